@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import grid
 
 ROOT = Path(__file__).resolve().parents[1]
 

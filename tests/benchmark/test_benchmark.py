@@ -14,11 +14,10 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
-from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.limits import cells_table, limits_table
+from dudmap.lab.benchmark.measure import markdown
 from dudmap.lab.benchmark.report import published
-from dudmap.lab.benchmark.suites import ABLATION, SUITES, find_suite, systems
-from dudmap.lab.benchmark.table import markdown
+from dudmap.lab.benchmark.suites import ABLATION, SUITES, Entry, find_suite, systems
 from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
 

@@ -4,8 +4,7 @@ from dudmap.config import Config
 from dudmap.errors import ConfigError
 from dudmap.lab.benchmark import measure
 from dudmap.lab.benchmark.color_columns import color_table, measure_columns
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.suites import SENSORS, sensor_entries
+from dudmap.lab.benchmark.suites import SENSORS, Entry, sensor_entries
 from dudmap.lab.synthetic.sensors import CAMERAS
 
 TINY = {"scene": "box", "movers": (), "frames": 2, "camera": (64, 48), "noise": "none"}

@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.lab.benchmark import measure, random_worlds
-from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.random_worlds import DRAWN, draw_world, measure_worlds, report, synth_command
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import names
 
 

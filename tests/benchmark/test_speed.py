@@ -5,8 +5,8 @@ import pytest
 
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark import roofline, speed
-from dudmap.lab.benchmark.passage import LAP, passage
 from dudmap.lab.benchmark.soak import grown, measure_soak
+from dudmap.lab.benchmark.speed import LAP, passage
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
@@ -90,7 +90,7 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     from pathlib import Path
 
     from dudmap.lab.benchmark import gpu as interleaved
-    from dudmap.lab.benchmark.entries import Entry
+    from dudmap.lab.benchmark.suites import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))
     entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (160, 120)})

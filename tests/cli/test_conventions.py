@@ -182,7 +182,7 @@ FAKED = {
     ),
     "study thesis": (
         ["study", "thesis", "--published", "--out", "published"],
-        {"dudmap.lab.study.thesis.published_report": lambda _: "an outcome"},
+        {"dudmap.lab.study.study.published_report": lambda _: "an outcome"},
     ),
 }
 """Long commands, with their measurements replaced."""

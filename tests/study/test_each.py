@@ -48,7 +48,6 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
 
 def test_progress_says_time_left_core_hours_and_cost():
     state = Progress(total=100, done=20, begun=10, spent=7200.0, started=0.0, cores=2)
-    assert state.core_hours == pytest.approx(4)
     assert "4.0 h of about 20.0 h of core time" in state.describe()
     assert "cost" not in state.describe()
     assert "cost 0.20 of about 1.00" in state.describe(0.05)

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 from dudmap.cli import app
 from dudmap.errors import DudmapError
 from dudmap.lab.study.plan import make_plan
-from dudmap.lab.study.thesis import thesis_plan
+from dudmap.lab.study.study import thesis_plan
 from dudmap.lab.study.tune import check_tune
 from recordings import write_recording
 

@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from dudmap.config import Config
-from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.measure import measure_sequence
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.study.plan import make_plan
 from dudmap.lab.study.study import run_study
 from study.here import Here

@@ -8,7 +8,7 @@ import pytest
 from dudmap.lab.study.effects import anova, interactions, main_effects
 from dudmap.lab.study.response_surface import carried_by, lack_of_fit, predict_optimum
 from dudmap.lab.study.responses import Scale
-from dudmap.lab.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
+from dudmap.lab.study.study import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
 
 # Table 6.1 as printed: Huber constant, regularisation, one row per voxel size 0.01, 0.02, 0.05 m, one column per weight
 # 0.025, 0.1, 0.175.

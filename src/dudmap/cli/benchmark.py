@@ -91,9 +91,8 @@ def sensors(
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.color_columns import color_table, measure_columns
-    from dudmap.lab.benchmark.entries import local_entries
-    from dudmap.lab.benchmark.suites import sensor_entries
-    from dudmap.lab.benchmark.table import save
+    from dudmap.lab.benchmark.measure import save
+    from dudmap.lab.benchmark.suites import local_entries, sensor_entries
 
     names = [name for name in only.split(",") if name]
     entries = sensor_entries(names, quick=quick) if data is None else local_entries(data)
@@ -206,8 +205,8 @@ def calls(
 ) -> None:
     """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.entries import Entry
     from dudmap.lab.benchmark.roofline import count_calls, summary
+    from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
     source = room.open() if recording is None else open_sequence(recording)
@@ -327,8 +326,8 @@ def limits(
 ) -> None:
     """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
-    The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements of
-    the same code in the same folder are reused, so that an interrupted sweep continues.
+    The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements
+    of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.limits import (
@@ -341,8 +340,8 @@ def limits(
         limits_table,
         measure_cells,
     )
+    from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.suites import systems as find_systems
-    from dudmap.lab.benchmark.table import save
 
     wanted = find_systems(systems)
     sweeps = QUICK_SWEEPS if quick else SWEEPS

@@ -81,8 +81,7 @@ def thesis(
     as_json: o.JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
-    from dudmap.lab.study.study import run_study
-    from dudmap.lab.study.thesis import published_report, thesis_plan
+    from dudmap.lab.study.study import published_report, run_study, thesis_plan
 
     need("study", "dudmap study", STUDY)
     if published:

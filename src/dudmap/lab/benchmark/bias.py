@@ -17,7 +17,7 @@ from dudmap.core.slam import Slam
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import DatasetError
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import grid
 
 ITERATIONS = 8
 """Gauss-Newton steps of each registration."""

@@ -6,9 +6,8 @@ The default must not be worse than the better of the two by more than ``TOLERANC
 from collections.abc import Callable, Iterable, Sequence
 
 from dudmap.config import Config
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Job, Row, measure_all
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import Job, Row, grid, measure_all
+from dudmap.lab.benchmark.suites import Entry
 
 SETTINGS: dict[str, tuple[str, ...]] = {
     "with colour": ("sensor.color_time_sigma=0",),

@@ -21,10 +21,9 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence, open_sequence
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Row, in_own_process
+from dudmap.lab.benchmark.measure import Row, grid, in_own_process
 from dudmap.lab.benchmark.speed import WARM_UP
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import sequence as synthetic_sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
@@ -161,18 +160,13 @@ kernel take time."""
 
 @dataclass(frozen=True)
 class DeviceRun:
-    """Medians of a recording on a device.
+    """Medians of a recording on a device; the voxel size is in metres, times are in milliseconds, sizes in MB.
 
     Attributes:
-        what: Recording and image size.
-        voxel: Voxel size, metres.
-        device: "cpu", "cuda:0", ...
-        frame_ms: Time per frame, milliseconds.
-        stages: Time of each stage, milliseconds.
-        mesh_ms, view_ms: Time of a mesh and of an artificial view of the camera's size.
-        triangles: Of that mesh.
-        map_mb, device_mb: Size of the map, and peak memory of the device where it is known.
-        kernels: Milliseconds per frame of each kernel, by the device's events; empty on the CPU.
+        mesh_ms, view_ms: Time of a mesh, which has so many triangles, and of an artificial view of the camera's
+            size.
+        device_mb: Peak memory of the device where it is known.
+        kernels: Time per frame of each kernel, by the device's events; empty on the CPU.
         error: Why there are no figures.
     """
 

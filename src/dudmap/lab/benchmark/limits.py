@@ -16,9 +16,8 @@ import numpy as np
 from dudmap.config import Config
 from dudmap.errors import DudmapError
 from dudmap.evaluation.segmentation import SCORED_COVERAGE
-from dudmap.lab.benchmark.entries import Excerpt
-from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, code_hash, measure_each, measure_sequence
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, code_hash, grid, measure_each, measure_sequence
+from dudmap.lab.benchmark.suites import Excerpt
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 
@@ -34,14 +33,11 @@ LARGEST_ATE = 0.02
 
 @dataclass(frozen=True)
 class Condition:
-    """One experimental condition.
+    """One experimental condition: speed of the people in m/s, built-in camera path, number of frames.
 
     Attributes:
         coverage: Mean share of the image that the crowd covers once all of it is in view.
-        speed: Speed of the people, m/s.
-        camera_path: Name of the built-in camera path.
         start_share: Share of the frames, from the first on, in which the crowd exists; None if it enters later.
-        frames: Number of frames.
     """
 
     coverage: float

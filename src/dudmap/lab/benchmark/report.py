@@ -8,10 +8,19 @@ from typing import NamedTuple
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Job, Row, measure_all, score_mesh, score_trajectory
-from dudmap.lab.benchmark.suites import Suite
-from dudmap.lab.benchmark.table import COLUMNS, grid, markdown, save, shown
+from dudmap.lab.benchmark.measure import (
+    COLUMNS,
+    Job,
+    Row,
+    grid,
+    markdown,
+    measure_all,
+    save,
+    score_mesh,
+    score_trajectory,
+    shown,
+)
+from dudmap.lab.benchmark.suites import Entry, Suite
 from dudmap.lab.data import tables
 
 

@@ -21,8 +21,8 @@ from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import teams
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.slam import Slam
+from dudmap.lab.benchmark.measure import grid
 from dudmap.lab.benchmark.speed import WARM_UP
-from dudmap.lab.benchmark.table import grid
 from dudmap.lab.synthetic import sequence
 
 if TYPE_CHECKING:

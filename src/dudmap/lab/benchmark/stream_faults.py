@@ -18,9 +18,8 @@ from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.entries import Excerpt
-from dudmap.lab.benchmark.measure import Row
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import Row, grid
+from dudmap.lab.benchmark.suites import Excerpt
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream, black, scaled
 
 SILENT_ERROR = 0.03
@@ -33,15 +32,14 @@ LAST_FRAMES = 5
 
 @dataclass(frozen=True, eq=False)
 class FaultRun:
-    """What became of the frames of one stream.
+    """What became of the frames of one stream with a fault: frames lost, and submaps in the end.
 
     Attributes:
-        fault: Its name.
         rejected: Number of frames not used, by kind (``FrameResult.rejected``, ``FrameError.kind``).
-        lost: Frames whose registration was rejected.
-        maps: Submaps in the end.
-        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a pose.
-        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or repeated.
+        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a
+            pose.
+        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or
+            repeated.
     """
 
     fault: str

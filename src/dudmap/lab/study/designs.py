@@ -26,10 +26,8 @@ class Factor:
     A coded value is -1 at the low end of the range and +1 at the high end.
 
     Attributes:
-        key: Configuration key, such as ``volume.voxel_size``.
         levels: The levels in the order given; empty for a range.
-        low: Low end of the range, or the smallest level; NaN if the levels are no numbers.
-        high: High end of the range, or the largest level; NaN if the levels are no numbers.
+        low, high: Ends of the range, or the smallest and the largest level; NaN if the levels are no numbers.
         scale: Whether the coded value is linear in the value or in its logarithm.
         whole: Whether the key takes whole numbers only.
     """

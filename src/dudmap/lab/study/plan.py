@@ -13,10 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError
-from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.suites import Entry
+from dudmap.lab.data import find
 from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, count_of, make_factors, points_of
-from dudmap.lab.study.remote import RemoteEntry, is_url, name_of
-from dudmap.lab.study.responses import RESPONSES, Scale, check_truth, known_responses
+from dudmap.lab.study.remote import RemoteEntry, name_of
+from dudmap.lab.study.responses import RESPONSES, Scale, check_truth
 
 MAX_RUNS = 1000
 """Runs of a design that is not refused unless ``--max-runs`` allows more."""
@@ -24,12 +25,9 @@ STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class TuneOptions(BaseModel):
-    """Table ``tune`` of a design file.
+    """Table ``tune`` of a design file: configurations, seed of the proposals, and when they are pruned.
 
-    Attributes:
-        trials: Number of configurations.
-        early: Share of the frames after which configurations are pruned; 0 prunes none.
-        seed: Seed of the proposals.
+    ``early`` is the share of the frames after which that happens; 0 prunes none.
     """
 
     model_config = STRICT
@@ -72,7 +70,7 @@ class DesignFile(BaseModel):
     design: str | dict[str, Any] = Field({}, description="a table with kind, samples, ...")
     sequences: list[dict[str, Any]] = Field([], description="tables [[sequences]] with path or scene")
     judge: list[dict[str, Any]] = Field([], description="tables [[judge]] with path or scene")
-    responses: list[str] = Field(["ate", "ms"], description=f"a list of {', '.join(RESPONSES)}")
+    responses: list[str] = Field(["ate", "ms"], min_length=1, description=f"a list of {', '.join(RESPONSES)}")
     log: list[str] = Field([], description="a list of responses")
     calibrate: bool = Field(False, description="true or false")
     confirm: int = Field(1, ge=0, description="the number of confirmation runs, 0 or more")
@@ -243,6 +241,8 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
     """Plan of the tree of a design file; see ``load_plan``."""
     file = checked(DesignFile, tree, "the design")
     base = Config().override(file.base)
+    for response in (*file.responses, *file.log):
+        find(response, RESPONSES, "response")
     design = {"kind": file.design} if isinstance(file.design, str) else file.design
     return Plan(
         name=file.name or name,
@@ -250,8 +250,8 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
         factors=make_factors(file.factors, base),
         options=checked(DesignOptions, design, "the design"),
         entries=make_entries(file.sequences, folder),
-        responses=known_responses(file.responses),
-        log=known_responses(file.log) if file.log else (),
+        responses=tuple(dict.fromkeys(file.responses)),
+        log=tuple(file.log),
         calibrate=file.calibrate,
         confirm=file.confirm,
         each=file.each,
@@ -295,7 +295,7 @@ def place_of(entry: Entry) -> str | None:
 
 def _real(table: dict[str, Any], folder: Path) -> tuple[str, int, Entry]:
     given = checked(RealTable, table, "a sequence")
-    if is_url(given.path):
+    if "://" in given.path:
         name = given.name or name_of(given.path).partition(".")[0]
         return name, 0, RemoteEntry(name, Path(given.path), max_frames=given.frames, url=given.path)
     path = folder / Path(given.path).expanduser()

@@ -12,16 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.extras import need
-from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.suites import Entry
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.mesh import Mesh
     from dudmap.io.sequences import Sequence
-
-
-def is_url(text: str) -> bool:
-    """Whether the path of a recording is a URL such as ``s3://bucket/desk.zip``, and not a path."""
-    return "://" in text
 
 
 def name_of(url: str) -> str:

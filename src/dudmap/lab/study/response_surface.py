@@ -203,8 +203,6 @@ class Prediction:
     """Quadratic model of a response, its optimum and the best point of the design.
 
     Attributes:
-        surface: The model.
-        best: Its optimum.
         point: Values of all factors at the optimum; those without numbers have their best level.
         best_point: Values of all factors at the best point of the design.
         reasons: What speaks against the optimum before it is confirmed, each a sentence.

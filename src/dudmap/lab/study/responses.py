@@ -9,17 +9,15 @@ from dudmap.lab.study.designs import Table
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
-    from dudmap.lab.benchmark.entries import Entry
+    from dudmap.lab.benchmark.suites import Entry
 
 
 class Response(NamedTuple):
-    """One response.
+    """One response, with its name and unit in a report.
 
     Attributes:
         key: Key of the figure in a row of ``dudmap.lab.benchmark.measure``.
-        name: Its name in a report.
-        unit: Its unit in a report.
-        factor: From the unit of the row to that unit.
+        factor: From the unit of the row to that of the report.
         better: Whether low or high values are good.
         needs: What the recording must have.
     """
@@ -101,20 +99,6 @@ class Scale(NamedTuple):
         if self.log and (out[name] <= 0).any():
             raise ConfigError(f"the response {name} is 0 in some runs and has no logarithm there; take it out of log")
         return out.assign(**{name: np.log(out[name])}) if self.log else out
-
-
-def known_responses(names: list[str]) -> tuple[str, ...]:
-    """Checked names of responses.
-
-    Raises:
-        ConfigError: There is none, or one is unknown.
-    """
-    if not names:
-        raise ConfigError(f"there are no responses; expected a list of {', '.join(RESPONSES)}")
-    for name in names:
-        if name not in RESPONSES:
-            raise ConfigError(f"unknown response {name!r}; known are {', '.join(RESPONSES)}")
-    return tuple(dict.fromkeys(names))
 
 
 def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) -> None:

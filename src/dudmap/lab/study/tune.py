@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
-from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.study.conduct import Progress, StudyFolder, conduct
 from dudmap.lab.study.designs import Factor, Point, Table, configured
 from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, place_of
@@ -230,7 +230,7 @@ def run_tune(
 
 def describe(table: Table, good: Sequence[Point], plan: Plan) -> str:
     """Outcome of a search in words."""
-    from dudmap.lab.benchmark.table import grid
+    from dudmap.lab.benchmark.measure import grid
     from dudmap.lab.study.report import shown
     from dudmap.lab.study.response_surface import values_text
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark.entries import Entry, Excerpt
+from dudmap.lab.benchmark.suites import Entry, Excerpt
 from dudmap.lab.study.plan import Run
 
 if TYPE_CHECKING:

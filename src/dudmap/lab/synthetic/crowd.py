@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
+from dudmap.lab.synthetic.motion import Figure
 from dudmap.lab.synthetic.movers import Staging, SyntheticMover, placed
-from dudmap.lab.synthetic.person import Figure
 from dudmap.lab.synthetic.render import Renderer
 from dudmap.lab.synthetic.scene import pose
 

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
 from dudmap.lab.data import find
-from dudmap.lab.synthetic.motion import FloorPath, crossing, smooth_step
-from dudmap.lab.synthetic.person import Figure
+from dudmap.lab.synthetic.motion import Figure, FloorPath, crossing, smooth_step
 from dudmap.lab.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
 
 Matrix = NDArray[np.float64]

@@ -45,13 +45,10 @@ class SyntheticSequence:
     """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        name: Names of scene and movers.
         camera: Intrinsics of the depth camera, which are also those that the files state for colour.
         faults: What the sensor does and its files do not say.
         timestamps: (N,) seconds.
-        ground_truth: Exact camera poses.
         parameters: Arguments from which it was made.
-        scene: The static scene.
     """
 
     calibration = None

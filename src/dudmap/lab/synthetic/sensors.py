@@ -168,13 +168,8 @@ class CameraModel:
     """One camera, described as its driver delivers it: colour registered to depth.
 
     Only what registration leaves over is a fault of place; add ``color_translation`` and the like for unregistered
-    streams.
-
-    Attributes:
-        noise: Name of its noise model (``sensors.SENSORS``).
-        field_of_view: Horizontal field of view of a 4:3 depth image, degrees.
-        motion_blur: Exposure time of the colour as a share of the frame interval.
-        faults: Its faults.
+    streams. ``field_of_view`` is that of a 4:3 depth image, horizontally, in degrees, and ``motion_blur`` the exposure
+    time of the colour as a share of the frame interval.
     """
 
     noise: str

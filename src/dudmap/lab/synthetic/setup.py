@@ -30,14 +30,11 @@ CAP_DISTANCE = 0.16
 
 @dataclass(frozen=True)
 class Situation:
-    """Modification of an ordinary sequence.
+    """Modification of an ordinary sequence: its defaults, and shares of the duration in which it differs.
 
     Attributes:
-        movers: Default movers.
-        camera_path: Default camera path.
-        start_dynamic: Whether movers are in view in the first frame.
-        covered: Intervals, as shares of the duration, in which the camera is covered.
-        elsewhere: Intervals, as shares of the duration, in which the camera looks at another part of the scene.
+        covered: Intervals in which the camera is covered.
+        elsewhere: Intervals in which the camera looks at another part of the scene.
     """
 
     movers: tuple[str, ...]

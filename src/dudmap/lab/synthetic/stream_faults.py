@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import ConfigError, FrameError
+from dudmap.errors import FrameError
 from dudmap.io.sequences import Sequence
+from dudmap.lab.data import find
 
 Alteration = Callable[[Frame], Frame]
 """Changes a frame, or raises FrameError if the fault leaves none."""
@@ -52,13 +53,11 @@ class FaultyStream:
     """
 
     def __init__(self, recording: Sequence, fault: str) -> None:
-        if fault not in FAULTS:
-            raise ConfigError(f"unknown fault {fault!r} of a stream; expected one of {', '.join(FAULTS)}")
         self.recording = recording
         self.name = f"{recording.name}-{fault.replace(' ', '-')}"
         self.camera, self.calibration = recording.camera, recording.calibration
         self.ground_truth: Trajectory | None = recording.ground_truth
-        self.deliveries = FAULTS[fault].schedule(recording.timestamps)
+        self.deliveries = find(fault, FAULTS, "fault").schedule(recording.timestamps)
         self.timestamps = np.array([delivery.timestamp for delivery in self.deliveries])
 
     def __len__(self) -> int:
