@@ -19,7 +19,7 @@ from dudmap.evaluation.segmentation import SCORED_COVERAGE
 from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, code_hash, grid, measure_each, measure_sequence
 from dudmap.lab.benchmark.suites import Excerpt
 from dudmap.lab.synthetic import sequence
-from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.recording import SyntheticSequence
 
 SIZE = (320, 240)
 """Image size, pixels."""
@@ -50,7 +50,7 @@ class Condition:
         """Recording of this condition."""
         recording = sequence(
             camera_path=self.camera_path, frames=self.frames, fps=FPS, speed=self.speed, coverage=self.coverage,
-            start_dynamic=self.start_share is not None, camera=DEFAULT_CAMERA.resized(*SIZE),
+            start_dynamic=self.start_share is not None, camera=SIZE,
         )  # fmt: skip
         until = round((self.start_share or 1.0) * self.frames)
         return recording if until == self.frames else recording.static_twin(since=float(recording.timestamps[until]))

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 """One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
+SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
+"""Figures of a trajectory; the drift is that after aligning the first pose only."""
 COMPLETE_WITHIN = 0.02
 """Largest distance to the mesh of a point of the true surface that counts as reconstructed, metres."""
 SAMPLES = 100_000
@@ -102,18 +104,13 @@ def measure_sequence(
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)
         truth = sequence.ground_truth
         if truth is not None:
-            row |= score_trajectory(report.trajectory, truth)
+            row |= accuracy(report.trajectory, truth, SCORED)
         if truth is not None and surfaces is not None and report.metrics["mesh_triangles"]:
             try:
                 row |= score_mesh(Mesh.load(report.out / "mesh.ply"), report.trajectory, truth, *surfaces, samples)
             except DatasetError as error:
                 row["mesh_missing"] = str(error)
     return row
-
-
-def score_trajectory(estimate: Trajectory, truth: Trajectory) -> Row:
-    """ATE, RPE, and the drift after aligning the first pose only; see ``evaluation.trajectory.trajectory_figures``."""
-    return accuracy(estimate, truth, (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg"))
 
 
 def score_mesh(

@@ -8,8 +8,10 @@ from typing import NamedTuple
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.lab.benchmark.measure import (
     COLUMNS,
+    SCORED,
     Job,
     Row,
     grid,
@@ -17,7 +19,6 @@ from dudmap.lab.benchmark.measure import (
     measure_all,
     save,
     score_mesh,
-    score_trajectory,
     shown,
 )
 from dudmap.lab.benchmark.suites import Entry, Suite
@@ -122,7 +123,7 @@ def _scored(entry: Entry, folder: Path) -> Row:
             return {"error": f"{entry.name} has no ground truth to score against"}
         estimate = Trajectory.load(path)
         row: Row = {"frames": len(sequence), "lost": max(len(sequence) - len(estimate), 0)}
-        row |= score_trajectory(estimate, sequence.ground_truth)
+        row |= accuracy(estimate, sequence.ground_truth, SCORED)
         surfaces = entry.surfaces(sequence)
         if surfaces is not None and (folder / "mesh.ply").is_file():
             mesh = Mesh.load(folder / "mesh.ply")

@@ -21,7 +21,7 @@ from dudmap.core.result import FrameResult
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
 from dudmap.lab.benchmark.measure import Row
-from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.recording import SyntheticSequence
 
 FPS = 15.0
 """Frame rate of the recording, Hz."""
@@ -92,7 +92,7 @@ def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[
     recording = Rendered(
         synthetic.sequence(
             movers=("people",), camera_path="orbit", frames=frames, fps=FPS, seed=seed,
-            camera=DEFAULT_CAMERA.resized(*size),
+            camera=size,
         )
     )  # fmt: skip
     tenths = Tenths(recording, done)

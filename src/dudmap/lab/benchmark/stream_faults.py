@@ -12,7 +12,6 @@ from dudmap.app.pipeline.inspection import inspect
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
@@ -20,6 +19,7 @@ from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
 from dudmap.lab.benchmark.measure import Row, grid
 from dudmap.lab.benchmark.suites import Excerpt
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream, black, scaled
 
 SILENT_ERROR = 0.03
@@ -74,12 +74,11 @@ class FaultRun:
 
 
 def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
-    """A synthetic scene with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+    """A synthetic scene with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
 
-    focal = 525 / 640 * width
-    camera = Camera(focal, focal, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera, noise="kinect")
+    camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
+    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera)
 
 
 def measure_stream_faults(

@@ -33,10 +33,7 @@ MOST_INTERACTION_FACTORS = 6
 
 
 def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> Table | None:
-    """Add everything that is known about one response but the confirmation of its optimum.
-
-    Returns:
-        The effects of a Plackett-Burman design.
+    """Add all that is known about one response but its confirmation; return the effects of a Plackett-Burman design.
 
     Raises:
         ConfigError: No run has the response, or the runs do not suffice for all effects.
@@ -127,12 +124,7 @@ def point_table(plan: "Plan", table: Table) -> Table:
 
 
 def pareto_front(points: Table, names: tuple[str, str]) -> Table:
-    """Rows that no other row beats in one of two responses without being worse in the other, by the first one.
-
-    Args:
-        points: One row per point with a column per response.
-        names: Names of the responses.
-    """
+    """Points (one row each, a column per response) that no other beats in one of two responses, by the first."""
     signs = [1 if RESPONSES[name].better == "low" else -1 for name in names]
     ordered = (points.dropna(subset=list(names))[list(names)] * signs).sort_values(list(names))
     return points.loc[ordered.index[ordered[names[1]] < ordered[names[1]].cummin().shift(fill_value=np.inf)]]

@@ -7,9 +7,6 @@ from dudmap.errors import ConfigError
 from dudmap.extras import extra, install
 from dudmap.lab.study.worker import Job, Outcome, perform, set_threads
 
-CPUS_PER_RUN = 1
-"""Cores that a run reserves, and its number of threads."""
-
 
 class RayExecutor:
     """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
@@ -31,9 +28,9 @@ class RayExecutor:
         except ImportError as error:  # ray:// needs the client of Ray
             raise ConfigError(f"ray lacks its client ({error}); {install('cluster')}") from None
         self._ray = ray
-        self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(_perform)  # dudmap's conduct tries again
-        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
-        self.cores = CPUS_PER_RUN
+        self._perform: Any = ray.remote(num_cpus=1, max_retries=0)(_perform)  # dudmap's conduct tries again
+        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self.cores = 1  # that a run reserves, and its number of threads
         self._running: set[Any] = set()
 
     def perform(self, job: Job) -> Outcome:
@@ -55,5 +52,5 @@ class RayExecutor:
 
 
 def _perform(job: Job) -> Outcome:
-    set_threads(CPUS_PER_RUN)
+    set_threads(1)
     return perform(job)

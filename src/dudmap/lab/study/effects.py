@@ -120,10 +120,9 @@ def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: 
 
 
 def emulated_indices(table: Table, factors: Sequence[Factor], response: str, seed: int = 0) -> tuple[Table, str]:
-    """Sobol indices of a Gaussian process (scikit-learn) that was fitted to the runs.
+    """Sobol indices of a Gaussian process (scikit-learn) fitted to the runs, and how much it predicts, in words.
 
-    Returns:
-        The indices, None if the process predicts too little, and a sentence on how much it predicts.
+    They are None if it predicts too little.
     """
     import warnings
 

@@ -26,11 +26,7 @@ def name_of(url: str) -> str:
 
 @dataclass(frozen=True)
 class RemoteEntry(Entry):
-    """Recording behind a URL, which every machine fetches when it first needs it.
-
-    Attributes:
-        url: The URL, of an archive, a file or a folder, of any file system that fsspec knows.
-    """
+    """Recording behind a URL of any file system that fsspec knows, which every machine fetches when it first needs it."""
 
     url: str = ""
 

@@ -50,12 +50,7 @@ RESPONSES = {
 
 
 class Scale(NamedTuple):
-    """How a response is analysed: as it is, or as its logarithm.
-
-    Attributes:
-        response: Name of the response.
-        log: Whether it is analysed as its logarithm.
-    """
+    """How the response of a name is analysed: as it is, or as its logarithm."""
 
     response: str
     log: bool = False

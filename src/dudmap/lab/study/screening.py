@@ -86,12 +86,11 @@ def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
 
     Least squares with all factors together (statsmodels), each recording on its own, so that a key that matters on one
     recording only is found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
-    and Hochberg 1995). In a design that is folded over, the effects are free of interactions of two factors, which are
-    in the residual.
+    and Hochberg 1995). In a design that is folded over, interactions of two factors are in the residual.
 
     Returns:
-        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in standard
-        deviations of the residual.
+        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in
+            standard deviations of the residual.
 
     Raises:
         ConfigError: The runs of a recording do not suffice for all factors.

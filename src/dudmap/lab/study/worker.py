@@ -211,12 +211,7 @@ def reset_peak_memory() -> None:
 
 
 class Executor(Protocol):
-    """Does jobs. An engine for clusters needs no more than this.
-
-    Attributes:
-        workers: Number of jobs that are done at a time, each asked for by a thread of its own.
-        cores: Cores that a job uses.
-    """
+    """Does jobs: ``workers`` at a time, each asked for by a thread of its own, on so many ``cores`` each."""
 
     workers: int
     cores: int
