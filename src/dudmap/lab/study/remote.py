@@ -26,7 +26,7 @@ def name_of(url: str) -> str:
 
 @dataclass(frozen=True)
 class RemoteEntry(Entry):
-    """Recording behind a URL of any file system that fsspec knows, which every machine fetches when it first needs it."""
+    """Recording behind a URL of any file system that fsspec knows; every machine fetches it when it first needs it."""
 
     url: str = ""
 
