@@ -12,6 +12,7 @@ from dudmap.lab.data import find
 from dudmap.lab.study.conduct import Progress, conduct, table_of
 from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, make_plan
+from dudmap.lab.study.responses import RESPONSES
 from dudmap.lab.study.worker import Executor
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def write_report(
     if screened or isinstance(predicted, str):
         return screening.summary(effects) if screened else str(predicted)
     best = first.text(predicted.best.predicted)
-    lines = [f"{first.heading}: predicted optimum {best} at {values_text(predicted.point)}."]
+    lines = [f"{RESPONSES[first.response].name}: predicted optimum {best} at {values_text(predicted.point)}."]
     if predicted.reasons:
         lines += ["Reasons to doubt it before it is measured:", *(f"- {reason}" for reason in predicted.reasons)]
     return "\n".join([*lines, f"Confirmation runs: {confirmation}"])
