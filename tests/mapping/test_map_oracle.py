@@ -12,8 +12,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.integrator import FRONTAL_WEIGHT
-from dudmap.core.map.volume import FREE, TsdfVolume
+from dudmap.core.map.volume import FREE, FRONTAL_WEIGHT, TsdfVolume
 from dudmap.core.map.voxel_blocks import MAX_LOAD
 from dudmap.errors import MapError
 from oracle import fuse, trilinear

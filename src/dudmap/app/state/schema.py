@@ -22,7 +22,7 @@ core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
-core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
+core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult
 core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.collector:KeyframeCollector core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
 core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
@@ -36,9 +36,9 @@ core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level co
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
 core.geometry.lens:Lens core.geometry.mesh:Mesh core.geometry.other_view:OtherView core.geometry.trajectory:Trajectory
-core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager core.map.block_tree:BlockTree
-core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks core.map.incremental_mesh:IncrementalMesh
-core.map.integrator:Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
+core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager
+core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks,BlockTree core.map.incremental_mesh:IncrementalMesh
+core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
 core.map.paged_map:PagedMap core.map.refinement:Refinement
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
 core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectFusion

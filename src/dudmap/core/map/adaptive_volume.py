@@ -18,7 +18,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.adaptive_mesh import extract_groups
 from dudmap.core.map.fine_blocks import FineBlocks, two_levels
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
+from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import MapContent
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -85,15 +85,14 @@ class AdaptiveVolume(TsdfVolume):
         extent: float | None = None,
     ) -> None:
         super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
-        self._integrators, self._refinements = [], []
+        self._level_parameters, self._refinements = [], []
         for number in range(self.config.adaptive_levels):
             coarse = self.voxel_size / 2**number
             halved = self.config.model_copy(update={"voxel_size": coarse / 2})
             parameters = fusion_parameters(halved, self.sensor, depth_max)
             band = parameters.band._replace(limit=self.band.limit)
-            parameters = parameters._replace(band=band, sdf_unit=self.sdf_unit)
-            self._integrators.append(Integrator(halved, parameters, self.backend))
-            parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
+            self._level_parameters.append(parameters._replace(band=band, sdf_unit=self.sdf_unit))
+            parents = self.band if number == 0 else self._level_parameters[number - 1].band
             self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
 
     def _empty(self) -> None:
@@ -127,24 +126,24 @@ class AdaptiveVolume(TsdfVolume):
         T_world_camera: NDArray[np.float64],
         count: int,
     ) -> NDArray[np.int32]:
-        weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
+        weights = self._reading_weights(depth, self.camera) if weights is None else weights
         fused = super()._fuse(depth, color, weights, T_world_camera, count)
         number = self._frame_number
-        view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
+        view = self._view(depth, T_world_camera)
         slots, updated = self.window.near, fused
         for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
             level.make_room(parents)
             gone = parents.entry_of[updated] < 0
             level.drop(level.children_of(updated[gone]))
             children = level.children_of(slots)
-            updated_children = self._average(n, view, color, weights, children, count)
+            updated_children = self._average_finer(n, view, color, weights, children, count)
             updated = updated[~gone]
             depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
             self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
             slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
         return fused
 
-    def _average(
+    def _average_finer(
         self,
         n: int,
         view: DepthView,
@@ -157,12 +156,12 @@ class AdaptiveVolume(TsdfVolume):
         these."""
         if len(candidates) == 0:
             return candidates
-        level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
+        level, number = self.levels[n], self._frame_number
         blocks = level.blocks
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied = self.backend.fuse(
-            grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
+            grid, view, color, weights, candidates, blocks.fused, turn, count, self._level_parameters[n]
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1

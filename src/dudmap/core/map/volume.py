@@ -15,6 +15,7 @@ from dudmap.core.backends.parameters import (
     FREE,
     SURFACE,
     UNKNOWN,
+    DepthView,
     MapSample,
     MeshParameters,
     RaycastParameters,
@@ -23,11 +24,12 @@ from dudmap.core.backends.parameters import (
 )
 from dudmap.core.backends.spec import Backend
 from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.fine_blocks import FineBlocks
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
+from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -42,6 +44,8 @@ MAX_JUMP = 5.0
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
 MAX_WINDOW = 288
 """Largest number of blocks along the edge of the window; its cells then take 96 MB."""
+FRONTAL_WEIGHT = 4.0
+"""Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
 
 
 class TsdfVolume(PagedMap):
@@ -89,9 +93,12 @@ class TsdfVolume(PagedMap):
         self.sensor = sensor or SensorConfig()
         self.depth_max = depth_max
         self.backend: Backend = backend or CpuBackend()
-        parameters = fusion_parameters(self.config, self.sensor, depth_max)
-        self._integrator = Integrator(self.config, parameters, self.backend)
-        self.voxel_size, self.sdf_unit, self.band = parameters.voxel_size, parameters.sdf_unit, parameters.band
+        self.parameters = fusion_parameters(self.config, self.sensor, depth_max)
+        self.voxel_size, self.sdf_unit, self.band = (
+            self.config.voxel_size,
+            self.parameters.sdf_unit,
+            self.parameters.band,
+        )
         self.block_size = BLOCK * self.voxel_size
         self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
@@ -116,36 +123,6 @@ class TsdfVolume(PagedMap):
         self._left = None
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing has been integrated yet."""
-        return self.num_blocks == 0
-
-    @property
-    def num_free_blocks(self) -> int:
-        """Blocks in memory known to be free space; they own no voxels."""
-        return self.blocks.num_free(self.config.free_after)
-
-    @property
-    def num_bytes(self) -> int:
-        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
-        hash table.
-
-        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
-        is the window, whose size depends on the view and the voxels, not on the map.
-        """
-        return self.blocks.num_bytes
-
-    @property
-    def entry_bytes(self) -> float:
-        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self.blocks.entry_bytes
-
-    @property
-    def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return self.blocks.active_slots
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -190,10 +167,70 @@ class TsdfVolume(PagedMap):
         T_world_camera: NDArray[np.float64],
         count: int,
     ) -> NDArray[np.int32]:
-        """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
-        return self._integrator.integrate(
-            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+        """Fuse an image whose view the window covers, 0 where nothing is to be fused; other arguments as of
+        ``integrate``.
+
+        Returns:
+            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
+        """
+        view = self._view(depth, T_world_camera)
+        self._allocate(view)
+        weights = self._reading_weights(depth, self.camera) if weights is None else weights
+        slots = self._average(view, color, weights, count)
+        if self.config.carving:
+            self._observe_free(view, count)
+        return slots
+
+    def _view(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> DepthView:
+        """A depth image (H, W) at a pose (4, 4), in coordinates from the window's local origin."""
+        T_camera_local = se3.inverse(T_world_camera)
+        T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (self.window.local_origin * self.block_size)
+        T_camera_local = T_camera_local[:3].astype(np.float32)
+        return self.backend.view(depth, self.camera.intrinsics, self.T_grid_camera(T_world_camera), T_camera_local)
+
+    def _allocate(self, view: DepthView) -> None:
+        """Allocate voxels for the blocks that the truncation band of the image touches."""
+        farthest = max(float(view.depth.max()), 0.05)
+        half_block = 0.5 * self.block_size * float(view.intrinsics[0]) / farthest  # pixels, at the farthest reading
+        stride = int(np.clip(half_block, 1, 8))
+        cells = self.backend.touched_cells(
+            self.grid, view, self.window.stamps, stride, self.config.free_after, self._frame_number, self.parameters
         )
+        if len(cells):
+            self.window.allocate(cells, self.blocks, self._frame_number)
+
+    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
+        """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
+        if self.config.weighting == "constant":
+            return np.ones(depth.shape, dtype=np.uint8)
+        return self.backend.reading_weights(depth, camera.intrinsics, self.band.noise, FRONTAL_WEIGHT)
+
+    def _average(
+        self, view: DepthView, color: NDArray[np.uint8], weights: NDArray[np.uint8], count: int
+    ) -> NDArray[np.int32]:
+        """Average distances and colours into the voxels in view; release the blocks that are seen to be empty."""
+        blocks, window = self.blocks, self.window
+        if len(window.near) == 0:
+            return window.near
+        turn = self._frame_number if self.config.take_turns else -1
+        slots, occupied = self.backend.fuse(
+            self._local_grid, view, color, weights, window.near, blocks.fused, turn, count, self.parameters
+        )
+        blocks.written[slots] = self._frame_number
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
+        if self.config.carving:
+            window.release(slots[occupied == 0], blocks, self.config.free_after)
+        return slots
+
+    def _observe_free(self, view: DepthView, count: int) -> None:
+        """Count ``count`` more observations of emptiness for blocks without voxels in front of the image.
+
+        Each call visits every second plane of the window, so that the cost is spread over two frames.
+        """
+        cells = self.backend.observe_free(
+            self._local_grid, view, self._frame_number % 2, count, self.config.free_after, self.parameters
+        )
+        self.window.set_free(cells, self.blocks, count)
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
@@ -225,7 +262,21 @@ class TsdfVolume(PagedMap):
     @property
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
-        return self._integrator.grid(self.blocks, self.window)
+        window, blocks = self.window, self.blocks
+        assert window.origin is not None
+        return VoxelGrid(
+            window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
+            blocks.slot_coords, blocks.free_count, self.voxel_size, self.sdf_unit,
+        )  # fmt: skip
+
+    @property
+    def _local_grid(self) -> VoxelGrid:
+        """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
+        grid, origin = self.grid, self.window.local_origin
+        if not origin.any():
+            return grid
+        coords = (grid.slot_coords - origin).astype(grid.slot_coords.dtype)
+        return grid._replace(origin=grid.origin - origin, slot_coords=coords)
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
@@ -265,7 +316,7 @@ class TsdfVolume(PagedMap):
         words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        gains = self._integrator.reading_weights(depth, camera)
+        gains = self._reading_weights(depth, camera)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
@@ -290,9 +341,8 @@ class TsdfVolume(PagedMap):
 
     def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
         """Mesh of blocks (n,) that are in memory."""
-        blocks = self.blocks
-        neighbours = blocks.neighbours(slots)
-        return Mesh(*meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, neighbours, parameters))
+        blocks, near = self.blocks, self.blocks.neighbours(slots)
+        return meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters)
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
@@ -322,30 +372,10 @@ class TsdfVolume(PagedMap):
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
             min_weight: As of ``extract_mesh``.
         """
-        blocks = self.blocks
-        meshes = meshing.extract_chunks(
-            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(min_weight), chunks,
-        )  # fmt: skip
-        return [Mesh(*mesh) for mesh in meshes]
-
-    @property
-    def num_integrated(self) -> int:
-        """Frames that were integrated."""
-        return self._frame_number
-
-    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
-
-        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
-        """
-        blocks = self.blocks
-        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
-        return slots, blocks.slot_coords[slots].astype(np.int32)
-
-    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        return self.blocks.slots_at(coords)
+        blocks, near, parameters = self.blocks, self.blocks.neighbours(slots), self._mesh_parameters(min_weight)
+        return meshing.extract_chunks(
+            blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters, chunks
+        )
 
     # -- files -------------------------------------------------------------------------------------------------------
 

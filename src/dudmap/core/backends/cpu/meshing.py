@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.links import links
 from dudmap.core.backends.cpu.tables import TRIANGLE_COUNT, TRIANGLES
-from dudmap.core.backends.parameters import MeshArrays, MeshParameters
+from dudmap.core.backends.parameters import MeshParameters
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.surface import crossing, mixed_channel, slope
+from dudmap.core.geometry.mesh import Mesh
 
 BAND = 256
 """Blocks of one band."""
@@ -300,12 +301,17 @@ def extract(
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
-) -> MeshArrays:
-    """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
-    vertices, faces, vertex_colors, normals, _ = extract_surface(
-        geometry, colors, slots, coords, neighbours, parameters, len(slots)
-    )
-    return MeshArrays(vertices, faces, vertex_colors, normals)
+) -> Mesh:
+    """Triangles of the zero level of blocks.
+
+    Args:
+        geometry, colors: (slots, 512) int32 packed voxels.
+        slots: (n,) int32 of the blocks.
+        coords: (slots, 3) block coordinates.
+        neighbours: (n, 8) int32, see ``VoxelBlocks.neighbours``.
+        parameters: Of the extraction.
+    """
+    return Mesh(*_extract(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
 
 
 def extract_chunks(
@@ -316,12 +322,12 @@ def extract_chunks(
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
-) -> list[MeshArrays]:
-    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
+) -> list[Mesh]:
+    """Meshes of groups of blocks; see ``TsdfVolume.extract_chunks``, and ``extract`` for the other arguments."""
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
-    vertices, faces, vertex_colors, normals, first_face = extract_surface(
+    vertices, faces, vertex_colors, normals, first_face = _extract(
         geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
@@ -334,11 +340,11 @@ def extract_chunks(
     for chunk in range(num_chunks):  # copies: a view would keep the arrays of all chunks alive
         own, faces_of = slice(first[chunk], first[chunk + 1]), slice(begin[chunk], begin[chunk + 1])
         parts = vertices[own], local_faces[faces_of], vertex_colors[own], normals[own]
-        out.append(MeshArrays(*(part.copy() for part in parts)))
+        out.append(Mesh(*(part.copy() for part in parts)))
     return out
 
 
-def extract_surface(
+def _extract(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
