@@ -66,13 +66,13 @@ def _contours(
     row_of[slots] = np.arange(len(slots), dtype=np.int32)
     rows = row_of[near]  # -1 is the last element
     finer = two_levels(levels)
-    coords, geometry, colors = np.ascontiguousarray(blocks.slot_coords[slots]), blocks.geometry, blocks.colors
+    coords = np.ascontiguousarray(blocks.slot_coords[slots])
     least = max(int(parameters.min_weight), 1)
     parts = run_bands(
         lambda start, stop: contour_blocks(
-            start, stop, slots, near, rows, meshed, coords, geometry, finer.geometry1, finer.geometry2,
-            finer.children1, finer.children2, colors, finer.colors1, finer.colors2, least,
-            np.float32(parameters.sdf_unit), float(parameters.voxel_size), np.float32(parameters.max_jump),
+            start, stop, near, rows, meshed, coords, (blocks.geometry, *finer.geometry), finer.children,
+            (blocks.colors, *finer.colors), least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
+            np.float32(parameters.max_jump),
         ),
         bands(len(slots), BAND),
     )  # fmt: skip

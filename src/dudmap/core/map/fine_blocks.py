@@ -227,5 +227,4 @@ def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
     """The finer levels of a map, at most two, as views and meshes read them."""
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
     arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels]
-    (children1, geometry1, colors1), (children2, geometry2, colors2) = arrays + missing
-    return FinerLevels(children1, children2, geometry1, geometry2, colors1, colors2)
+    return FinerLevels(*zip(*arrays, *missing, strict=True))
