@@ -98,6 +98,23 @@ def test_a_camera_that_stays_keeps_what_the_map_remembers():
         np.testing.assert_allclose(walker.history[n].frame.depth, expected, atol=0.51 * DEPTH_UNIT)
 
 
+def test_what_is_hidden_from_newer_frames_is_kept_until_it_is_seen_again():
+    """Somebody stands before the right half of a wall that the camera keeps seeing, and leaves at last."""
+    walker, hidden = Walker(), EVERYTHING.copy()
+    hidden[:, CAMERA.width // 2 :] = False
+    for _ in range(2 * ENOUGH):
+        walker.see(at(0))
+    for _ in range(3 * ENOUGH):
+        walker.see(at(0), static=hidden)
+    assert walker.stored[-1] <= walker.stored[2 * ENOUGH] + 4 / 3 * ENOUGH + 4  # of each half as many as without
+    wholly_seen = [n for n, stored in enumerate(walker.history) if stored.static.all()]
+    assert len(wholly_seen) >= ENOUGH
+    for _ in range(3 * ENOUGH):
+        walker.see(at(0))
+    assert len(walker.history) <= 4 / 3 * ENOUGH + 4
+    assert walker.history.timestamps[1] > 5 * ENOUGH
+
+
 def test_a_walk_without_return_keeps_all():
     walker = Walker()
     for second in range(4 * ENOUGH):

@@ -22,6 +22,8 @@ DEPTH_UNIT = 0.0005
 JPEG_QUALITY = 95
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` waits for it."""
+CELLS = 8, 6
+"""Cells of an image, across and down, of each of which is known whether a frame was fused in most of it."""
 EncodedFrame = tuple[bytes, bytes, bytes]
 """Depth, colour and mask of a stored frame as files."""
 
@@ -64,6 +66,7 @@ class FrameStore:
         timestamps: Of the stored frames, seconds.
         Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
         counts: Number of fused frames that each represents.
+        cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
         submaps: Numbers of their submaps.
         serials: Numbers of the stored frames that never change, and are never given again; ascending.
         links: Standard deviations, metres and radians, of the motion to a stored frame, by its serial, from the one
@@ -89,6 +92,7 @@ class FrameStore:
         self.timestamps: list[float] = []
         self.Ts_world_camera: list[NDArray[np.float64]] = []
         self.counts: list[int] = []
+        self.cells: list[int] = []
         self.submaps: list[int] = []
         self.serials: list[int] = []
         self.links: dict[int, tuple[float, float]] = {}
@@ -145,6 +149,7 @@ class FrameStore:
         self.timestamps.append(frame.timestamp)
         self.Ts_world_camera.append(T_world_camera.copy())
         self.counts.append(1)
+        self.cells.append(_fused_cells(frame, static))
         self.submaps.append(submap)
         self.color_timestamps.append(frame.color_timestamp)
         self.serials.append(self._next_serial)
@@ -179,8 +184,8 @@ class FrameStore:
         if self._file is not None and serial >= self._first_own:
             self._file.remove(str(serial))
         self.links.pop(serial, None)
-        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self.serials
-        for column in columns:
+        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.cells, self.submaps
+        for column in (*columns, self.serials):
             del column[number]
 
     def timeline(self, numbers: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -257,6 +262,15 @@ class FrameStore:
                 self._file = ScratchStore("fused frames")
             serial, encoded = self._pending.popleft()
             self._file.write(str(serial), encoded.result())
+
+
+def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
+    """The cells of an image in which most pixels are readings of the static world, bit by bit."""
+    import cv2
+
+    used = (static & (frame.depth > 0)).astype(np.float32)
+    cells = np.asarray(cv2.resize(used, CELLS, interpolation=cv2.INTER_AREA)) > 0.5
+    return int(cells.ravel() @ (1 << np.arange(cells.size)))
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.geometry import se3
 from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_store import CELLS
 from dudmap.core.places.loop_correction import LoopCorrector, odometry_sigmas
 from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE, LOCAL_FRAMES
 
@@ -25,9 +26,10 @@ MIN_KEPT = 256
 class FrameThinning:
     """Removes kept frames of the current submap whose view newer ones show.
 
-    A frame is removed when newer frames of the same view (SAME_DISTANCE, SAME_ANGLE_DEG) stand for more than
-    ``similarity.threshold`` of the readings that the running average of a voxel can hold, and when LOCAL_FRAMES of them
-    were kept before any keyframe nearby was last seen: a return to its place is compared with what was kept until then.
+    A frame is removed when, in every cell of its image that it was fused in, newer frames of the same view
+    (SAME_DISTANCE, SAME_ANGLE_DEG) stand for more than ``similarity.threshold`` of the readings that the running
+    average of a voxel can hold: what is seen behind somebody who stays there is kept. LOCAL_FRAMES of them must have
+    been kept before any keyframe nearby was last seen: a return to its place is compared with what was kept until then.
     The nearest of the latter replaces the frame: its corrections are those of the frame, too, and motions measured to
     the frame go over to it. The tracked motion from the frame before to the one after keeps the noise of both parts.
 
@@ -74,7 +76,10 @@ class FrameThinning:
         history = self.atlas.history
         assert history is not None
         newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i]))
-        if sum(history.counts[nodes[j]] for j in newer) < self._enough:
+        cells = np.array([history.cells[nodes[j]] for j in (i, *newer)], np.int64)
+        fused = (cells[:, None] >> np.arange(np.prod(CELLS))) & 1
+        readings = np.array([history.counts[nodes[j]] for j in newer], np.int64) @ fused[1:]
+        if np.any(readings[fused[0] > 0] < self._enough):
             return None
         nearby = self.atlas.keyframes.near(Ts[i], self.atlas.current, 2 * LOCAL_DISTANCE, 2 * LOCAL_ANGLE_DEG)
         seen = [keyframe.last_seen for keyframe in nearby if keyframe.last_seen >= history.timestamps[nodes[i]]]
