@@ -81,7 +81,7 @@ class LoopCloser:
         self.atlas = atlas
         self.verifier = LoopVerifier(config, atlas, tracker)
         self.corrector = LoopCorrector(atlas)
-        self.thinning = FrameThinning(config, atlas, self.corrector)
+        self.thinning = FrameThinning(config, atlas)
         self.closed = 0
         self._frame = 0
         self._next_search = 0
