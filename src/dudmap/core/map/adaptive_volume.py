@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import adaptive_raycasting
-from dudmap.core.backends.parameters import DepthView, MeshParameters, RaycastParameters, RaycastResult
+from dudmap.core.backends.parameters import (
+    DepthView,
+    FusionParameters,
+    MeshParameters,
+    RaycastParameters,
+    RaycastResult,
+)
 from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
@@ -22,7 +28,7 @@ from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import MapContent
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
-from dudmap.core.map.refinement import Refinement, prolonged
+from dudmap.core.map.refinement import prolonged, refine
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.errors import MapError
@@ -62,38 +68,11 @@ class AdaptiveVolume(TsdfVolume):
     Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
     mesh and views read the finest. See ``docs/adaptive.md``.
 
-    Args:
-        camera, config, sensor, depth_max, backend, max_blocks, extent: As of ``TsdfVolume``.
-
     Attributes:
         levels: The finer levels, that with the larger voxels first.
-
-    Raises:
-        MapError: As of ``TsdfVolume``.
     """
 
     levels: Sequence[FineBlocks]
-
-    def __init__(
-        self,
-        camera: Camera,
-        config: VolumeConfig | None = None,
-        sensor: SensorConfig | None = None,
-        depth_max: float = 6.0,
-        backend: Backend | None = None,
-        max_blocks: int | MemoryLimit | None = None,
-        extent: float | None = None,
-    ) -> None:
-        super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
-        self._level_parameters, self._refinements = [], []
-        for number in range(self.config.adaptive_levels):
-            coarse = self.voxel_size / 2**number
-            halved = self.config.model_copy(update={"voxel_size": coarse / 2})
-            parameters = fusion_parameters(halved, self.sensor, depth_max)
-            band = parameters.band._replace(limit=self.band.limit)
-            self._level_parameters.append(parameters._replace(band=band, sdf_unit=self.sdf_unit))
-            parents = self.band if number == 0 else self._level_parameters[number - 1].band
-            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
 
     def _empty(self) -> None:
         super()._empty()
@@ -115,6 +94,14 @@ class AdaptiveVolume(TsdfVolume):
     def _coarser(self) -> list[VoxelBlocks]:
         """The parents of each level."""
         return self.all_blocks.parents
+
+    def _parameters_of(self, n: int) -> FusionParameters:
+        """Parameters of the fusion into a level, 0 is the coarsest; all store distances in its steps."""
+        if n == 0:
+            return self.parameters
+        finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
+        parameters = fusion_parameters(finer, self.sensor, self.depth_max)
+        return parameters._replace(band=parameters.band._replace(limit=self.band.limit), sdf_unit=self.sdf_unit)
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -139,7 +126,9 @@ class AdaptiveVolume(TsdfVolume):
             updated_children = self._average_finer(n, view, color, weights, children, count)
             updated = updated[~gone]
             depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
-            self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
+            self._note_change(
+                n, refine(level, parents, updated, depths, number, self.config, self.sensor, self._parameters_of(n))
+            )
             slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
         return fused
 
@@ -161,7 +150,7 @@ class AdaptiveVolume(TsdfVolume):
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied = self.backend.fuse(
-            grid, view, color, weights, candidates, blocks.fused, turn, count, self._level_parameters[n]
+            grid, view, color, weights, candidates, blocks.fused, turn, count, self._parameters_of(n + 1)
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1

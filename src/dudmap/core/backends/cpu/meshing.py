@@ -87,56 +87,24 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
     return count
 
 
-@kernel
-def _find_vertices(start, stop, geometry, near, behind, cases, flags):
-    """Bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a cell with triangles.
+@scalar
+def _edge(row, n, corner, near, row_of):
+    """Row of the block, and number there, of the voxel at a corner of cell ``n`` of the block in ``row``."""
+    i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
+    if (i | j | k) & 8:
+        row = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (k >> 3)]])
+    return row, ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
 
-    Returns:
-        (stop - start,) int64 vertices per block.
-    """
-    words = np.empty((9, 9, 9), np.int32)
-    used = np.empty((9, 9, 9), np.uint8)  # cells -1 to 7 in each direction
-    count = np.zeros(stop - start, np.int64)
-    for row in range(start, stop):
-        any_used = False
-        for m in range(8):
-            dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
-            other = behind[row, m]
-            for i in range(7 if dx else 0, 8):
-                for j in range(7 if dy else 0, 8):
-                    for k in range(7 if dz else 0, 8):
-                        case = cases[other, (i * 8 + j) * 8 + k] if other >= 0 else np.uint8(0)
-                        used[0 if dx else i + 1, 0 if dy else j + 1, 0 if dz else k + 1] = case
-                        any_used |= case != 0
-        if not any_used:
-            flags[row, :] = 0
-            continue
-        _corner_words(geometry, near, row, words)
-        total = 0
-        for i in range(8):
-            for j in range(8):
-                for k in range(8):
-                    word = words[i, j, k]
-                    flag = 0
-                    middle = used[i + 1, j + 1, k + 1]
-                    if (word ^ words[i + 1, j, k]) < 0 and (
-                        middle | used[i + 1, j, k + 1] | used[i + 1, j + 1, k] | used[i + 1, j, k]
-                    ):
-                        flag |= 1
-                        total += 1
-                    if (word ^ words[i, j + 1, k]) < 0 and (
-                        middle | used[i, j + 1, k + 1] | used[i + 1, j + 1, k] | used[i, j + 1, k]
-                    ):
-                        flag |= 2
-                        total += 1
-                    if (word ^ words[i, j, k + 1]) < 0 and (
-                        middle | used[i, j + 1, k + 1] | used[i + 1, j, k + 1] | used[i, j, k + 1]
-                    ):
-                        flag |= 4
-                        total += 1
-                    flags[row, (i * 8 + j) * 8 + k] = flag
-        count[row - start] = total
-    return count
+
+@kernel
+def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags):
+    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a triangle."""
+    for row in range(len(cases)):
+        for n in range(512):
+            case = cases[row, n]
+            for k in range(3 * np.int64(triangle_count[case])):
+                owner, voxel = _edge(row, n, np.int64(triangles[case, k, 0]), near, row_of)
+                flags[owner, voxel] |= np.uint8(1 << triangles[case, k, 1])
 
 
 @kernel
@@ -251,15 +219,9 @@ def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, b
             case = cases[row, n]
             if case == 0:
                 continue
-            x, y, z = n >> 6, (n >> 3) & 7, n & 7
             for k in range(3 * np.int64(triangle_count[case])):
-                corner, axis = np.int64(triangles[case, k, 0]), np.int64(triangles[case, k, 1])
-                i, j, m = x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)
-                owner = row
-                if (i | j | m) & 8:
-                    owner = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (m >> 3)]])
-                voxel = ((i & 7) * 8 + (j & 7)) * 8 + (m & 7)
-                below = flags[owner, voxel] & ((1 << axis) - 1)
+                owner, voxel = _edge(row, n, np.int64(triangles[case, k, 0]), near, row_of)
+                below = flags[owner, voxel] & ((1 << np.int64(triangles[case, k, 1])) - 1)
                 vertex = first_vertex[owner] + np.int64(first[owner, voxel]) + (below & 1) + (below >> 1)
                 faces[number + k // 3, k % 3] = vertex
             number += np.int64(triangle_count[case])
@@ -359,16 +321,17 @@ def _extract(
     slots, near, behind, row_of = links(slots, neighbours, len(geometry))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
-    flags = np.empty((n, 512), dtype=np.uint8)
+    flags = np.zeros((n, 512), dtype=np.uint8)
     least = max(int(parameters.min_weight), 1)
     jump = int(min(parameters.max_jump / parameters.sdf_unit, 1 << 20))
     triangles = run_bands(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
-    owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
+    _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags)
+    owned = np.sum([(flags >> axis) & 1 for axis in range(3)], axis=0, dtype=np.int64).sum(axis=1)
     first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
-    first_vertex = _offsets(owned)
+    first_vertex = _offsets([owned])
     vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
     vertex_colors = np.empty((first_vertex[-1], 3), dtype=np.uint8)
     normals = np.empty((first_vertex[-1], 3), dtype=np.float32)
