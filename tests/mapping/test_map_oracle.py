@@ -310,7 +310,7 @@ def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     mesh = volume.extract_mesh()
     inside = (np.abs(mesh.vertices[:, 0]) < 0.15) & (np.abs(mesh.vertices[:, 1]) < 0.1)
     assert not np.any(inside & (mesh.vertices[:, 2] < 2.5))
-    assert volume.num_free_blocks > 0
+    assert volume.blocks.num_free(volume.config.free_after) > 0
     seen = volume.sample(box_before_wall().depth, np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
     empty = (seen.occupancy == FREE) | (seen.distance > 0.8 * volume.truncation)
     assert np.mean(empty[18:32, 24:41]) > 0.9
@@ -371,7 +371,7 @@ def test_save_and_load_give_an_equal_map(tmp_path):
     assert np.array_equal(a.vertices, b.vertices)
     assert np.array_equal(a.faces, b.faces)
     assert (loaded.config, loaded.sensor, loaded.depth_max) == (volume.config, volume.sensor, volume.depth_max)
-    assert loaded.num_free_blocks == volume.num_free_blocks
+    assert loaded.blocks.num_free(loaded.config.free_after) == volume.blocks.num_free(volume.config.free_after)
     loaded.integrate(wall(1.5, 5), np.eye(4))
     volume.integrate(wall(1.5, 5), np.eye(4))
     assert np.array_equal(volume.extract_mesh().vertices, loaded.extract_mesh().vertices)
@@ -404,7 +404,7 @@ def test_space_that_was_seen_empty_costs_a_hundredth_of_its_voxels():
     before = volume.num_bytes
     for _ in range(12):
         volume.integrate(wall(3.5), np.eye(4))
-    assert volume.num_free_blocks > 1.5 * volume.num_blocks
+    assert volume.blocks.num_free(volume.config.free_after) > 1.5 * volume.num_blocks
     voxels = 2 * 512 * 4
     index = volume.num_bytes - before - volume.blocks.num_slots * (voxels + 20)
     assert 0 < index <= 0.01 * voxels * volume.blocks.num_entries

@@ -41,11 +41,6 @@ class PagedMap:
         return self.num_blocks == 0
 
     @property
-    def num_free_blocks(self) -> int:
-        """Blocks in memory known to be free space; they own no voxels."""
-        return self.blocks.num_free(self.config.free_after)
-
-    @property
     def num_bytes(self) -> int:
         """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
         hash table.
@@ -54,11 +49,6 @@ class PagedMap:
         is the window, whose size depends on the view and the voxels, not on the map.
         """
         return self.blocks.num_bytes
-
-    @property
-    def entry_bytes(self) -> float:
-        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self.blocks.entry_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:

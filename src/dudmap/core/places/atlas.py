@@ -22,8 +22,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
-from dudmap.core.places.prior_map import PriorMap
-from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
 

@@ -97,14 +97,17 @@ def _edge(row, n, corner, near, row_of):
 
 
 @kernel
-def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags):
-    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a triangle."""
+def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned):
+    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a triangle, and count
+    them block by block."""
     for row in range(len(cases)):
         for n in range(512):
             case = cases[row, n]
             for k in range(3 * np.int64(triangle_count[case])):
                 owner, voxel = _edge(row, n, np.int64(triangles[case, k, 0]), near, row_of)
-                flags[owner, voxel] |= np.uint8(1 << triangles[case, k, 1])
+                bit = np.uint8(1 << triangles[case, k, 1])
+                owned[owner] += np.int64(flags[owner, voxel] & bit == 0)
+                flags[owner, voxel] |= bit
 
 
 @kernel
@@ -328,8 +331,8 @@ def _extract(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
-    _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags)
-    owned = np.sum([(flags >> axis) & 1 for axis in range(3)], axis=0, dtype=np.int64).sum(axis=1)
+    owned = np.zeros(n, dtype=np.int64)
+    _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags, owned)
     first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
     first_vertex = _offsets([owned])
     vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
