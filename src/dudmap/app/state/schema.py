@@ -18,7 +18,7 @@ import numpy as np
 CLASSES = """
 app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
-core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
+core.backends.cpu.consensus:ConsensusParams,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
@@ -47,7 +47,7 @@ core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker
 core.objects.regions:MovingPixels,Region core.objects.scene_flow:InstanceFrame core.places.atlas:TimedPose,Atlas
 core.places.features:ImageFeatures,SiftExtractor
 core.places.frame_store:StoredFrame,FrameStore core.places.frame_thinning:FrameThinning
-core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
+core.places.loop_closing:LoopSearch,LoopCloser
 core.places.loop_correction:LoopCorrector core.places.loop_verification:LoopQuery,LoopVerifier
 core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge

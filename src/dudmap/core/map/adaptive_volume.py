@@ -113,11 +113,10 @@ class AdaptiveVolume(TsdfVolume):
         self,
         depth: NDArray[np.float32],
         color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
+        weights: NDArray[np.uint8],
         T_world_camera: NDArray[np.float64],
         count: int,
     ) -> NDArray[np.int32]:
-        weights = self._reading_weights(depth, self.camera) if weights is None else weights
         fused = super()._fuse(depth, color, weights, T_world_camera, count)
         number = self._frame_number
         view = self._view(depth, T_world_camera)

@@ -131,7 +131,6 @@ class TsdfVolume(PagedMap):
         frame: Frame,
         T_world_camera: NDArray[np.float64],
         static_mask: NDArray[np.bool_] | None = None,
-        weights: NDArray[np.uint8] | None = None,
         count: int = 1,
     ) -> None:
         """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
@@ -140,7 +139,6 @@ class TsdfVolume(PagedMap):
             frame: Depth (m) and colour of the volume's camera.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            weights: (H, W) uint8 weight of each reading; None = by the configuration.
             count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
 
         Raises:
@@ -157,25 +155,24 @@ class TsdfVolume(PagedMap):
         used_readings(np.ascontiguousarray(frame.depth, np.float32), used, np.float32(self.depth_max), depth)
         self.look_at(T_world_camera)
         self._frame_number += 1
-        self._fuse(depth, frame.color, weights, T_world_camera, count)
+        self._fuse(depth, frame.color, self._reading_weights(depth, self.camera), T_world_camera, count)
 
     def _fuse(
         self,
         depth: NDArray[np.float32],
         color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
+        weights: NDArray[np.uint8],
         T_world_camera: NDArray[np.float64],
         count: int,
     ) -> NDArray[np.int32]:
-        """Fuse an image whose view the window covers, 0 where nothing is to be fused; other arguments as of
-        ``integrate``.
+        """Fuse an image (H, W) whose view the window covers, 0 where nothing is to be fused, by the weights (H, W) of
+        its readings; other arguments as of ``integrate``.
 
         Returns:
             (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
         """
         view = self._view(depth, T_world_camera)
         self._allocate(view)
-        weights = self._reading_weights(depth, self.camera) if weights is None else weights
         slots = self._average(view, color, weights, count)
         if self.config.carving:
             self._observe_free(view, count)

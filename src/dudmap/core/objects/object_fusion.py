@@ -287,15 +287,14 @@ class ObjectFusion:
         result = self._align(track.volume, view, [se3.inverse(T) @ T_world_camera for T in predictions])
         T_object_camera = result.T_world_camera
         track.last_seen = now
+        track.registrations += 1
         if not result.converged:
             track.misfits.append(result.reason)
             track.velocity = np.concatenate([mover.velocity, np.zeros(3)])
             track.T_world_object = predictions[1]
-            track.checks.append((np.nan, np.nan))
             return
         seen_through = self._seen_through_share(track, observation, T_object_camera)
         off_surface = self._off_surface_share(track, view, T_object_camera)
-        track.checks.append((seen_through, off_surface))
         T = T_world_camera @ se3.inverse(T_object_camera)
         rotation = (T @ se3.inverse(track.T_world_object))[:3, :3]
         translation = T[:3, 3] - track.T_world_object[:3, 3]

@@ -1,4 +1,4 @@
-"""Store of fused frames on disk, from which the map is rebuilt with corrected poses or masks."""
+"""Store of fused frames on disk, from which the map is rebuilt with corrected poses."""
 
 import weakref
 from collections import deque
@@ -119,7 +119,7 @@ class FrameStore:
 
         Args:
             frame: Depth as it was fused, and colour as it was recorded; the arrays must not change afterwards.
-            static: (H, W) bool, pixels that were fused. The others are stored too, for corrected masks.
+            static: (H, W) bool, pixels that were fused. The others are stored too.
             T_world_camera: (4, 4).
             submap: Number of the submap it was fused into.
             exposure: Gain and offset to the colours of the map.
@@ -208,7 +208,6 @@ class FrameStore:
         volume: TsdfVolume,
         numbers: Sequence[int] | None = None,
         Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
-        static_masks: Sequence[NDArray[np.bool_] | None] | None = None,
     ) -> None:
         """Fuse stored frames into a map, each with the weight of the frames it represents.
 
@@ -216,13 +215,11 @@ class FrameStore:
             volume: The map, usually an empty one.
             numbers: Numbers of the frames, in the order of fusion; None = all that are kept.
             Ts_world_camera: Poses (4, 4); None = the stored ones.
-            static_masks: (H, W) bool each, pixels that are fused; None = those fused before.
         """
         for i, number in enumerate(self.kept if numbers is None else numbers):
             stored = self[number]
             T = stored.T_world_camera if Ts_world_camera is None else Ts_world_camera[i]
-            static = None if static_masks is None else static_masks[i]
-            volume.integrate(stored.frame, T, stored.static if static is None else static, count=stored.count)
+            volume.integrate(stored.frame, T, stored.static, stored.count)
 
     def _write(self, max_pending: int) -> None:
         """Write encoded frames to the file until at most this many are pending."""
