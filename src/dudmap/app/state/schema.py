@@ -33,7 +33,7 @@ core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
 core.dynamics.temporal_memory:RememberedFrame,TemporalMemory
 core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level core.frames.preprocess:Preprocessor
-core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
+core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
 core.geometry.lens:Lens,OtherView core.geometry.mesh:Mesh core.geometry.trajectory:Trajectory
 core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager
