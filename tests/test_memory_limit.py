@@ -8,6 +8,7 @@ import pytest
 from dudmap.config import Config
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.geometry.mesh_pieces import load_simplified, save_pieces
+from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.core.slam import Slam
@@ -56,9 +57,9 @@ def test_a_limit_is_met_by_what_is_left_for_the_map():
     limit = MemoryLimit(resident_bytes() + 1_000_000_000)
     blocks = VoxelBlocks()
     expected = (0.75 * limit.limit - resident_bytes()) / 4.1e3
-    assert 0.9 * expected < limit(blocks) < 1.1 * expected
+    assert 0.9 * expected < limit(BlockTree(blocks, ())) < 1.1 * expected
     blocks.num_slots += 1000  # slots that were provided are resident, used or not
-    assert limit(blocks) >= 1000
+    assert limit(BlockTree(blocks, ())) >= 1000
     with pytest.raises(ConfigError, match="found a memory limit of 1 MB; the program takes"):
         MemoryLimit(1_000_000)
 

@@ -9,8 +9,8 @@ from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarg
 from dudmap.config import Config, PreprocessConfig, SensorConfig
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.calibration.adjustment import Adjustment, Fit
-from dudmap.core.calibration.collector import KeyframeCollector
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
+from dudmap.core.calibration.keyframes import KeyframeCollector
 from dudmap.core.calibration.pairs import Pair, PairSet
 from dudmap.core.frames.color_registration import color_projection
 from dudmap.core.frames.frame import Frame

@@ -40,7 +40,7 @@ OWNERS = {
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
-        "core/map/integrator.py:fusion_parameters",  # hands them on, as do all that follow
+        "core/map/fusion_parameters.py:fusion_parameters",  # hands them on, as do all that follow
         "core/tracking/tracker.py:_chi_square",
         "core/dynamics/detector.py:_noise_parameters",
         "core/dynamics/detector.py:distance_sigma",

@@ -10,7 +10,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import AdaptiveVolume
 from dudmap.core.map.incremental_mesh import IncrementalMesh
-from dudmap.core.map.refinement import MAX_CALM
+from dudmap.core.map.refinement import MAX_CALM, _drop_calm
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.volume_mirror import VolumeMirror
 from dudmap.core.places.saved_map import MAP_FILE
@@ -105,14 +105,13 @@ def test_smaller_voxels_are_dropped_after_calm_examinations_in_a_row_only():
     """A block that is needed every now and then stays; one is dropped with the last of MAX_CALM calm examinations."""
     dropped, calm = [], np.zeros(2, np.uint8)
     level = SimpleNamespace(calm=calm, drop=lambda slots: dropped.append(slots.tolist()))
-    refinement = fused([])._refinements[0]
     children = np.full((2, 8), -1, np.int32)
     children[:, 3] = 0, 1
     surface = np.ones((2, 8), bool)
     for number in range(3 * MAX_CALM):
         needed = np.zeros((2, 8), np.float32)
         needed[0, 3] = number % MAX_CALM == MAX_CALM - 1
-        refinement._drop_calm(level, children, surface, needed)
+        _drop_calm(level, children, surface, needed)
         assert dropped[-1] == ([1] if number >= MAX_CALM - 1 else [])
 
 

@@ -11,7 +11,7 @@ from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.system import restore, take_snapshot
 from dudmap.core.geometry import se3
 from dudmap.core.map.block_pager import MAX_PENDING, REGION, BlockPager
-from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.incremental_mesh import IncrementalMesh
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks

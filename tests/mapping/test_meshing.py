@@ -46,10 +46,19 @@ def lattice(n):
     return np.stack(np.meshgrid(*[np.arange(n, dtype=np.float64)] * 3, indexing="ij"), axis=-1)
 
 
+def extract(*arguments):
+    """Vertices, faces, colours and normals."""
+    return tuple(vars(meshing.extract(*arguments)).values())
+
+
+def extract_chunks(*arguments):
+    return [tuple(vars(mesh).values()) for mesh in meshing.extract_chunks(*arguments)]
+
+
 def extracted(sdf, weight=None, shade=None, voxel_size=0.01, min_weight=1, origin=(0, 0, 0)):
     weight = np.full(sdf.shape, 9) if weight is None else weight
     shade = np.full(sdf.shape, 128) if shade is None else shade
-    return meshing.extract(*blocks_of(sdf, weight, shade, origin), MeshParameters(voxel_size, UNIT, min_weight))
+    return extract(*blocks_of(sdf, weight, shade, origin), MeshParameters(voxel_size, UNIT, min_weight))
 
 
 def edge_counts(faces):
@@ -205,7 +214,7 @@ def test_untrusted_and_missing_blocks_make_a_border():
     assert np.isfinite(normals).all()
     geometry, colors, slots, coords, neighbours = blocks_of(sdf, weight, weight)
     some = coords[slots][:, 0] != 1
-    part = meshing.extract(geometry, colors, slots[some], coords, neighbours[some], MeshParameters(0.01, UNIT, 3))
+    part = extract(geometry, colors, slots[some], coords, neighbours[some], MeshParameters(0.01, UNIT, 3))
     x = part[0][:, 0] / 0.01
     assert not np.any((x > 7.001) & (x < 15.999))
     assert len(np.unique(part[1])) == len(part[0])
@@ -224,10 +233,10 @@ def test_chunks_make_up_the_whole():
     sdf = rng.uniform(-1, 1, (24, 24, 24))
     weight = rng.choice([0, 9], sdf.shape, p=[0.03, 0.97])
     arrays = blocks_of(sdf, weight, 100 + 0 * weight)
-    whole = meshing.extract(*arrays, MeshParameters(0.01, UNIT, 3))
+    whole = extract(*arrays, MeshParameters(0.01, UNIT, 3))
     _, _, slots, coords, _ = arrays
     chunks = coords[slots] @ np.array([1, 0, 1])  # 0 to 4
-    parts = meshing.extract_chunks(*arrays, MeshParameters(0.01, UNIT, 3), chunks)
+    parts = extract_chunks(*arrays, MeshParameters(0.01, UNIT, 3), chunks)
     assert len(parts) == 5
     for vertices, faces, _, normals in parts:
         assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
@@ -245,11 +254,11 @@ def test_changed_chunk_alone_equals_the_same_chunk_of_all():
     geometry, colors, slots, coords, neighbours = blocks_of(sdf, 9 + 0 * sdf, 100 + 0 * sdf)
     places = coords[slots]
     chunks = (places // 2) @ np.array([4, 2, 1])
-    parts = meshing.extract_chunks(geometry, colors, slots, coords, neighbours, MeshParameters(0.01, UNIT, 3), chunks)
+    parts = extract_chunks(geometry, colors, slots, coords, neighbours, MeshParameters(0.01, UNIT, 3), chunks)
     wanted = 2  # blocks (0..1, 2..3, 0..1)
     needed = np.all((places >= [0, 2, 0]) & (places <= [2, 4, 2]), axis=1)
     only = np.where(chunks == wanted, 0, -1)[needed]
-    alone = meshing.extract_chunks(
+    alone = extract_chunks(
         geometry, colors, slots[needed], coords, neighbours[needed], MeshParameters(0.01, UNIT, 3), only
     )  # fmt: skip
     assert len(alone) == 1
@@ -261,12 +270,10 @@ def test_nothing_to_mesh():
     assert (len(vertices), len(faces), len(colors), len(normals)) == (0, 0, 0, 0)
     empty = np.empty((0, 8), np.int32)
     geometry = np.zeros((4, 512), np.int32)
-    result = meshing.extract(
-        geometry, geometry, empty[:, 0], np.zeros((4, 3), np.int32), empty, MeshParameters(0.01, UNIT, 1)
-    )
+    result = extract(geometry, geometry, empty[:, 0], np.zeros((4, 3), np.int32), empty, MeshParameters(0.01, UNIT, 1))
     assert [len(part) for part in result] == [0, 0, 0, 0]
     assert (
-        meshing.extract_chunks(
+        extract_chunks(
             geometry, geometry, empty[:, 0], geometry[:, :3], empty, MeshParameters(0.01, UNIT, 1), empty[:, 0]
         )
         == []

@@ -15,7 +15,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import LOCAL_GRID
-from dudmap.core.map.integrator import fusion_parameters
+from dudmap.core.map.fusion_parameters import fusion_parameters
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.estimate import PoseEstimate
@@ -175,5 +175,5 @@ def test_free_space_ten_kilometres_away_is_seen_as_at_the_origin():
         T[:3, 3] = place
         for _ in range(2 * CONFIG.volume.free_after):
             volume.integrate(wall, T)
-        known.append(volume.num_free_blocks)
+        known.append(volume.blocks.num_free(volume.config.free_after))
     assert known[1] == known[0] > 100

@@ -13,8 +13,7 @@ from dudmap.config import VolumeConfig
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.lens import Lens
-from dudmap.core.geometry.other_view import OtherView
+from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.io.exporting.exporters import export_run

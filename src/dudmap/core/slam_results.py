@@ -12,8 +12,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.places.atlas import Atlas
-from dudmap.core.places.prior_map import PriorMap
-from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 
 

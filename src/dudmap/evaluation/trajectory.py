@@ -302,7 +302,7 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
     their common principal directions, metres. The rotation is determined only if the second one is not zero.
     """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
-    T, _, spread = umeyama(targets, positions)
+    T, spread = umeyama(targets, positions)
     if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
         return T, "se3"
     rotations = Ts_reference[:, :3, :3] @ np.swapaxes(Ts_estimate[:, :3, :3], 1, 2)

@@ -12,9 +12,8 @@ from dudmap.app.pipeline.frame_source import read_ahead
 from dudmap.config import Config
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.threads import num_threads
-from dudmap.core.calibration.collector import KeyframeCollector
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate, mask_of
-from dudmap.core.calibration.keyframes import halvings_to
+from dudmap.core.calibration.keyframes import KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.pyramid import HALVING_BAND
 from dudmap.core.geometry.calibration import Calibration

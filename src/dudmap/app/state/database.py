@@ -24,8 +24,7 @@ from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 from dudmap.app.state.tree import Snapshot
 from dudmap.core.map.block_pager import Region
-from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of
-from dudmap.core.map.voxel_blocks import BlockRecords
+from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.places.frame_store import EncodedFrame
 from dudmap.errors import StateError
 from dudmap.input_files import (

@@ -11,16 +11,16 @@ class FrameSnapshot:
 
     Attributes:
         number: Number of the store in the database.
-        frames: The frames that the database lacks, by serial: depth, colour and mask as files.
-        gone: Serials of those that it holds, and the store does not any more.
-        serials: Serials of all frames of the store.
+        frames: The frames that the database lacks, by number: depth, colour and mask as files.
+        gone: Numbers of those that it holds, and the store does not any more.
+        kept: Numbers of the frames whose images are in the store.
         store: The store.
     """
 
     number: int
     frames: dict[int, EncodedFrame]
     gone: list[int]
-    serials: set[int]
+    kept: set[int]
     store: FrameStore
 
 
@@ -35,17 +35,17 @@ class StoredFrames:
         number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
         if number == len(self._stores):
             self._stores.append((store, set()))
-        stored, serials = self._stores[number][1], set(store.serials)
-        frames = {serial: store.encoded(n) for n, serial in enumerate(store.serials) if serial not in stored}
-        return FrameSnapshot(number, frames, sorted(stored - serials), serials, store)
+        stored, kept = self._stores[number][1], set(store.kept)
+        frames = {n: store.encoded(n) for n in store.kept if n not in stored}
+        return FrameSnapshot(number, frames, sorted(stored - kept), kept, store)
 
     def commit(self, frames: list[FrameSnapshot]) -> None:
         """What these snapshots hold is in the database."""
         for changed in frames:
-            self._stores[changed.number] = changed.store, changed.serials
+            self._stores[changed.number] = changed.store, changed.kept
 
     def add(self, store: FrameStore, number: int) -> None:
         """The frames of a store come from the database."""
         while len(self._stores) <= number:
             self._stores.append((store, set()))
-        self._stores[number] = store, set(store.serials)
+        self._stores[number] = store, set(store.kept)

@@ -18,14 +18,14 @@ import numpy as np
 CLASSES = """
 app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
-core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
+core.backends.cpu.consensus:ConsensusParams,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
-core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FreeSpace,TouchedBlocks,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
+core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FreeSpace,TouchedBlocks,FusedBlocks,NormalEquations,MapSample,RaycastResult
 core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
-core.calibration.collector:KeyframeCollector core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
-core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
+core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
+core.calibration.keyframes:ColorKeyframe,KeyframeCollector core.calibration.pairs:Pair,PairSet
 core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
 core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
@@ -33,26 +33,26 @@ core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
 core.dynamics.temporal_memory:RememberedFrame,TemporalMemory
 core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level core.frames.preprocess:Preprocessor
-core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
+core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
-core.geometry.lens:Lens core.geometry.mesh:Mesh core.geometry.other_view:OtherView core.geometry.trajectory:Trajectory
-core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager core.map.block_tree:BlockTree
-core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks core.map.incremental_mesh:IncrementalMesh
-core.map.integrator:Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
-core.map.paged_map:PagedMap core.map.refinement:Refinement
+core.geometry.lens:Lens,OtherView core.geometry.mesh:Mesh core.geometry.trajectory:Trajectory
+core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager
+core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks,BlockTree core.map.incremental_mesh:IncrementalMesh
+core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
+core.map.paged_map:PagedMap
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
-core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectFusion
+core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectView,ObjectFusion
 core.objects.object_map:RigidObject,ObjectVolume,ObjectTrack
-core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker core.objects.object_view:ObjectView
+core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker
 core.objects.regions:MovingPixels,Region core.objects.scene_flow:InstanceFrame core.places.atlas:TimedPose,Atlas
 core.places.features:ImageFeatures,SiftExtractor
 core.places.frame_store:StoredFrame,FrameStore core.places.frame_thinning:FrameThinning
-core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
+core.places.loop_closing:LoopSearch,LoopCloser
 core.places.loop_correction:LoopCorrector core.places.loop_verification:LoopQuery,LoopVerifier
 core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge
-core.places.prior_map:PriorMap core.places.redundancy:SimilarityTest,_Place,RedundantViews
-core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap core.result:FrameResult
+core.places.redundancy:SimilarityTest,_Place,RedundantViews
+core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap,PriorMap core.result:FrameResult
 core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
 core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
 core.tracking.front_end:FrontEnd core.tracking.gradient_agreement:GradientAgreement

@@ -352,9 +352,9 @@ class TreeReader:
 
     def _connect_frames(self, store: FrameStore, number: int) -> None:
         reader = self._reader
-        if reader.frames(number) != store.serials:
+        if reader.frames(number) != store.kept:
             raise StateError(f"the state of the run in {reader.path} is damaged: stored frames are missing")
-        store.continue_from(lambda serial: reader.frame(number, serial))
+        store.continue_from(lambda n: reader.frame(number, n))
         if self._database is not None:
             self._database.frames.add(store, number)
 

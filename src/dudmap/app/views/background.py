@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.lens import Lens
-from dudmap.core.geometry.other_view import OtherView
+from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.map.volume import TsdfVolume
 
 SAMPLES = 5

@@ -360,19 +360,3 @@ class RaycastResult(NamedTuple):
     depth: NDArray[np.float32]
     color: NDArray[np.uint8]
     normals: NDArray[np.float32]
-
-
-class MeshArrays(NamedTuple):
-    """Triangles over shared vertices.
-
-    Attributes:
-        vertices: (V, 3) float32, metres, world frame.
-        faces: (F, 3) int32, counter-clockwise seen from free space.
-        colors: (V, 3) uint8, red green blue.
-        normals: (V, 3) float32, unit length, pointing to free space.
-    """
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    colors: NDArray[np.uint8]
-    normals: NDArray[np.float32]

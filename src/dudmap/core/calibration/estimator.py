@@ -108,7 +108,7 @@ class CalibrationEstimator:
         self.workers = workers
         self.adjustment = Adjustment(given, sensor)
 
-    def estimate(self, keyframes: Sequence[ColorKeyframe], count: int = PAIRS) -> Estimate:
+    def estimate(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
         """Calibration that explains pairs of frames, as far as they prove it.
 
         Groups of parameters leave the given values one after the other, of those that prove themselves that with the
@@ -118,10 +118,9 @@ class CalibrationEstimator:
 
         Args:
             keyframes: In the order of time.
-            count: Number of pairs, half of them in each half of the time.
         """
         middle = len(keyframes) // 2
-        within = [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
+        within = [select_pairs(part, PAIRS // 2) for part in (keyframes[:middle], keyframes[middle:])]
         if min(len(pairs) for pairs in within) < MIN_PAIRS:
             return Estimate(self.given, dict.fromkeys(GROUPS, float("nan")), 0.0, sum(map(len, within)))
         halves = [PairSet(pairs, STRIDE) for pairs in within]
@@ -132,7 +131,7 @@ class CalibrationEstimator:
         ]
         start = _Trial(~everything, fits, [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)])
         proven, evidence = self._proven(halves, start)
-        pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], count // 2)])
+        pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], PAIRS // 2)])
         free, levels = proven.free, self.adjustment.levels
         fit, covariance = Fit.tracked(pairs, proven.fits[1].calibration), None
         if free.any():

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.collector import KeyframeCollector
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
+from dudmap.core.calibration.keyframes import KeyframeCollector
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 

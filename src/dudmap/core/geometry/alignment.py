@@ -1,7 +1,6 @@
 """Rigid alignment of point sets (Kabsch 1976, Umeyama 1991; RANSAC: Fischler and Bolles 1981), comparison of poses."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ def rigid_ransac(
     b: NDArray[np.float64],
     tolerance: NDArray[np.float64],
     inlier_share: float = 0.25,
-    seed: int = 1,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Rigid motion T_a_b that the most pairs of points agree with (RANSAC); the same input gives the same answer.
 
@@ -30,7 +28,6 @@ def rigid_ransac(
         tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of an inlier, metres.
         inlier_share: Smallest share w of inliers at which the motion is to be found, at least 0.1. It gives the number
             of samples of three pairs, ``log(1 - p) / log(1 - w^3)`` for a success with probability p.
-        seed: Seed of the random samples.
 
     Returns:
         T_a_b (4, 4), the least-squares fit to all inliers, and the inliers (m,) bool. If no motion was found the
@@ -40,7 +37,7 @@ def rigid_ransac(
     if len(a) < 3:
         return no_motion
     num_samples = math.ceil(math.log(1 - SUCCESS) / math.log(1 - max(inlier_share, 0.1) ** 3))
-    triples = np.random.default_rng(seed).integers(0, len(a), (num_samples, 3))
+    triples = np.random.default_rng(1).integers(0, len(a), (num_samples, 3))
     sides = [(0, 1), (1, 2), (2, 0)]
     lengths = np.array(
         [[np.linalg.norm(p[triples[:, i]] - p[triples[:, j]], axis=1) for i, j in sides] for p in (a, b)]
@@ -63,42 +60,27 @@ def rigid_ransac(
     return T, inliers
 
 
-class Alignment(NamedTuple):
-    """Similarity transform that aligns two point sets: ``a = scale R b + t``.
+def umeyama(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least-squares rigid alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42).
 
-    Attributes:
-        T_a_b: (..., 4, 4) rotation R and translation t, metres.
-        scale: (...,) 1 unless it was estimated.
-        spread: (..., 3) extent of the two sets together along the principal directions, metres: the square roots of the
-            singular values of their cross-covariance. The rotation is determined only if the second is not zero.
+    Returns:
+        T_a_b (..., 4, 4), metres, and the extent (..., 3) of the two sets together along the principal directions,
+        metres: the square roots of the singular values of their cross-covariance. The rotation is determined only if
+        the second is not zero.
     """
-
-    T_a_b: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    spread: NDArray[np.float64]
-
-
-def umeyama(a: NDArray[np.float64], b: NDArray[np.float64], with_scale: bool = False) -> Alignment:
-    """Least-squares alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42)."""
     a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
     U, singular, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
-    sign = np.linalg.det(U @ V_t)[..., None]  # -1 where the best orthogonal matrix is a reflection
-    U[..., :, 2] *= sign
-    scale = np.ones(a.shape[:-2])
-    if with_scale:
-        trace = singular[..., 0] + singular[..., 1] + sign[..., 0] * singular[..., 2]
-        scale = trace / ((b - b_mean) ** 2).sum(axis=(-2, -1))
+    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # -1 where the best orthogonal matrix is a reflection
     T = np.zeros((*a.shape[:-2], 4, 4))
     T[..., :3, :3] = U @ V_t
-    rotated = b_mean @ np.swapaxes(T[..., :3, :3], -1, -2)
-    T[..., :3, 3] = (a_mean - scale[..., None, None] * rotated)[..., 0, :]
+    T[..., :3, 3] = (a_mean - b_mean @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
     T[..., 3, 3] = 1
-    return Alignment(T, scale, np.sqrt(singular / a.shape[-2]))
+    return T, np.sqrt(singular / a.shape[-2])
 
 
 def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
-    return umeyama(a, b).T_a_b
+    return umeyama(a, b)[0]
 
 
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:

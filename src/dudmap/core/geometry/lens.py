@@ -1,4 +1,4 @@
-"""Images with and without lens distortion."""
+"""Images with and without lens distortion, and as a second camera beside the first sees them."""
 
 from dataclasses import replace
 
@@ -6,6 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
+
+BEHIND = 0.03
+"""A reading hides another one that is farther by this share: two standard deviations of a depth camera at 4 m, and as
+much again for the pixels of one camera that lie between those of the other."""
 
 
 class Lens:
@@ -61,3 +65,68 @@ class Lens:
             uv = self.camera.project(points)
         uv = np.where((z > 0)[:, None] & np.isfinite(uv), uv, -1)
         return np.clip(uv, -1, 1e6).astype(np.float32), z
+
+
+class OtherView:
+    """From the depth camera to a second camera.
+
+    Args:
+        depth_lens: The depth camera.
+        color_lens: The second camera.
+    """
+
+    def __init__(self, depth_lens: Lens, color_lens: Lens) -> None:
+        self.depth_lens, self.color_lens = depth_lens, color_lens
+        one, other = depth_lens.camera, color_lens.camera
+        self._spread = max(1, int(np.ceil(max(other.fx / one.fx, other.fy / one.fy))))
+
+    def depth(self, depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Depth (h, w), metres along the axis of the second camera, 0 where no reading falls.
+
+        Args:
+            depth: (H, W) of the depth camera, metres, 0 = no reading.
+            T_color_depth: (4, 4) points of the depth camera to the second camera, each at its own time.
+        """
+        rows, columns = np.nonzero(depth > 0)
+        return self._splatted(rows, columns, depth[rows, columns], T_color_depth)
+
+    def mask(
+        self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) of the second camera that show what the mask (H, W) marks in the depth camera's image.
+
+        Marked pixels without a reading have that of the nearest marked pixel with one; what the other readings hide
+        from the second camera is left out.
+        """
+        from scipy.ndimage import binary_closing, distance_transform_edt
+
+        marked = mask & (depth > 0)
+        if not marked.any():
+            return np.zeros(self.color_lens.camera.shape, bool)
+        nearest = distance_transform_edt(~marked, return_distances=False, return_indices=True)
+        filled = depth[tuple(np.asarray(nearest))]
+        rows, columns = np.nonzero(mask)
+        front = self._splatted(rows, columns, filled[rows, columns], T_color_depth)
+        others = self.depth(np.where(mask, 0, depth).astype(np.float32), T_color_depth)
+        shown = (front > 0) & ((others == 0) | (front < (1 + BEHIND) * others))
+        return np.asarray(binary_closing(np.pad(shown, 2), np.ones((3, 3))))[2:-2, 2:-2].astype(np.bool_)
+
+    def _splatted(
+        self, rows: NDArray[np.intp], columns: NDArray[np.intp], z: NDArray[np.float32], T: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Nearest depths (h, w) of pixels (n,) with depths (n,); each covers as many pixels as its own is wide."""
+        points = self.depth_lens.points(rows, columns, z.astype(np.float64))
+        uv, depths = self.color_lens.project(points @ T[:3, :3].T + T[:3, 3])
+        order = np.argsort(-depths)  # the nearest is written last
+        uv, depths = uv[order], depths[order]
+        height, width = self.color_lens.camera.shape
+        out = np.zeros((height, width), np.float32)
+        corner = np.floor(uv - (self._spread - 1) / 2 + 0.5).astype(np.intp)
+        for dv in range(self._spread):
+            for du in range(self._spread):
+                u, v = corner[:, 0] + du, corner[:, 1] + dv
+                inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (depths > 0)
+                nearer = np.zeros((height, width), np.float32)
+                nearer[v[inside], u[inside]] = depths[inside]
+                out = np.where((nearer > 0) & ((out == 0) | (nearer < out)), nearer, out)
+        return out

@@ -12,20 +12,31 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import adaptive_raycasting
-from dudmap.core.backends.parameters import DepthView, MeshParameters, RaycastParameters, RaycastResult, TouchedBlocks
+from dudmap.core.backends.cpu.dual_contouring import contour_blocks, split_polygons
+from dudmap.core.backends.parameters import (
+    DepthView,
+    FusionParameters,
+    MeshParameters,
+    RaycastParameters,
+    RaycastResult,
+    TouchedBlocks,
+)
 from dudmap.core.backends.spec import Backend
+from dudmap.core.backends.threads import bands, run_bands
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
-from dudmap.core.map.adaptive_mesh import extract_groups
-from dudmap.core.map.fine_blocks import FineBlocks, two_levels
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
+from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood, two_levels
+from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import MapContent
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
-from dudmap.core.map.refinement import Refinement, prolonged
+from dudmap.core.map.refinement import prolonged, refine
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.errors import MapError
+
+BAND = 64
+"""Blocks of one band."""
 
 
 def make_volume(
@@ -62,39 +73,11 @@ class AdaptiveVolume(TsdfVolume):
     Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
     mesh and views read the finest. See ``docs/adaptive.md``.
 
-    Args:
-        camera, config, sensor, depth_max, backend, max_blocks, extent: As of ``TsdfVolume``.
-
     Attributes:
         levels: The finer levels, that with the larger voxels first.
-
-    Raises:
-        MapError: As of ``TsdfVolume``.
     """
 
     levels: Sequence[FineBlocks]
-
-    def __init__(
-        self,
-        camera: Camera,
-        config: VolumeConfig | None = None,
-        sensor: SensorConfig | None = None,
-        depth_max: float = 6.0,
-        backend: Backend | None = None,
-        max_blocks: int | MemoryLimit | None = None,
-        extent: float | None = None,
-    ) -> None:
-        super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
-        self._integrators, self._refinements = [], []
-        for number in range(self.config.adaptive_levels):
-            coarse = self.voxel_size / 2**number
-            halved = self.config.model_copy(update={"voxel_size": coarse / 2})
-            parameters = fusion_parameters(halved, self.sensor, depth_max)
-            band = parameters.band._replace(limit=self.band.limit)
-            parameters = parameters._replace(band=band, sdf_unit=self.sdf_unit)
-            self._integrators.append(Integrator(halved, parameters, self.backend))
-            parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
-            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
 
     def _empty(self) -> None:
         super()._empty()
@@ -117,6 +100,14 @@ class AdaptiveVolume(TsdfVolume):
         """The parents of each level."""
         return self.all_blocks.parents
 
+    def _parameters_of(self, n: int) -> FusionParameters:
+        """Parameters of the fusion into a level, 0 is the coarsest; all store distances in its steps."""
+        if n == 0:
+            return self.parameters
+        finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
+        parameters = fusion_parameters(finer, self.sensor, self.depth_max)
+        return parameters._replace(band=parameters.band._replace(limit=self.band.limit), sdf_unit=self.sdf_unit)
+
     # -- writing -----------------------------------------------------------------------------------------------------
 
     def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
@@ -128,26 +119,28 @@ class AdaptiveVolume(TsdfVolume):
             gone = parents.entry_of[updated] < 0
             level.drop(level.children_of(updated[gone]))
             children = level.children_of(slots)
-            updated_children = self._average(n, view, touched, children, count)
+            updated_children = self._average_finer(n, view, touched, children, count)
             updated = updated[~gone]
             depths = self._depths(parents, updated, self.voxel_size / 2**n, view.T_world_camera)
-            self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
+            self._note_change(
+                n, refine(level, parents, updated, depths, number, self.config, self.sensor, self._parameters_of(n))
+            )
             slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
         return fused, touched
 
-    def _average(
+    def _average_finer(
         self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
         """Average an image into blocks of a finer level, and drop those that it shows to be empty; slots (m,) of all
         these."""
         if len(candidates) == 0:
             return candidates
-        level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
+        level, number = self.levels[n], self._frame_number
         blocks = level.blocks
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied, _ = self.backend.fuse(
-            grid, view, touched, candidates, blocks.fused, turn, count, None, integrator.parameters
+            grid, view, touched, candidates, blocks.fused, turn, count, None, self._parameters_of(n + 1)
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
@@ -225,3 +218,66 @@ class AdaptiveVolume(TsdfVolume):
                 raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
         for level, parents in zip(self.levels, self._coarser, strict=True):
             level.make_room(parents)
+
+
+def extract_groups(
+    blocks: VoxelBlocks,
+    levels: Sequence[FineBlocks],
+    slots: NDArray[np.int32],
+    groups: NDArray[np.integer],
+    parameters: MeshParameters,
+) -> list[Mesh]:
+    """Meshes of groups of blocks that share no vertices.
+
+    Args:
+        blocks: Blocks of the coarsest level.
+        levels: The finer levels, at most two.
+        slots: (n,) int32, the blocks to mesh and all blocks that touch one of them; each once.
+        groups: (n,) int group of each block, counted from 0; -1 for blocks that only lend their voxels.
+        parameters: Of the extraction, for the coarsest level.
+
+    Returns:
+        The mesh of each group; no vertex occurs twice in one, or without a triangle.
+    """
+    number = int(groups.max(initial=-1)) + 1
+    if len(slots) == 0:
+        return []
+    keys, places, colors, polygons, rows = _contours(blocks, levels, slots, groups >= 0, parameters)
+    corners = np.searchsorted(keys, polygons).astype(np.int32)
+    vertices = np.ascontiguousarray(places[:, :3])
+    faces = np.empty((2 * len(corners), 3), dtype=np.int32)
+    count, each = split_polygons(corners, vertices, faces)
+    faces, group_of = faces[:count], np.repeat(groups[rows], each)
+    out = []
+    for group in range(number):
+        own = faces if number == 1 else faces[group_of == group]
+        used, local = np.unique(own, return_inverse=True)
+        local = local.reshape(own.shape).astype(np.int32)
+        out.append(Mesh(vertices[used], local, colors[used], np.ascontiguousarray(places[used, 3:])))
+    return out
+
+
+def _contours(
+    blocks: VoxelBlocks,
+    levels: Sequence[FineBlocks],
+    slots: NDArray[np.int32],
+    meshed: NDArray[np.bool_],
+    parameters: MeshParameters,
+) -> list[NDArray]:
+    """Results of ``contour_blocks`` for all blocks, in their order."""
+    near = neighbourhood(blocks, slots)
+    row_of = np.full(len(blocks.entry_of) + 1, -1, dtype=np.int32)
+    row_of[slots] = np.arange(len(slots), dtype=np.int32)
+    rows = row_of[near]  # -1 is the last element
+    finer = two_levels(levels)
+    coords = np.ascontiguousarray(blocks.slot_coords[slots])
+    least = max(int(parameters.min_weight), 1)
+    parts = run_bands(
+        lambda start, stop: contour_blocks(
+            start, stop, near, rows, meshed, coords, (blocks.geometry, *finer.geometry), finer.children,
+            (blocks.colors, *finer.colors), least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
+            np.float32(parameters.max_jump),
+        ),
+        bands(len(slots), BAND),
+    )  # fmt: skip
+    return [np.concatenate([part[n] for part in parts]) for n in range(5)]

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.map import morton
-from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of
-from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
-from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, VoxelBlocks, blobs_of, records_of
 from dudmap.core.scratch_store import ScratchStore
 
 REGION_BITS = 4
@@ -123,13 +122,13 @@ class BlockPager:
         """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
         self._returned.pop(_key(first >> REGION_BITS), None)
 
-    def focus(self, blocks: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
+    def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
         """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
 
         Regions farther away leave if there are too many blocks, and those in the direction of motion are read ahead.
 
         Args:
-            blocks: Blocks of the map; changed here. Entries are numbered anew.
+            tree: Blocks of the map; changed here. Entries are numbered anew.
             low, high: Block coordinates.
             frame_number: Number of frames that were integrated.
         """
@@ -137,11 +136,11 @@ class BlockPager:
             (low.astype(np.int64) - MARGIN) >> REGION_BITS,
             (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS,
         )
-        self._settle(blocks, frame_number)
+        self._settle(tree, frame_number)
         wanted = self._stored_in(first, last) if self._away else []
-        self._make_room(blocks, first, last, frame_number, wanted)
+        self._make_room(tree, first, last, frame_number, wanted)
         for region in wanted:
-            self._bring_back(blocks, region, frame_number)
+            self._bring_back(tree, region, frame_number)
         if self._away:
             self._read_ahead(first, last)
 
@@ -153,7 +152,7 @@ class BlockPager:
         ranges = (range(a, b + 1) for a, b in zip(_key(first), _key(last), strict=True))
         return [(x, y, z) for x, y, z in product(*ranges) if (x, y, z) in self._away]
 
-    def _bring_back(self, blocks: BlockTree, region: Region, frame_number: int) -> None:
+    def _bring_back(self, tree: BlockTree, region: Region, frame_number: int) -> None:
         if region in self._writing:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
@@ -164,7 +163,7 @@ class BlockPager:
                 self._returned[region] = frame_number, self._away[region].serial
         del self._away[region]
         self._archived.discard(region)
-        blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
+        tree.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
 
     def _read_ahead(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> None:
         """Read the regions that come into the box if it goes on as it has moved since the last call."""
@@ -188,7 +187,7 @@ class BlockPager:
 
     def _make_room(
         self,
-        blocks: BlockTree,
+        tree: BlockTree,
         first: NDArray[np.integer],
         last: NDArray[np.integer],
         frame_number: int,
@@ -199,12 +198,12 @@ class BlockPager:
         Beyond what must leave only as many do as can wait to be written, so that no frame waits for the disk.
         """
         self._retry_in = max(self._retry_in - 1, 0)
-        allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(blocks)
-        needed = blocks.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
+        allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(tree)
+        needed = tree.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
         if needed <= allowed or self._retry_in:
             return
-        keys, region_of = _regions_of_entries(blocks)
-        owned = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys))
+        keys, region_of = _regions_of_entries(tree)
+        owned = np.bincount(region_of, tree.owned_slots(), minlength=len(keys))
         outside = np.maximum(np.maximum(first - keys, keys - last), 0)
         distance = np.linalg.norm(outside, axis=1)
         leaving = np.zeros(len(keys), dtype=bool)
@@ -216,17 +215,17 @@ class BlockPager:
             leaving[n] = True
             needed -= owned[n]
         if leaving.any():
-            self._send_all_away(blocks, keys, region_of, leaving, frame_number)
-            blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
+            self._send_all_away(tree, keys, region_of, leaving, frame_number)
+            tree.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
 
-    def page_out(self, blocks: BlockTree, frame_number: int) -> None:
-        """Move all regions to the store; empty blocks must take the place of ``blocks``."""
-        keys, region_of = _regions_of_entries(blocks)
-        self._send_all_away(blocks, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
+    def page_out(self, tree: BlockTree, frame_number: int) -> None:
+        """Move all regions to the store; empty blocks must take the place of those of ``tree``."""
+        keys, region_of = _regions_of_entries(tree)
+        self._send_all_away(tree, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
 
     def _send_all_away(
         self,
-        blocks: BlockTree,
+        tree: BlockTree,
         keys: NDArray[np.integer],
         region_of: NDArray[np.integer],
         leaving: NDArray[np.bool_],
@@ -235,25 +234,25 @@ class BlockPager:
         """Send the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
-        voxel_blocks = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
-        finer = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys)) - voxel_blocks
+        voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))
+        finer = np.bincount(region_of, tree.owned_slots(), minlength=len(keys)) - voxel_blocks
         for n in np.flatnonzero(leaving):
             region, entries = _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]]
             returned_in, serial = self._returned.pop(region, (-1, 0))
             if returned_in != frame_number:  # the store does not hold it as it is
                 serial = self._next_serial = self._next_serial + 1
-                self._have_written(region, blocks, entries)
+                self._have_written(region, tree, entries)
             self._away[region] = Away(serial, len(entries), int(voxel_blocks[n]), int(finer[n]))
 
-    def _have_written(self, region: Region, blocks: BlockTree, entries: NDArray[np.integer]) -> None:
+    def _have_written(self, region: Region, tree: BlockTree, entries: NDArray[np.integer]) -> None:
         """Have a region written; its entries (n,) are removed by the caller."""
         for pending in list(self._writing)[: max(len(self._writing) - MAX_PENDING + 1, 0)]:
             if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
                 del self._writing[pending]
-        records = blocks.records(entries)
+        records = tree.records(entries)
         self._writing[region] = records, self._submit(self._write, region, records)
 
-    def _settle(self, blocks: BlockTree, frame_number: int) -> None:
+    def _settle(self, tree: BlockTree, frame_number: int) -> None:
         """Forget what has been written; take back what could not be."""
         for region, (records, written) in list(self._writing.items()):
             if not written.done():
@@ -262,7 +261,7 @@ class BlockPager:
             if error := written.exception():
                 self.failure, self._retry_in = str(error), RETRY_AFTER
                 del self._away[region]
-                blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
+                tree.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
             else:
                 self.failure = ""
 
@@ -279,17 +278,17 @@ class BlockPager:
         return self._executor.submit(work, *arguments)
 
 
-def regions_of(blocks: BlockTree, pager: BlockPager | None) -> list[Region]:
+def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:
     """All regions of a map, in Morton order, so that neighbours follow each other."""
-    near, _ = _regions_of_entries(blocks)
+    near, _ = _regions_of_entries(tree)
     stored = np.array(list(() if pager is None else pager.away()), np.int64).reshape(-1, 3)
     regions = np.unique(np.concatenate([near, stored]), axis=0)
     return [_key(region) for region in regions[np.argsort(morton.encode(regions))]]
 
 
-def _regions_of_entries(blocks: BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def _regions_of_entries(tree: BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
-    x, y, z = (blocks.coords[: blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
+    x, y, z = (tree.blocks.coords[: tree.blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
     parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]
     return np.stack(parts, axis=1) - (1 << 15), region_of.reshape(-1)

@@ -4,7 +4,7 @@ import ctypes
 import sys
 from pathlib import Path
 
-from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.errors import ConfigError
 
@@ -37,12 +37,13 @@ class MemoryLimit:
                 f"first frame, so that at least {(taken + LEAST) / 1e6:.0f} MB are needed"
             )
 
-    def __call__(self, blocks: BlockTree) -> int:
+    def __call__(self, tree: BlockTree) -> int:
         """Largest number of blocks with voxels, of all levels, that a map may have in memory now."""
         spare = SAFE_SHARE * self.limit - resident_bytes()
         if spare < 0 and _return_freed():
             spare = SAFE_SHARE * self.limit - resident_bytes()
-        return blocks.num_slots + int(spare / blocks.slot_bytes)  # released slots are resident too
+        # released slots are resident too; a finer block has no more than its links besides, one in a hundred
+        return tree.num_slots + int(spare / tree.blocks.slot_bytes)
 
     def capacity(self, blocks: VoxelBlocks) -> int:
         """Number of slots to provide at the start, so that the arrays need not be copied while they grow."""

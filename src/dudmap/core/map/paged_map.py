@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from dudmap.config import VolumeConfig
 from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
-from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.fine_blocks import FineBlocks
+from dudmap.core.map.fine_blocks import BlockTree, FineBlocks
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
 
 
@@ -35,6 +34,26 @@ class PagedMap:
     def num_blocks(self) -> int:
         """Blocks that own voxels, also those that are not in memory."""
         return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has been integrated yet."""
+        return self.num_blocks == 0
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
+        hash table.
+
+        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
+        is the window, whose size depends on the view and the voxels, not on the map.
+        """
+        return self.blocks.num_bytes
+
+    @property
+    def active_slots(self) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        return self.blocks.active_slots
 
     @property
     def view_bytes(self) -> int:
@@ -109,3 +128,21 @@ class PagedMap:
         ``number``."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)
+
+    @property
+    def num_integrated(self) -> int:
+        """Frames that were integrated."""
+        return self._frame_number
+
+    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
+
+        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
+        """
+        blocks = self.blocks
+        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
+        return slots, blocks.slot_coords[slots].astype(np.int32)
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        return self.blocks.slots_at(coords)

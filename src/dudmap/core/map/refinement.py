@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu.refinement import SATURATED, examine, prolong
-from dudmap.core.backends.parameters import TruncationBand
+from dudmap.core.backends.parameters import FusionParameters
 from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
@@ -26,87 +26,69 @@ SIGNIFICANT = 2.0
 """Standard deviations of the bend of noise that a bend must exceed in addition to the threshold."""
 
 
-class Refinement:
-    """Opens and drops the blocks of one level.
+def refine(
+    level: FineBlocks,
+    parents: VoxelBlocks,
+    slots: NDArray[np.int32],
+    depths: NDArray[np.float64],
+    number: int,
+    config: VolumeConfig,
+    sensor: SensorConfig,
+    coarser: FusionParameters,
+) -> NDArray[np.int32]:
+    """Open and drop the blocks of a level in those of the coarser level that a frame was fused into.
 
     Args:
+        level: Blocks of this level, changed here.
+        parents: Those of the coarser one.
+        slots: (n,) int32 slots of the parents.
+        depths: (n,) depth of their centres in the view, metres.
+        number: Number of the frame.
         config: Thresholds.
         sensor: Noise of the readings.
-        band: Truncation band of the coarser level.
-        voxel_size: Of the coarser level, metres.
-        sdf_unit: Metres per step of a stored distance.
+        coarser: Parameters of the coarser level.
+
+    Returns:
+        (m,) int32 slots of the parents whose children changed.
     """
+    unit, saturated = coarser.sdf_unit / coarser.voxel_size, float(SATURATED * coarser.band.front / coarser.voxel_size)
+    sigma = sensor.sigma(depths)
+    fused = parents.fused[slots].astype(np.int64)
+    due = (fused == FIRST) | ((fused > FIRST) & ((_phases(parents, slots) + number) % PERIOD == 0))
+    due &= (depths > 0) & (sigma < level.voxel_size)
+    slots, sigma, fused = slots[due], sigma[due], fused[due]
+    if len(slots) == 0:
+        return slots
+    near = neighbourhood(parents, slots)
+    bend, texture, found = examine(parents.geometry, near, unit, saturated)
+    surface = found.astype(bool)
+    noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (coarser.voxel_size * np.sqrt(np.minimum(fused, 64)))
+    needed = np.maximum(bend / np.hypot(config.adaptive_bend, noise)[:, None], texture / config.adaptive_texture)
+    children = level.children[slots]
+    rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
+    if len(rows):
+        opened = level.open(parents, slots[rows], octants, number)
+        blocks = level.blocks
+        prolong(parents.geometry, parents.colors, near[rows], octants, opened, blocks.geometry, blocks.colors)
+    dropped = _drop_calm(level, children, surface, needed)
+    changed = np.zeros(len(slots), dtype=bool)
+    changed[rows] = True
+    return slots[changed | dropped]
 
-    def __init__(
-        self,
-        config: VolumeConfig,
-        sensor: SensorConfig,
-        band: TruncationBand,
-        voxel_size: float,
-        sdf_unit: float,
-    ) -> None:
-        self.config, self.sensor = config, sensor
-        self.voxel_size = voxel_size
-        self._by_voxel, self._saturated = sdf_unit / voxel_size, float(SATURATED * band.front / voxel_size)
 
-    def update(
-        self,
-        level: FineBlocks,
-        parents: VoxelBlocks,
-        slots: NDArray[np.int32],
-        depths: NDArray[np.float64],
-        number: int,
-    ) -> NDArray[np.int32]:
-        """Examine blocks of the coarser level that a frame was fused into.
-
-        Args:
-            level: Blocks of this level, changed here.
-            parents: Those of the coarser one.
-            slots: (n,) int32 slots of the parents.
-            depths: (n,) depth of their centres in the view, metres.
-            number: Number of the frame.
-
-        Returns:
-            (m,) int32 slots of the parents whose children changed.
-        """
-        sigma = self.sensor.sigma(depths)
-        fused = parents.fused[slots].astype(np.int64)
-        due = (fused == FIRST) | ((fused > FIRST) & ((_phases(parents, slots) + number) % PERIOD == 0))
-        due &= (depths > 0) & (sigma < level.voxel_size)
-        slots, sigma, fused = slots[due], sigma[due], fused[due]
-        if len(slots) == 0:
-            return slots
-        near = neighbourhood(parents, slots)
-        bend, texture, found = examine(parents.geometry, near, self._by_voxel, self._saturated)
-        surface = found.astype(bool)
-        noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (self.voxel_size * np.sqrt(np.minimum(fused, 64)))
-        needed = np.maximum(
-            bend / np.hypot(self.config.adaptive_bend, noise)[:, None], texture / self.config.adaptive_texture
-        )
-        children = level.children[slots]
-        rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
-        if len(rows):
-            opened = level.open(parents, slots[rows], octants, number)
-            blocks = level.blocks
-            prolong(parents.geometry, parents.colors, near[rows], octants, opened, blocks.geometry, blocks.colors)
-        dropped = self._drop_calm(level, children, surface, needed)
-        changed = np.zeros(len(slots), dtype=bool)
-        changed[rows] = True
-        return slots[changed | dropped]
-
-    def _drop_calm(
-        self, level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """Drop children (n, 8) that are not needed any more; whether a parent (n,) lost one."""
-        rows, octants = np.nonzero(children >= 0)
-        slots = children[rows, octants]
-        calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
-        level.calm[slots] = np.where(calm, level.calm[slots] + 1, 0)
-        unneeded = level.calm[slots] >= MAX_CALM
-        level.drop(slots[unneeded])
-        out = np.zeros(len(children), dtype=bool)
-        out[rows[unneeded]] = True
-        return out
+def _drop_calm(
+    level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Drop children (n, 8) that are not needed any more; whether a parent (n,) lost one."""
+    rows, octants = np.nonzero(children >= 0)
+    slots = children[rows, octants]
+    calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
+    level.calm[slots] = np.where(calm, level.calm[slots] + 1, 0)
+    unneeded = level.calm[slots] >= MAX_CALM
+    level.drop(slots[unneeded])
+    out = np.zeros(len(children), dtype=bool)
+    out[rows[unneeded]] = True
+    return out
 
 
 def prolonged(

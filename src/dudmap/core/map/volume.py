@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import meshing
 from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.fusion import reading_weights
 from dudmap.core.backends.parameters import (
     FREE,
     SURFACE,
     UNKNOWN,
     DepthView,
+    FreeSpace,
     MapSample,
     MeshParameters,
     RaycastParameters,
@@ -24,11 +26,12 @@ from dudmap.core.backends.parameters import (
 )
 from dudmap.core.backends.spec import Backend
 from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.fine_blocks import FineBlocks
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
+from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -90,9 +93,12 @@ class TsdfVolume(PagedMap):
         self.sensor = sensor or SensorConfig()
         self.depth_max = depth_max
         self.backend: Backend = backend or CpuBackend()
-        parameters = fusion_parameters(self.config, self.sensor, depth_max)
-        self._integrator = Integrator(self.config, parameters, self.backend)
-        self.voxel_size, self.sdf_unit, self.band = parameters.voxel_size, parameters.sdf_unit, parameters.band
+        self.parameters = fusion_parameters(self.config, self.sensor, depth_max)
+        self.voxel_size, self.sdf_unit, self.band = (
+            self.config.voxel_size,
+            self.parameters.sdf_unit,
+            self.parameters.band,
+        )
         self.block_size = BLOCK * self.voxel_size
         self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
@@ -118,36 +124,6 @@ class TsdfVolume(PagedMap):
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing has been integrated yet."""
-        return self.num_blocks == 0
-
-    @property
-    def num_free_blocks(self) -> int:
-        """Blocks in memory known to be free space; they own no voxels."""
-        return self.blocks.num_free(self.config.free_after)
-
-    @property
-    def num_bytes(self) -> int:
-        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
-        hash table.
-
-        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
-        is the window, whose size depends on the view and the voxels, not on the map.
-        """
-        return self.blocks.num_bytes
-
-    @property
-    def entry_bytes(self) -> float:
-        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self.blocks.entry_bytes
-
-    @property
-    def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return self.blocks.active_slots
-
     # -- writing -----------------------------------------------------------------------------------------------------
 
     def integrate(
@@ -155,7 +131,6 @@ class TsdfVolume(PagedMap):
         frame: Frame,
         T_world_camera: NDArray[np.float64],
         static_mask: NDArray[np.bool_] | None = None,
-        weights: NDArray[np.uint8] | None = None,
         count: int = 1,
     ) -> None:
         """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
@@ -164,7 +139,6 @@ class TsdfVolume(PagedMap):
             frame: Depth (m) and colour of the volume's camera.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            weights: (H, W) uint8 weight of each reading; None = by the configuration.
             count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
 
         Raises:
@@ -179,11 +153,47 @@ class TsdfVolume(PagedMap):
         used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else static_mask
         self.look_at(T_world_camera)
         self._frame_number += 1
-        self._fuse(self._integrator.view(self.window, self.camera, frame, used, weights, T_world_camera), count)
+        self._fuse(self._view(frame, used, T_world_camera), count)
+
+    def _view(self, frame: Frame, used: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> DepthView:
+        """A frame at a pose (4, 4), of which the readings ``used`` (H, W) are fused, for the back end."""
+        T_camera_local = se3.inverse(T_world_camera)
+        T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (self.window.local_origin * self.block_size)
+        constant = self.config.weighting == "constant"
+        return DepthView(
+            frame.depth, frame.color, used, np.ones(used.shape, np.uint8) if constant else None,
+            self.camera.intrinsics, self.T_grid_camera(T_world_camera), T_camera_local[:3].astype(np.float32),
+            T_world_camera,
+        )  # fmt: skip
 
     def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
-        """Fuse an image which the window covers; see ``Integrator.integrate``."""
-        return self._integrator.integrate(self.blocks, self.window, view, self._frame_number, count)
+        """Fuse an image which the window covers ``count`` times.
+
+        Returns:
+            (n,) int32 slots that it was averaged into, those that it shows to be empty have been released; and the
+            prepared image.
+        """
+        blocks, window, number, free_after = self.blocks, self.window, self._frame_number, self.config.free_after
+        touched = self.backend.touch(self.grid, view, window.stamps, free_after, number, self.parameters)
+        if len(touched.cells):
+            window.allocate(touched.cells, blocks, number)
+        turn = number if self.config.take_turns else -1
+        free_space = FreeSpace(number % 2, free_after) if self.config.carving else None
+        slots, occupied, empty = self.backend.fuse(
+            self._local_grid, view, touched, window.near, blocks.fused, turn, count, free_space, self.parameters
+        )
+        blocks.written[slots] = number
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
+        if self.config.carving:
+            window.release(slots[occupied == 0], blocks, free_after)
+            window.set_free(empty, blocks, count)
+        return slots, touched
+
+    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
+        """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
+        if self.config.weighting == "constant":
+            return np.ones(depth.shape, dtype=np.uint8)
+        return reading_weights(depth, camera.intrinsics, self.band.noise)
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
@@ -215,7 +225,21 @@ class TsdfVolume(PagedMap):
     @property
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
-        return self._integrator.grid(self.blocks, self.window)
+        window, blocks = self.window, self.blocks
+        assert window.origin is not None
+        return VoxelGrid(
+            window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
+            blocks.slot_coords, blocks.free_count, self.voxel_size, self.sdf_unit,
+        )  # fmt: skip
+
+    @property
+    def _local_grid(self) -> VoxelGrid:
+        """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
+        grid, origin = self.grid, self.window.local_origin
+        if not origin.any():
+            return grid
+        coords = (grid.slot_coords - origin).astype(grid.slot_coords.dtype)
+        return grid._replace(origin=grid.origin - origin, slot_coords=coords)
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
@@ -255,7 +279,7 @@ class TsdfVolume(PagedMap):
         words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        gains = self._integrator.reading_weights(depth, camera)
+        gains = self._reading_weights(depth, camera)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
@@ -280,9 +304,8 @@ class TsdfVolume(PagedMap):
 
     def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
         """Mesh of blocks (n,) that are in memory."""
-        blocks = self.blocks
-        neighbours = blocks.neighbours(slots)
-        return Mesh(*meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, neighbours, parameters))
+        blocks, near = self.blocks, self.blocks.neighbours(slots)
+        return meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters)
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
@@ -312,30 +335,10 @@ class TsdfVolume(PagedMap):
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
             min_weight: As of ``extract_mesh``.
         """
-        blocks = self.blocks
-        meshes = meshing.extract_chunks(
-            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(min_weight), chunks,
-        )  # fmt: skip
-        return [Mesh(*mesh) for mesh in meshes]
-
-    @property
-    def num_integrated(self) -> int:
-        """Frames that were integrated."""
-        return self._frame_number
-
-    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
-
-        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
-        """
-        blocks = self.blocks
-        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
-        return slots, blocks.slot_coords[slots].astype(np.int32)
-
-    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        return self.blocks.slots_at(coords)
+        blocks, near, parameters = self.blocks, self.blocks.neighbours(slots), self._mesh_parameters(min_weight)
+        return meshing.extract_chunks(
+            blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters, chunks
+        )
 
     # -- files -------------------------------------------------------------------------------------------------------
 

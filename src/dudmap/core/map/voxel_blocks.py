@@ -1,6 +1,7 @@
 """Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,14 @@ class BlockRecords:
     colors: NDArray[np.int32]
     fused: NDArray[np.uint8]
     finer: "tuple[BlockRecords, ...]" = ()
+
+
+COLUMNS = tuple(field.name for field in fields(BlockRecords) if field.name != "finer")
+"""Arrays of a row: of the blocks of one level of a region, 0 is the coarsest."""
+_TYPES = {
+    "coords": (np.int32, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
+    "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),
+}  # fmt: skip
 
 
 class VoxelBlocks:
@@ -329,3 +338,34 @@ def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geom
 def _row_bytes(array: NDArray) -> int:
     """Memory of one element along the first axis."""
     return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
+
+
+def blobs_of(records: BlockRecords) -> list[list[memoryview]]:
+    """The arrays of records as they are stored, in the order of ``COLUMNS``, level by level."""
+    levels = [records, *records.finer]
+    return [[np.ascontiguousarray(getattr(level, name)).data for name in COLUMNS] for level in levels]
+
+
+def records_of(rows: Sequence[Sequence[bytes]]) -> BlockRecords:
+    """The records of stored arrays, level by level.
+
+    Raises:
+        ValueError: They do not fit each other.
+    """
+    levels = [_level_of(blobs) for blobs in rows]
+    return replace(levels[0], finer=tuple(levels[1:]))
+
+
+def _level_of(blobs: Sequence[bytes]) -> BlockRecords:
+    """The blocks of one level; see ``records_of``."""
+    arrays = {}
+    for name, blob in zip(COLUMNS, blobs, strict=True):
+        kind, width = _TYPES[name]
+        array = np.frombuffer(blob, kind)
+        arrays[name] = array.reshape(-1, width) if width > 1 else array
+    records = BlockRecords(**arrays)
+    n, m = len(records.coords), len(records.owners)
+    sizes = {len(records.geometry), len(records.colors), len(records.fused)}
+    if len(records.free_count) != n or sizes != {m} or np.any(records.owners < 0) or np.any(records.owners >= n):
+        raise ValueError("the blocks of a region do not fit each other")
+    return records

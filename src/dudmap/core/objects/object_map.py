@@ -83,8 +83,7 @@ class ObjectTrack:
         Ts_camera_object: Poses (4, 4) of the frames that were fused, by time.
         points: (n, 3) float32, a sample of the fused surface, object frame, metres.
         misfits: Reason for each frame that contradicted the map.
-        checks: Per registered frame, the shares of the surface seen through and of the readings off the surface; NaN
-            where the registration failed.
+        registrations: Number of frames that were to be registered.
         max_displacement: Largest displacement of its surface since the map was started, metres.
         recent_poses: Times and poses T_world_object of the last ``velocity_window`` seconds.
         restarts: For each restart of the map the misfit that caused it; empty if a larger view did.
@@ -101,7 +100,7 @@ class ObjectTrack:
     Ts_camera_object: dict[float, NDArray[np.float64]] = field(default_factory=dict)
     points: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
     misfits: list[str] = field(default_factory=list)
-    checks: list[tuple[float, float]] = field(default_factory=list)
+    registrations: int = 0
     max_displacement: float = 0.0
     recent_poses: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)
     restarts: tuple[str, ...] = ()
@@ -112,7 +111,7 @@ class ObjectTrack:
         Args:
             final: Whether no more frames will come. Before that, only evidence against a rigid object is a reason.
         """
-        frames, contradicting = len(self.checks), len(self.misfits)
+        frames, contradicting = self.registrations, len(self.misfits)
         if frames >= MIN_FRAMES and contradicting > MAX_MISFITS * frames:
             return f"not rigid: {contradicting} of {frames} frames do not fit, the last: {self.misfits[-1]}"
         if not final:

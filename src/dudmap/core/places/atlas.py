@@ -22,8 +22,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
-from dudmap.core.places.prior_map import PriorMap
-from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
 
@@ -189,8 +188,8 @@ class Atlas:
     def clear_map(self) -> None:
         """Empty the current map, which is the newest, and forget the frames stored of it."""
         self.volume.clear()
-        while self.history is not None and self.history.submaps and self.history.submaps[-1] == self.current:
-            self.history.drop_last()
+        if self.history is not None:
+            self.history.remove_submap(self.current)
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
         """Append the pose (4, 4) of a frame in the current submap; poses that were predicted since the last tracked
@@ -275,10 +274,15 @@ class Atlas:
         )
 
     def nodes(self, submap: int) -> list[int]:
-        """Numbers of the stored frames of a submap, in order of time."""
+        """Numbers of the stored frames of a submap, in order of time, also of those whose images were removed: the
+        nodes of its pose graph."""
         if self.history is None:
             return []
         return [n for n, number in enumerate(self.history.submaps) if number == submap]
+
+    def kept_nodes(self, submap: int) -> list[int]:
+        """Those of them whose images are kept."""
+        return [] if self.history is None else [n for n in self.history.kept if self.history.submaps[n] == submap]
 
     def correct(
         self,
@@ -289,8 +293,7 @@ class Atlas:
     ) -> NDArray[np.float64]:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
-        Trajectory and keyframes receive the correction interpolated in time between the stored frames; one that was
-        removed has that of the frame that replaces it.
+        Trajectory and keyframes receive the correction interpolated in time between the stored frames.
 
         Args:
             nodes: Numbers of all stored frames of the submap, in order of time.
@@ -303,19 +306,19 @@ class Atlas:
         """
         assert self.history is not None
         self.repainting = None  # the new map has the new colours
-        stamps, positions = self.history.timeline(nodes)
+        stamps = np.array([self.history.timestamps[n] for n in nodes])
         corrections = np.stack(
             [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
         )
-        in_time = corrections[positions]
         for place in (*self.poses, *self.keyframes.keyframes):
             if place.submap == self.current:
-                place.T_world_camera = se3.interpolate_in_time(stamps, in_time, place.timestamp) @ place.T_world_camera
+                correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
+                place.T_world_camera = correction @ place.T_world_camera
         for n, T in zip(nodes, Ts_new, strict=True):
             self.history.Ts_world_camera[n] = T
         self.volume.take_over(volume)
         self.rebuildings.pop(self.current, None)  # of an earlier correction
-        if fused is not None and len(fused) < len(nodes):
+        if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
             self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
         return corrections[-1]
@@ -324,12 +327,12 @@ class Atlas:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
         self._complete_repainting()
-        moved_nodes, kept_nodes = self.nodes(source), self.nodes(target)
+        moved_nodes, fused_nodes = self.kept_nodes(source), self.nodes(target)
         for moved in (*self.poses, *self.keyframes.keyframes):
             if moved.submap == source:
                 moved.T_world_camera = T_target_source @ moved.T_world_camera
                 moved.submap = target
-        for n in moved_nodes:
+        for n in self.nodes(source):
             self.history.Ts_world_camera[n] = T_target_source @ self.history.Ts_world_camera[n]
             self.history.submaps[n] = target
         del self.volumes[source]
@@ -339,15 +342,15 @@ class Atlas:
             if target in self.rebuildings:
                 self.rebuildings[target].add_shown(moved_nodes)
         else:
-            self._fuse_gradually(target, kept_nodes)
+            self._fuse_gradually(target, fused_nodes)
         self.switch_to(target)
 
-    def _fuse_gradually(self, target: int, kept_nodes: list[int]) -> None:
+    def _fuse_gradually(self, target: int, fused_nodes: list[int]) -> None:
         """Add the stored frames of a submap that its map lacks over the frames to come.
 
         Args:
             target: Number of the submap.
-            kept_nodes: Numbers of the stored frames that its map, or the one that replaces it, holds or is to hold
+            fused_nodes: Numbers of the stored frames that its map, or the one that replaces it, holds or is to hold
                 first.
         """
         assert self.history is not None
@@ -356,9 +359,9 @@ class Atlas:
             volume = self.make_volume()
             volume.take_over(self.volumes[target])
             volume.page_out()
-            running = MapRebuilding(self.history, target, volume, kept_nodes, [])
+            running = MapRebuilding(self.history, target, volume, fused_nodes, [])
         provisional = self.make_volume()
-        nodes = np.array(self.nodes(target))
+        nodes = np.array(self.kept_nodes(target))
         Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
         near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, AT_ONCE)].tolist()
         self.history.reintegrate(provisional, near)

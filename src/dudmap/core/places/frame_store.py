@@ -1,4 +1,4 @@
-"""Store of fused frames on disk, from which the map is rebuilt with corrected poses or masks."""
+"""Store of fused frames on disk, from which the map is rebuilt with corrected poses."""
 
 import weakref
 from collections import deque
@@ -22,6 +22,8 @@ DEPTH_UNIT = 0.0005
 JPEG_QUALITY = 95
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` waits for it."""
+CELLS = 8, 6
+"""Cells of an image, across and down, of each of which is known whether a frame was fused in most of it."""
 EncodedFrame = tuple[bytes, bytes, bytes]
 """Depth, colour and mask of a stored frame as files."""
 
@@ -50,7 +52,8 @@ class FrameStore:
     A frame is stored if the camera has moved or turned since the last stored frame, or if a number of frames were
     fused since; other frames increase the count of the stored frame before them. Frames are encoded (16-bit PNG and
     JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about 1.5 kB per stored frame. Frames are
-    numbered in the order of time; ``remove`` lowers the numbers of later ones. Not for concurrent calls.
+    numbered in the order of time; those whose images were removed keep their number and their pose. Not for concurrent
+    calls.
 
     Args:
         camera: Camera of the frames.
@@ -63,14 +66,10 @@ class FrameStore:
     Attributes:
         timestamps: Of the stored frames, seconds.
         Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
-        counts: Number of fused frames that each represents.
-        submaps: Numbers of their submaps.
-        serials: Numbers of the stored frames that never change, and are never given again; ascending.
-        links: Standard deviations, metres and radians, of the motion to a stored frame, by its serial, from the one
-            before it in its submap, where frames between them were removed.
-        removed_timestamps: Of the frames that were removed, seconds.
-        replacements: Serials of the stored frames that replace them.
-        archived: Returns a frame, by its serial, that is not in the file of this store, but in the database of a
+        counts: Number of fused frames that each represents; 0 for those whose images were removed.
+        cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
+        submaps: Numbers of their submaps; -1 for frames that are as if they had never been.
+        archived: Returns a frame, by its number, that is not in the file of this store, but in the database of a
             continued run.
     """
 
@@ -89,17 +88,13 @@ class FrameStore:
         self.timestamps: list[float] = []
         self.Ts_world_camera: list[NDArray[np.float64]] = []
         self.counts: list[int] = []
+        self.cells: list[int] = []
         self.submaps: list[int] = []
-        self.serials: list[int] = []
-        self.links: dict[int, tuple[float, float]] = {}
-        self.removed_timestamps: list[float] = []
-        self.replacements: list[int] = []
-        self._next_serial = 0
         self.archived: Callable[[int], EncodedFrame] | None = None
-        self._first_own = 0  # serial; the frames before it are archived
+        self._first_own = 0  # number; the frames before it are archived
         self._file: ScratchStore | None = None
         self._encoder: ThreadPoolExecutor | None = None
-        self._pending: deque[tuple[int, Future[EncodedFrame]]] = deque()  # by serial
+        self._pending: deque[tuple[int, Future[EncodedFrame]]] = deque()  # by number
 
     @classmethod
     def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
@@ -124,7 +119,7 @@ class FrameStore:
 
         Args:
             frame: Depth as it was fused, and colour as it was recorded; the arrays must not change afterwards.
-            static: (H, W) bool, pixels that were fused. The others are stored too, for corrected masks.
+            static: (H, W) bool, pixels that were fused. The others are stored too.
             T_world_camera: (4, 4).
             submap: Number of the submap it was fused into.
             exposure: Gain and offset to the colours of the map.
@@ -145,57 +140,37 @@ class FrameStore:
         self.timestamps.append(frame.timestamp)
         self.Ts_world_camera.append(T_world_camera.copy())
         self.counts.append(1)
+        self.cells.append(_fused_cells(frame, static))
         self.submaps.append(submap)
         self.color_timestamps.append(frame.color_timestamp)
-        self.serials.append(self._next_serial)
-        self._pending.append((self._next_serial, self._encoder.submit(_encoded, frame, static, exposure)))
-        self._next_serial += 1
+        self._pending.append((len(self) - 1, self._encoder.submit(_encoded, frame, static, exposure)))
         self._write(MAX_PENDING)
         return True
 
-    def drop_last(self) -> None:
-        """Remove the frame stored last, as if it had never been."""
-        self._drop(len(self) - 1)
+    @property
+    def kept(self) -> list[int]:
+        """Numbers of the frames whose images were not removed."""
+        return [number for number, count in enumerate(self.counts) if count]
 
-    def remove(self, number: int, replacement: int, link: tuple[float, float]) -> None:
-        """Remove a stored frame that is neither the first nor the last of its submap.
+    def remove_submap(self, submap: int) -> None:
+        """Remove the frames of a submap as if they had never been."""
+        for number, other in enumerate(self.submaps):
+            if other == submap:
+                self.remove_images(number)
+                self.submaps[number] = -1
 
-        Args:
-            number: Its number; those of later frames fall by one.
-            replacement: Number of the stored frame whose corrections are those of the removed frame from now on.
-            link: Standard deviations of the motion from the frame before it in its submap to the one after it.
-        """
-        after = self.submaps.index(self.submaps[number], number + 1)
-        self.links[self.serials[after]] = link
-        old, new = self.serials[number], self.serials[replacement]
-        self.replacements = [new if serial == old else serial for serial in (*self.replacements, old)]
-        self.removed_timestamps.append(self.timestamps[number])
-        self._drop(number)
-
-    def _drop(self, number: int) -> None:
-        serial = self.serials[number]
-        if any(serial == pending for pending, _ in self._pending):
+    def remove_images(self, number: int) -> None:
+        """Remove the images of a frame; its pose stays."""
+        if self.counts[number] == 0:
+            return
+        if any(number == pending for pending, _ in self._pending):
             self._write(0)
-        if self._file is not None and serial >= self._first_own:
-            self._file.remove(str(serial))
-        self.links.pop(serial, None)
-        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self.serials
-        for column in columns:
-            del column[number]
-
-    def timeline(self, numbers: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Times (n,) ascending of stored frames and of the removed ones that they replace, and for each time the
-        position of that stored frame in ``numbers``, which ascend."""
-        position = {self.serials[number]: n for n, number in enumerate(numbers)}
-        times = [(self.timestamps[number], n) for n, number in enumerate(numbers)]
-        removed = zip(self.removed_timestamps, self.replacements, strict=True)
-        times += [(timestamp, position[serial]) for timestamp, serial in removed if serial in position]
-        stamps, positions = np.array([time for time, _ in times]), np.array([n for _, n in times], np.int64)
-        order = np.argsort(stamps, kind="stable")
-        return stamps[order], positions[order]
+        if self._file is not None and number >= self._first_own:
+            self._file.remove(str(number))
+        self.counts[number] = 0
 
     def __getitem__(self, number: int) -> StoredFrame:
-        """The stored frame of a number, 0 = oldest."""
+        """The stored frame of a number, 0 = oldest; its images must not have been removed."""
         import cv2
 
         depth_file, color_file, mask_file = self.encoded(number)
@@ -214,49 +189,54 @@ class FrameStore:
     def encoded(self, number: int) -> EncodedFrame:
         """The files of a stored frame."""
         self._write(0)
-        serial = self.serials[number]
-        if serial < self._first_own:
+        if number < self._first_own:
             assert self.archived is not None
-            return self.archived(serial)
+            return self.archived(number)
         assert self._file is not None
-        depth, color, mask = self._file.read(str(serial))
+        depth, color, mask = self._file.read(str(number))
         return depth, color, mask
 
     def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
         """Take the frames, whose times and poses are set, from an archive."""
-        self.archived, self._first_own = archived, self._next_serial
+        self.archived, self._first_own = archived, len(self)
 
     def __iter__(self) -> Iterator[StoredFrame]:
-        return (self[number] for number in range(len(self)))
+        return (self[number] for number in self.kept)
 
     def reintegrate(
         self,
         volume: TsdfVolume,
         numbers: Sequence[int] | None = None,
         Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
-        static_masks: Sequence[NDArray[np.bool_] | None] | None = None,
     ) -> None:
         """Fuse stored frames into a map, each with the weight of the frames it represents.
 
         Args:
             volume: The map, usually an empty one.
-            numbers: Numbers of the frames, in the order of fusion; None = all.
+            numbers: Numbers of the frames, in the order of fusion; None = all that are kept.
             Ts_world_camera: Poses (4, 4); None = the stored ones.
-            static_masks: (H, W) bool each, pixels that are fused; None = those fused before.
         """
-        for i, number in enumerate(range(len(self)) if numbers is None else numbers):
+        for i, number in enumerate(self.kept if numbers is None else numbers):
             stored = self[number]
             T = stored.T_world_camera if Ts_world_camera is None else Ts_world_camera[i]
-            static = None if static_masks is None else static_masks[i]
-            volume.integrate(stored.frame, T, stored.static if static is None else static, count=stored.count)
+            volume.integrate(stored.frame, T, stored.static, stored.count)
 
     def _write(self, max_pending: int) -> None:
         """Write encoded frames to the file until at most this many are pending."""
         while self._pending and (len(self._pending) > max_pending or self._pending[0][1].done()):
             if self._file is None:
                 self._file = ScratchStore("fused frames")
-            serial, encoded = self._pending.popleft()
-            self._file.write(str(serial), encoded.result())
+            number, encoded = self._pending.popleft()
+            self._file.write(str(number), encoded.result())
+
+
+def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
+    """The cells of an image in which most pixels are readings of the static world, bit by bit."""
+    import cv2
+
+    used = (static & (frame.depth > 0)).astype(np.float32)
+    cells = np.asarray(cv2.resize(used, CELLS, interpolation=cv2.INTER_AREA)) > 0.5
+    return int(cells.ravel() @ (1 << np.arange(cells.size)))
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:

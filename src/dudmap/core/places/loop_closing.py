@@ -49,14 +49,6 @@ class LoopSearch:
     due: int
 
 
-@dataclass(frozen=True, eq=False)
-class PendingCorrection:
-    """A correction (4, 4) of the current world, measured by one frame in a submap and not yet confirmed."""
-
-    submap: int
-    T_corrected_tracked: NDArray[np.float64]
-
-
 class LoopCloser:
     """Detects, verifies and closes loops, and joins submaps.
 
@@ -81,7 +73,7 @@ class LoopCloser:
         self.atlas = atlas
         self.verifier = LoopVerifier(config, atlas, tracker)
         self.corrector = LoopCorrector(atlas)
-        self.thinning = FrameThinning(config, atlas, self.corrector)
+        self.thinning = FrameThinning(config, atlas)
         self.closed = 0
         self._frame = 0
         self._next_search = 0
@@ -89,7 +81,8 @@ class LoopCloser:
         self._newest_keyframe: float | None = None  # timestamp; their number ends at ``max_keyframes``
         self._search: LoopSearch | None = None
         self._executor: ThreadPoolExecutor | None = None
-        self._pending: PendingCorrection | None = None
+        # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
+        self._pending: tuple[int, NDArray[np.float64]] | None = None
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.
@@ -180,11 +173,11 @@ class LoopCloser:
                 return self._confirm_no_drift(place, query)
             confirmed = (
                 pending is not None
-                and pending.submap == submap
-                and agree(pending.T_corrected_tracked @ T, T_found, SAME_DISTANCE, SAME_ANGLE_DEG)
+                and pending[0] == submap
+                and agree(pending[1] @ T, T_found, SAME_DISTANCE, SAME_ANGLE_DEG)
             )
             if not confirmed:
-                self._pending = PendingCorrection(submap, T_found @ se3.inverse(T))
+                self._pending = submap, T_found @ se3.inverse(T)
                 self._next_search = self._frame
                 return None
             T_corrected_tracked = T_found @ se3.inverse(T)

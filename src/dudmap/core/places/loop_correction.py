@@ -1,7 +1,5 @@
 """Correction of a submap after a loop closure: pose graph optimization and the map built from its poses."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,7 +44,7 @@ class LoopCorrector:
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Motion to the newest stored frame from the one nearest in time to a keyframe, or what replaces that.
+        """Motion to the newest stored frame from the one nearest in time to a keyframe.
 
         Args:
             keyframe: Keyframe of the current submap that was recognised.
@@ -61,8 +59,7 @@ class LoopCorrector:
         nodes = self.atlas.nodes(self.atlas.current)
         if len(nodes) < 2:
             return None
-        timestamps, positions = history.timeline(nodes)
-        old, new = nodes[positions[int(np.argmin(np.abs(timestamps - keyframe.timestamp)))]], nodes[-1]
+        old, new = min(nodes, key=lambda n: abs(history.timestamps[n] - keyframe.timestamp)), nodes[-1]
         if old == new:
             return None
         T_camera_new = se3.inverse(T_tracked) @ history.Ts_world_camera[new]
@@ -83,14 +80,15 @@ class LoopCorrector:
         nodes = self.atlas.nodes(self.atlas.current)
         index = {n: i for i, n in enumerate(nodes)}
         Ts = np.stack([history.Ts_world_camera[n] for n in nodes])
-        edges = _odometry_edges(Ts, [history.links.get(history.serials[n]) for n in nodes])
+        edges = _odometry_edges(Ts)
         for edge in (*self.edges, loop):
             if edge.a in index and edge.b in index:
                 edges.append(Edge(index[edge.a], index[edge.b], edge.T_a_b, edge.sigma_distance, edge.sigma_angle))
         Ts_new = optimize(Ts, edges)
         if not np.all(np.isfinite(Ts_new)):
             return None
-        old, new = _passes(Ts_new, index[loop.a], index[loop.b])
+        kept = np.flatnonzero([history.counts[n] for n in nodes])
+        old, new = _passes(Ts_new, kept, index[loop.a], index[loop.b])
         self.atlas.make_room()
         before = self._misfit(self._map_of(nodes, Ts, new), nodes, Ts, new)
         volume = self._map_of(nodes, Ts_new, old)
@@ -99,32 +97,6 @@ class LoopCorrector:
         history.reintegrate(volume, [nodes[i] for i in new], list(Ts_new[new]))
         self.edges.append(loop)
         return self.atlas.correct(nodes, Ts_new, volume, [nodes[i] for i in (*old, *new)])
-
-    def move_edges(self, number: int, replacement: int) -> None:
-        """Let the measured motions that begin or end at a stored frame, which is about to be removed, do so at the one
-        that replaces it.
-
-        Both are registered to the same map, so that the motion between them has the noise of one measured at a loop.
-        Of two motions between the same frames the more precise one is kept. Numbers above the frame's fall by one.
-        """
-        assert self.atlas.history is not None
-        Ts = self.atlas.history.Ts_world_camera
-        T_new_old = se3.inverse(Ts[replacement]) @ Ts[number]
-        best: dict[tuple[int, int], Edge] = {}
-        for edge in self.edges:
-            if number in (edge.a, edge.b):
-                sigmas = np.hypot((edge.sigma_distance, edge.sigma_angle), LOOP_NOISE).tolist()
-                if edge.a == number:
-                    edge = Edge(replacement, edge.b, T_new_old @ edge.T_a_b, *sigmas)
-                else:
-                    edge = Edge(edge.a, replacement, edge.T_a_b @ se3.inverse(T_new_old), *sigmas)
-                if edge.a == edge.b:
-                    continue
-            edge = replace(edge, a=edge.a - (edge.a > number), b=edge.b - (edge.b > number))
-            ends = min(edge.a, edge.b), max(edge.a, edge.b)
-            if ends not in best or edge.sigma_distance < best[ends].sigma_distance:
-                best[ends] = edge
-        self.edges = list(best.values())
 
     def _map_of(self, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]) -> TsdfVolume:
         """Map of some of the stored frames ``nodes`` with poses (n, 4, 4)."""
@@ -172,28 +144,23 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
     return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, MAX_OFFSETS, strict=True))
 
 
-def _passes(Ts: NDArray[np.float64], a: int, b: int) -> tuple[list[int], list[int]]:
-    """Numbers of the poses of a path (n, 4, 4) that view what pose ``b``, where a loop ends, views: those before and
-    those after the way from ``a`` to ``b`` has led farthest from there, about as many of each."""
+def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) -> tuple[list[int], list[int]]:
+    """Numbers, among those ``kept`` (k,), of poses of a path (n, 4, 4) that view what pose ``b``, where a loop ends,
+    views: those before and those after the way from ``a`` to ``b`` has led farthest from there, about as many of each.
+    """
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
-    half = AT_ONCE // 2
-    num_new = max(half, AT_ONCE - farthest)
-    new = nearest_views(Ts[farthest:], Ts[b], num_new) + farthest
-    old = nearest_views(Ts[:farthest], Ts[b], AT_ONCE - len(new))
+    before, after = kept[kept < farthest], kept[kept >= farthest]
+    new = after[nearest_views(Ts[after], Ts[b], max(AT_ONCE // 2, AT_ONCE - len(before)))]
+    old = before[nearest_views(Ts[before], Ts[b], AT_ONCE - len(new))]
     return old.tolist(), new.tolist()
 
 
-def _odometry_edges(Ts: NDArray[np.float64], links: list[tuple[float, float] | None]) -> list[Edge]:
-    """Tracked motion from each stored frame (n, 4, 4) to the next, with the given standard deviations of the motion
-    that leads to it where there are any."""
+def _odometry_edges(Ts: NDArray[np.float64]) -> list[Edge]:
+    """Tracked motion from each stored frame (n, 4, 4) to the next; its standard deviations, metres and radians, grow
+    with its length."""
     motions = se3.inverse(Ts[:-1]) @ Ts[1:]
-    known = [link or (sigma, sigma) for link, sigma in zip(links[1:], odometry_sigmas(Ts), strict=True)]
-    return [Edge(i, i + 1, T, *sigmas) for i, (T, sigmas) in enumerate(zip(motions, known, strict=True))]
-
-
-def odometry_sigmas(Ts: NDArray[np.float64]) -> list[float]:
-    """Standard deviations (n - 1,), metres and radians, of the steps along a path (n, 4, 4), which grow with it."""
-    return (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * step_lengths(Ts)).tolist()
+    sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions)).tolist()
+    return [Edge(i, i + 1, T, sigma, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]
 
 
 def step_lengths(Ts: NDArray[np.float64]) -> NDArray[np.float64]:

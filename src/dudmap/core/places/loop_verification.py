@@ -134,7 +134,7 @@ class LoopVerifier:
             return self.atlas.volumes[keyframe.submap]
         nodes = [
             n
-            for n in self.atlas.nodes(keyframe.submap)
+            for n in self.atlas.kept_nodes(keyframe.submap)
             if history.timestamps[n] <= keyframe.last_seen
             and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
         ]

@@ -54,7 +54,12 @@ class MapRebuilding:
     @property
     def missing(self) -> list[int]:
         """Numbers of the stored frames that the new map lacks, in order of time."""
-        return [n for n, submap in enumerate(self.history.submaps) if submap == self.submap and n not in self._fused]
+        return [n for n in self._kept if n not in self._fused]
+
+    @property
+    def _kept(self) -> list[int]:
+        """Numbers of the stored frames of the submap whose images are kept."""
+        return [n for n in self.history.kept if self.history.submaps[n] == self.submap]
 
     def fuse(self, count: int | None = None) -> bool:
         """Fuse the next stored frames, None = all, into the new map; returns whether it is complete now."""
@@ -75,8 +80,7 @@ class MapRebuilding:
     def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> int:
         """Add those stored frames to the provisional map, at most ``count``, that see what a camera sees; returns how
         many."""
-        older = self.history.submaps[: self._start]
-        unknown = np.array([n for n, submap in enumerate(older) if submap == self.submap and n not in self._shown], int)
+        unknown = np.array([n for n in self._kept if n < self._start and n not in self._shown], int)
         points, here = _points_seen(self.history, unknown), _looked_at(T_world_camera)
         added: list[int] = []
         while len(unknown) and len(added) < count:

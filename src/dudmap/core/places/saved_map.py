@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
+from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
+from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
 from dudmap.core.tracking.quality_monitor import RegistrationHistory
 from dudmap.errors import ConfigError, MapError
 from dudmap.input_files import DAMAGE, open_arrays
@@ -160,3 +161,22 @@ def _check_arrays(data: "Mapping[str, NDArray]") -> None:
 def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:
     """Rows of all parts (n, width) below each other."""
     return np.concatenate([np.empty((0, width), dtype), *(part.astype(dtype) for part in parts)])
+
+
+@dataclass(frozen=True, eq=False)
+class PriorMap:
+    """The map of a whole recording, which a second pass registers and labels its frames with.
+
+    Attributes:
+        volume: The map of the largest submap.
+        submap: Number of that submap.
+        Ts_world_camera: Poses (4, 4) of the frames tracked in it, by timestamp.
+        keyframes: Keyframes of all submaps.
+        detector: Holds the remembered frames of the first seconds.
+    """
+
+    volume: TsdfVolume
+    submap: int
+    Ts_world_camera: dict[float, NDArray[np.float64]]
+    keyframes: KeyframeDatabase
+    detector: DynamicDetector

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.lens import Lens
+from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.core.geometry.other_view import OtherView
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.input_files import damaged
 from dudmap.io.exporting.mesh_editing import edited

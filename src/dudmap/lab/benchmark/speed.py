@@ -222,7 +222,7 @@ def time_frames(job: tuple[float, int]) -> Row:
     timed = np.array(times[WARM_UP:] or times)
     row: Row = {"median": float(np.median(timed)), "p95": float(np.percentile(timed, 95))}
     row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
-    row["free_share"] = slam.volume.entry_bytes / (2 * 512 * 4)
+    row["free_share"] = slam.volume.blocks.entry_bytes / (2 * 512 * 4)
     pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
     seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
     row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}

@@ -25,20 +25,6 @@ class ConsensusParams(NamedTuple):
     prior_px: float
 
 
-class LinearizedMotions(NamedTuple):
-    """Reprojection errors of motions, linearised at each of them.
-
-    Attributes:
-        H: (g, 6, 6), and gradient: (g, 6) normal equations of the inliers, whose solution ``solve(H, gradient)`` is the
-            twist (v, omega) of the update exp(twist) @ T.
-        inliers: (g,) int64, number of the inliers.
-    """
-
-    H: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    inliers: NDArray[np.int64]
-
-
 class Correspondences(NamedTuple):
     """Points and where they are found after a motion.
 
@@ -73,18 +59,24 @@ def msac_scores(motions: NDArray[np.float64], found: Correspondences, params: Co
 
 def linearized(
     motions: NDArray[np.float64], found: Correspondences, inlier_px: NDArray[np.float64]
-) -> LinearizedMotions:
-    """Normal equations of the reprojection error of motions (g, 4, 4); points are left out of them from an error of
-    ``inlier_px`` (g,) on, pixels."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Normal equations of the reprojection error of motions (g, 4, 4), linearised at each of them.
+
+    Points are left out of them from an error of ``inlier_px`` (g,) on, pixels.
+
+    Returns:
+        H (g, 6, 6) and gradient (g, 6), whose solution ``solve(H, gradient)`` is the twist (v, omega) of the update
+        exp(twist) @ T; number of the inliers (g,).
+    """
     g = len(motions)
-    out = LinearizedMotions(np.zeros((g, 6, 6)), np.zeros((g, 6)), np.zeros(g, np.int64))
+    H, gradient, inliers = np.zeros((g, 6, 6)), np.zeros((g, 6)), np.zeros(g, np.int64)
     run_bands(
         lambda start, stop: _linearize_band(
-            start, stop, motions, inlier_px, found.points, found.targets, found.intrinsics, *out
+            start, stop, motions, inlier_px, found.points, found.targets, found.intrinsics, H, gradient, inliers
         ),
         bands(g, LINEARIZED_BAND),
     )
-    return out
+    return H, gradient, inliers
 
 
 @kernel
@@ -114,7 +106,7 @@ def _score_band(start, stop, motions, points, targets, expected, weights, intrin
 
 @kernel
 def _linearize_band(start, stop, motions, inlier_px, points, targets, intrinsics, H, gradient, inliers):
-    """Write what ``LinearizedMotions`` holds of the motions ``start`` to ``stop``."""
+    """Normal equations and numbers of inliers of the motions ``start`` to ``stop``."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     size = points.shape[1]
     rows = np.zeros((7, 2, size))  # derivatives of the pixels u, v by the twist, and their errors; of outliers 0

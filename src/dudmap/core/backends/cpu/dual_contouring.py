@@ -9,7 +9,7 @@ changes its sign, and the surface is closed wherever the field is known, across 
 import numpy as np
 
 from dudmap.core.backends.cpu.cell_vertices import is_known, is_trusted, place_vertex
-from dudmap.core.backends.cpu.octree_field import PAD, SPAN, fill, finest_level, may_hold_surface
+from dudmap.core.backends.cpu.octree_field import PAD, SPAN, child_of, fill, finest_level, may_hold_surface
 from dudmap.core.backends.threads import kernel, scalar
 
 f32 = np.float32
@@ -32,7 +32,7 @@ def _cell_key(x, y, z, top, rows):
 
 
 @scalar
-def _mixed_color(near, children1, children2, colors0, colors1, colors2, top, x, y, z, edge, place, out):
+def _mixed_color(near, children, colors, top, x, y, z, edge, place, out):
     """Colour (3,) uint8 at a place of a cell: mean of the corners that have one, weighed trilinearly."""
     total = f32(0)
     sums = np.zeros(3, f32)
@@ -50,22 +50,15 @@ def _mixed_color(near, children1, children2, colors0, colors1, colors2, top, x, 
             continue
         i, j, k = i - (bx - 1) * width, j - (by - 1) * width, k - (bz - 1) * width
         color = np.int32(0)
-        if top == 0 or ((i | j | k) & ((1 << top) - 1)) == 0:
-            color = colors0[slot, (((i >> top) << 3) + (j >> top)) * 8 + (k >> top)]
-        if top > 0 and slot < len(children1):
-            half = width >> 1
-            child = children1[slot, 4 * (i // half) + 2 * (j // half) + k // half]
-            if child >= 0:
-                i, j, k = i % half, j % half, k % half
-                shift = top - 1
-                if ((i | j | k) & ((1 << shift) - 1)) == 0:
-                    found = colors1[child, (((i >> shift) << 3) + (j >> shift)) * 8 + (k >> shift)]
-                    color = found if found != 0 else color
-                if top == 2 and child < len(children2):
-                    small = children2[child, 4 * (i >> 3) + 2 * (j >> 3) + (k >> 3)]
-                    if small >= 0:
-                        found = colors2[small, (((i & 7) << 3) + (j & 7)) * 8 + (k & 7)]
-                        color = found if found != 0 else color
+        for level in range(top + 1):
+            shift = top - level
+            if slot >= 0 and ((i | j | k) & ((1 << shift) - 1)) == 0:
+                found = colors[level][slot, (((i >> shift) & 7) << 6) | (((j >> shift) & 7) << 3) | ((k >> shift) & 7)]
+                color = found if found != 0 else color
+            if level < top:
+                half = shift + 2
+                octant = 4 * ((i >> half) & 1) + 2 * ((j >> half) & 1) + ((k >> half) & 1)
+                slot = child_of(children[level], slot, octant)
         if color == 0 or weight <= f32(0):
             continue
         total += weight
@@ -98,9 +91,10 @@ def _may_cross(field, size, p, stride, top):
 
 
 @scalar
-def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, work, keys, places, colors, count):
+def _block_vertices(
+    field, levels, near, row, top, jump, children, paint, coords, spacing, work, keys, places, colors, count
+):  # fmt: skip
     """Vertices of the cells of a block; the new number of vertices. See ``contour_blocks``."""
-    children1, children2, colors0, colors1, colors2 = tree
     cells, size, pad, width = SPAN << top, (SPAN << top) + 1, PAD << top, 8 << top
     vertex, planes = np.empty(6, f32), np.empty((540, 5), f32)
     for i in range(width):
@@ -123,9 +117,7 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
                     first = (i if axis == 0 else (j if axis == 1 else k)) + width * np.int64(coords[axis])
                     place[axis] = f32(spacing * (np.float64(first) + np.float64(vertex[axis])))
                     place[3 + axis] = vertex[3 + axis]
-                _mixed_color(
-                    near, children1, children2, colors0, colors1, colors2, top, x, y, z, edge, vertex, colors[count]
-                )
+                _mixed_color(near, children, paint, top, x, y, z, edge, vertex, colors[count])
                 count += 1
     return count
 
@@ -182,20 +174,18 @@ def _block_polygons(field, levels, rows, top, jump, polygons, count):
 
 @kernel
 def contour_blocks(
-    start, stop, slots, near, rows, meshed, coords, geometry0, geometry1, geometry2, children1, children2, colors0,
-    colors1, colors2, least, unit, voxel_size, jump,
+    start, stop, near, rows, meshed, coords, geometry, children, paint, least, unit, voxel_size, jump
 ):  # fmt: skip
     """Vertices and polygons of blocks ``start`` to ``stop`` of the coarsest level.
 
     Args:
         start, stop: Range of blocks.
-        slots: (n,) int32.
         near: (n, 27) int32 slots of the blocks and their neighbours.
-        rows: (n, 27) int32 rows of ``slots`` that hold these neighbours; -1 = none.
+        rows: (n, 27) int32 numbers of these neighbours among the blocks; -1 = none.
         meshed: (n,) bool, whether the polygons of a block are wanted; its vertices always are.
         coords: (n, 3) int32 coordinates of the blocks.
-        geometry0, geometry1, geometry2, colors0, colors1, colors2: (slots, 512) int32 by level.
-        children1, children2: (slots, 8) int32.
+        geometry, paint: Packed voxels and colours (slots, 512) int32 of each of three levels.
+        children: (slots, 8) int32 slots of the children in each of the two finer levels, see ``FinerLevels``.
         least: Smallest trusted weight, at least 1.
         unit: Metres per step of a stored distance.
         voxel_size: Of the coarsest level, metres.
@@ -207,49 +197,32 @@ def contour_blocks(
     """
     top = 0
     for row in range(start, stop):
-        top = max(top, finest_level(near[row], children1, children2))
+        top = max(top, finest_level(near[row], children))
     sizes = (SPAN + 1, (SPAN << 1) + 1 if top > 0 else 1, (SPAN << 2) + 1 if top > 1 else 1)
     buffers = (np.empty(sizes[0] ** 3, f32), np.empty(sizes[1] ** 3, f32), np.empty(sizes[2] ** 3, f32))
     levels = np.empty((SPAN << top) ** 3, np.uint8)
     work = np.empty((192, 7), f32)
-    tree = (children1, children2, colors0, colors1, colors2)
     capacity = 1 << 12
     keys, places = np.empty(capacity, np.int64), np.empty((capacity, 6), f32)
     colors, polygons = np.empty((capacity, 3), np.uint8), np.empty((capacity, 4), np.int64)
     owners = np.empty(capacity, np.int32)
     num_vertices, num_polygons = 0, 0
     for row in range(start, stop):
-        if not may_hold_surface(near[row], geometry0, children1, least):
+        if not may_hold_surface(near[row], geometry[0], children[0], least):
             continue
-        top = finest_level(near[row], children1, children2)
+        top = finest_level(near[row], children)
         most = 512 << (3 * top)
         if num_vertices + most > len(keys):
-            keys, places, colors = (
-                _longer(keys, num_vertices, most),
-                _longer(places, num_vertices, most),
-                _longer(colors, num_vertices, most),
-            )
+            keys, places = _longer(keys, num_vertices, most), _longer(places, num_vertices, most)
+            colors = _longer(colors, num_vertices, most)
         if num_polygons + 3 * most > len(owners):
             polygons, owners = _longer(polygons, num_polygons, 3 * most), _longer(owners, num_polygons, 3 * most)
-        fill(near[row], geometry0, geometry1, geometry2, children1, children2, least, unit, top, buffers, levels)
-        field = buffers[top]
-        spacing = voxel_size / (1 << top)
+        fill(near[row], geometry, children, least, unit, top, buffers, levels)
+        field, spacing = buffers[top], voxel_size / (1 << top)
         num_vertices = _block_vertices(
-            field,
-            levels,
-            near[row],
-            row,
-            top,
-            jump,
-            tree,
-            coords[row],
-            spacing,
-            work,
-            keys,
-            places,
-            colors,
+            field, levels, near[row], row, top, jump, children, paint, coords[row], spacing, work, keys, places, colors,
             num_vertices,
-        )
+        )  # fmt: skip
         if meshed[row]:
             before = num_polygons
             num_polygons = _block_polygons(field, levels, rows[row], top, jump, polygons, num_polygons)

@@ -20,15 +20,15 @@ def _cell(x, y, z, size):
 
 
 @kernel
-def find(table, coords, x, y, z):
-    """Entry of block (x, y, z), or -1."""
+def place_of(table, coords, x, y, z):
+    """Cell of the table that holds the entry of block (x, y, z), or is free for it."""
     cell = _cell(x, y, z, table.size)
     while table[cell] != EMPTY:
         entry = table[cell]
         if coords[entry, 0] == x and coords[entry, 1] == y and coords[entry, 2] == z:
-            return entry
+            break
         cell = cell + 1 if cell + 1 < table.size else 0
-    return EMPTY
+    return cell
 
 
 @kernel
@@ -36,7 +36,7 @@ def find_all(table, coords, wanted):
     """Entries (n,) int32 of blocks ``wanted`` (n, 3), -1 where there is none."""
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
-        out[n] = find(table, coords, np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2]))
+        out[n] = table[place_of(table, coords, np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2]))]
     return out
 
 
@@ -49,20 +49,12 @@ def insert_all(table, coords, num_entries, wanted):
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
         x, y, z = np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2])
-        cell = _cell(x, y, z, table.size)
-        entry = -1
-        while table[cell] != EMPTY:
-            other = table[cell]
-            if coords[other, 0] == x and coords[other, 1] == y and coords[other, 2] == z:
-                entry = other
-                break
-            cell = cell + 1 if cell + 1 < table.size else 0
-        if entry < 0:
-            entry = num_entries
+        cell = place_of(table, coords, x, y, z)
+        if table[cell] == EMPTY:
+            table[cell] = num_entries
+            coords[num_entries, 0], coords[num_entries, 1], coords[num_entries, 2] = x, y, z
             num_entries += 1
-            table[cell] = entry
-            coords[entry, 0], coords[entry, 1], coords[entry, 2] = x, y, z
-        out[n] = entry
+        out[n] = table[cell]
     return out, num_entries
 
 
@@ -70,10 +62,8 @@ def insert_all(table, coords, num_entries, wanted):
 def rebuild(table, coords, num_entries):
     """Fill an all-empty ``table`` with entries 0 to ``num_entries``."""
     for entry in range(num_entries):
-        cell = _cell(np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2]), table.size)
-        while table[cell] != EMPTY:
-            cell = cell + 1 if cell + 1 < table.size else 0
-        table[cell] = entry
+        x, y, z = np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2])
+        table[place_of(table, coords, x, y, z)] = entry
 
 
 @kernel

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.links import links
 from dudmap.core.backends.cpu.tables import TRIANGLE_COUNT, TRIANGLES
-from dudmap.core.backends.parameters import MeshArrays, MeshParameters
+from dudmap.core.backends.parameters import MeshParameters
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.surface import crossing, mixed_channel, slope
+from dudmap.core.geometry.mesh import Mesh
 
 BAND = 256
 """Blocks of one band."""
@@ -86,56 +87,27 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
     return count
 
 
-@kernel
-def _find_vertices(start, stop, geometry, near, behind, cases, flags):
-    """Bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a cell with triangles.
+@scalar
+def _edge(row, n, corner, near, row_of):
+    """Row of the block, and number there, of the voxel at a corner of cell ``n`` of the block in ``row``."""
+    i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
+    if (i | j | k) & 8:
+        row = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (k >> 3)]])
+    return row, ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
 
-    Returns:
-        (stop - start,) int64 vertices per block.
-    """
-    words = np.empty((9, 9, 9), np.int32)
-    used = np.empty((9, 9, 9), np.uint8)  # cells -1 to 7 in each direction
-    count = np.zeros(stop - start, np.int64)
-    for row in range(start, stop):
-        any_used = False
-        for m in range(8):
-            dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
-            other = behind[row, m]
-            for i in range(7 if dx else 0, 8):
-                for j in range(7 if dy else 0, 8):
-                    for k in range(7 if dz else 0, 8):
-                        case = cases[other, (i * 8 + j) * 8 + k] if other >= 0 else np.uint8(0)
-                        used[0 if dx else i + 1, 0 if dy else j + 1, 0 if dz else k + 1] = case
-                        any_used |= case != 0
-        if not any_used:
-            flags[row, :] = 0
-            continue
-        _corner_words(geometry, near, row, words)
-        total = 0
-        for i in range(8):
-            for j in range(8):
-                for k in range(8):
-                    word = words[i, j, k]
-                    flag = 0
-                    middle = used[i + 1, j + 1, k + 1]
-                    if (word ^ words[i + 1, j, k]) < 0 and (
-                        middle | used[i + 1, j, k + 1] | used[i + 1, j + 1, k] | used[i + 1, j, k]
-                    ):
-                        flag |= 1
-                        total += 1
-                    if (word ^ words[i, j + 1, k]) < 0 and (
-                        middle | used[i, j + 1, k + 1] | used[i + 1, j + 1, k] | used[i, j + 1, k]
-                    ):
-                        flag |= 2
-                        total += 1
-                    if (word ^ words[i, j, k + 1]) < 0 and (
-                        middle | used[i, j + 1, k + 1] | used[i + 1, j, k + 1] | used[i, j, k + 1]
-                    ):
-                        flag |= 4
-                        total += 1
-                    flags[row, (i * 8 + j) * 8 + k] = flag
-        count[row - start] = total
-    return count
+
+@kernel
+def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned):
+    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a triangle, and count
+    them block by block."""
+    for row in range(len(cases)):
+        for n in range(512):
+            case = cases[row, n]
+            for k in range(3 * np.int64(triangle_count[case])):
+                owner, voxel = _edge(row, n, np.int64(triangles[case, k, 0]), near, row_of)
+                bit = np.uint8(1 << triangles[case, k, 1])
+                owned[owner] += np.int64(flags[owner, voxel] & bit == 0)
+                flags[owner, voxel] |= bit
 
 
 @kernel
@@ -250,15 +222,9 @@ def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, b
             case = cases[row, n]
             if case == 0:
                 continue
-            x, y, z = n >> 6, (n >> 3) & 7, n & 7
             for k in range(3 * np.int64(triangle_count[case])):
-                corner, axis = np.int64(triangles[case, k, 0]), np.int64(triangles[case, k, 1])
-                i, j, m = x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)
-                owner = row
-                if (i | j | m) & 8:
-                    owner = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (m >> 3)]])
-                voxel = ((i & 7) * 8 + (j & 7)) * 8 + (m & 7)
-                below = flags[owner, voxel] & ((1 << axis) - 1)
+                owner, voxel = _edge(row, n, np.int64(triangles[case, k, 0]), near, row_of)
+                below = flags[owner, voxel] & ((1 << np.int64(triangles[case, k, 1])) - 1)
                 vertex = first_vertex[owner] + np.int64(first[owner, voxel]) + (below & 1) + (below >> 1)
                 faces[number + k // 3, k % 3] = vertex
             number += np.int64(triangle_count[case])
@@ -300,12 +266,17 @@ def extract(
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
-) -> MeshArrays:
-    """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
-    vertices, faces, vertex_colors, normals, _ = extract_surface(
-        geometry, colors, slots, coords, neighbours, parameters, len(slots)
-    )
-    return MeshArrays(vertices, faces, vertex_colors, normals)
+) -> Mesh:
+    """Triangles of the zero level of blocks.
+
+    Args:
+        geometry, colors: (slots, 512) int32 packed voxels.
+        slots: (n,) int32 of the blocks.
+        coords: (slots, 3) block coordinates.
+        neighbours: (n, 8) int32, see ``VoxelBlocks.neighbours``.
+        parameters: Of the extraction.
+    """
+    return Mesh(*_extract(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
 
 
 def extract_chunks(
@@ -316,12 +287,12 @@ def extract_chunks(
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
-) -> list[MeshArrays]:
-    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
+) -> list[Mesh]:
+    """Meshes of groups of blocks; see ``TsdfVolume.extract_chunks``, and ``extract`` for the other arguments."""
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
-    vertices, faces, vertex_colors, normals, first_face = extract_surface(
+    vertices, faces, vertex_colors, normals, first_face = _extract(
         geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
@@ -334,11 +305,11 @@ def extract_chunks(
     for chunk in range(num_chunks):  # copies: a view would keep the arrays of all chunks alive
         own, faces_of = slice(first[chunk], first[chunk + 1]), slice(begin[chunk], begin[chunk + 1])
         parts = vertices[own], local_faces[faces_of], vertex_colors[own], normals[own]
-        out.append(MeshArrays(*(part.copy() for part in parts)))
+        out.append(Mesh(*(part.copy() for part in parts)))
     return out
 
 
-def extract_surface(
+def _extract(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
@@ -353,16 +324,17 @@ def extract_surface(
     slots, near, behind, row_of = links(slots, neighbours, len(geometry))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
-    flags = np.empty((n, 512), dtype=np.uint8)
+    flags = np.zeros((n, 512), dtype=np.uint8)
     least = max(int(parameters.min_weight), 1)
     jump = int(min(parameters.max_jump / parameters.sdf_unit, 1 << 20))
     triangles = run_bands(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
-    owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
+    owned = np.zeros(n, dtype=np.int64)
+    _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags, owned)
     first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
-    first_vertex = _offsets(owned)
+    first_vertex = _offsets([owned])
     vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
     vertex_colors = np.empty((first_vertex[-1], 3), dtype=np.uint8)
     normals = np.empty((first_vertex[-1], 3), dtype=np.float32)

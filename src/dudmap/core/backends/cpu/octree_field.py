@@ -16,27 +16,28 @@ SPAN = 8 + 2 * PAD
 
 
 @kernel
-def finest_level(near, children1, children2):
+def child_of(children, slot, octant):
+    """Slot of the block in an octant of the block in ``slot``; -1 = none."""
+    return children[slot, octant] if 0 <= slot < len(children) else np.int32(-1)
+
+
+@kernel
+def finest_level(near, children):
     """Finest level, 0 to 2, among a block of the coarsest level and its neighbours ``near`` (27,)."""
     level = 0
     for n in range(27):
-        slot = near[n]
-        if slot < 0 or slot >= len(children1):
-            continue
         for octant in range(8):
-            child = children1[slot, octant]
-            if child < 0:
-                continue
-            level = max(level, 1)
-            if child < len(children2):
+            child = child_of(children[0], near[n], octant)
+            if child >= 0:
+                level = max(level, 1)
                 for part in range(8):
-                    if children2[child, part] >= 0:
+                    if child_of(children[1], child, part) >= 0:
                         return 2
     return level
 
 
 @kernel
-def may_hold_surface(near, geometry0, children1, least):
+def may_hold_surface(near, coarsest, children, least):
     """Whether a block of the coarsest level has finer voxels, or observed ones of both signs, up to one voxel beyond
     its upper sides; else there is no surface in its cells."""
     negative, positive = False, False
@@ -45,14 +46,13 @@ def may_hold_surface(near, geometry0, children1, least):
         slot = near[13 + 9 * dx + 3 * dy + dz]
         if slot < 0:
             continue
-        if slot < len(children1):
-            for octant in range(8):
-                if children1[slot, octant] >= 0:
-                    return True
+        for octant in range(8):
+            if child_of(children, slot, octant) >= 0:
+                return True
         for i in range(1 if dx else 8):
             for j in range(1 if dy else 8):
                 for k in range(1 if dz else 8):
-                    word = geometry0[slot, (i * 8 + j) * 8 + k]
+                    word = coarsest[slot, (i * 8 + j) * 8 + k]
                     known = ((word >> 8) & 0xFF) >= least
                     negative |= known & (word < 0)
                     positive |= known & (word >= 0)
@@ -105,13 +105,12 @@ def _mark(levels, cells, x, y, z, edge, level):
 
 
 @kernel
-def fill(near, geometry0, geometry1, geometry2, children1, children2, least, unit, top, buffers, levels):
+def fill(near, geometry, children, least, unit, top, buffers, levels):
     """Field around a block and level of each cell.
 
     Args:
         near: (27,) int32 slots of the block and its neighbours.
-        geometry0, geometry1, geometry2: (slots, 512) int32 voxels of the levels.
-        children1, children2: (slots, 8) int32 of the levels 1 and 2.
+        geometry, children: As of ``contour_blocks``.
         least: Smallest trusted weight.
         unit: Metres per step of a stored distance.
         top: Finest level around the block; its lattice has ``SPAN * 2^top`` cells along each edge.
@@ -122,34 +121,20 @@ def fill(near, geometry0, geometry1, geometry2, children1, children2, least, uni
     cells = SPAN << top
     levels[: cells * cells * cells] = 0
     size = SPAN + 1
-    field = buffers[0]
-    field[: size * size * size] = np.float32(np.nan)
-    for n in range(27):
-        if near[n] >= 0:
-            x, y, z = 8 * (n // 9 - 1) + PAD, 8 * ((n // 3) % 3 - 1) + PAD, 8 * (n % 3 - 1) + PAD
-            _put(geometry0, near[n], x, y, z, size, least, unit, field)
-    for level in range(1, top + 1):
-        _upsample(buffers[level - 1], size, buffers[level])
-        size = 2 * size - 1
-        field = buffers[level]
+    buffers[0][: size * size * size] = np.float32(np.nan)
+    for level in range(top + 1):
+        if level > 0:
+            _upsample(buffers[level - 1], size, buffers[level])
+            size = 2 * size - 1
         for n in range(27):
-            slot = near[n]
-            if slot < 0 or slot >= len(children1):
-                continue
-            bx, by, bz = 8 * (n // 9 - 1) + PAD, 8 * ((n // 3) % 3 - 1) + PAD, 8 * (n % 3 - 1) + PAD
-            for octant in range(8):
-                child = children1[slot, octant]
-                if child < 0:
-                    continue
-                x, y, z = 2 * bx + 8 * (octant >> 2), 2 * by + 8 * ((octant >> 1) & 1), 2 * bz + 8 * (octant & 1)
-                if level == 1:
-                    _put(geometry1, child, x, y, z, size, least, unit, field)
-                    shift = top - 1
-                    _mark(levels, cells, x << shift, y << shift, z << shift, 8 << shift, 1)
-                elif child < len(children2):
-                    for part in range(8):
-                        small = children2[child, part]
-                        if small >= 0:
-                            i, j, k = 2 * x + 8 * (part >> 2), 2 * y + 8 * ((part >> 1) & 1), 2 * z + 8 * (part & 1)
-                            _put(geometry2, small, i, j, k, size, least, unit, field)
-                            _mark(levels, cells, i, j, k, 8, 2)
+            for part in range(1 << (3 * level)):  # the octants on the way down, three bits each
+                slot = near[n]
+                x, y, z = 8 * (n // 9 - 1) + PAD, 8 * ((n // 3) % 3 - 1) + PAD, 8 * (n % 3 - 1) + PAD
+                for finer in range(level):
+                    octant = (part >> (3 * (level - 1 - finer))) & 7
+                    slot = child_of(children[finer], slot, octant)
+                    x, y, z = 2 * x + 8 * (octant >> 2), 2 * y + 8 * ((octant >> 1) & 1), 2 * z + 8 * (octant & 1)
+                if slot >= 0:
+                    _put(geometry[level], slot, x, y, z, size, least, unit, buffers[level])
+                    shift = top - level
+                    _mark(levels, cells, x << shift, y << shift, z << shift, 8 << shift, level)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.cpu.hashing import find
+from dudmap.core.backends.cpu.hashing import place_of
 from dudmap.core.backends.threads import kernel
 
 UNSEEN, OBSERVED, EMPTY = 0, 1, 2
@@ -42,7 +42,7 @@ def sample_points(table, coords, slot_of, free_count, geometry, colors, points, 
             vx, vy, vz = ix + (corner >> 2), iy + ((corner >> 1) & 1), iz + (corner & 1)
             if vx >> 3 != bx or vy >> 3 != by or vz >> 3 != bz:
                 bx, by, bz = vx >> 3, vy >> 3, vz >> 3
-                entry = find(table, coords, bx, by, bz)
+                entry = table[place_of(table, coords, bx, by, bz)]
             if entry < 0:
                 known = False
                 break
