@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.association import associate, read_list, read_pairs
 from dudmap.errors import DatasetError
-from dudmap.io.sequences.images import read_mask
-from dudmap.io.sequences.masks import stamped_masks
+from dudmap.io.sequences.images import read_mask, stamped_masks
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.errors import CameraError
 from dudmap.io.exporting import ros_messages as ros
-from dudmap.io.exporting.mcap import McapWriter
+from dudmap.io.exporting.ros_messages import McapWriter
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame

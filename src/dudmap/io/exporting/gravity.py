@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.mesh_editing import face_vectors
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 CONE = np.cos(np.radians(45))
 """The floor's normal is looked for within 45 degrees of the mean direction that the cameras held up."""

@@ -15,8 +15,7 @@ from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.gravity import find_floor, z_up
 from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Values of cells, those of ROS' ``nav_msgs/OccupancyGrid``."""

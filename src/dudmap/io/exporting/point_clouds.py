@@ -10,8 +10,7 @@ from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.extras import extra
 from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 LAS_STEP = 0.0001
 """Resolution of coordinates in LAS files, metres: a hundredth of a voxel."""

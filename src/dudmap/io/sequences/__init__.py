@@ -84,9 +84,9 @@ READERS = (
     "numbered:NumberedSequence",
     "image_logs:SensRecording",
     "image_logs:KlgRecording",
-    "record3d:Record3DRecording",
+    "image_logs:Record3DRecording",
     "azure_kinect:AzureKinectRecording",
-    "realsense:RealSenseRecording",
+    "bag:RealSenseRecording",
     "bag:RosBag",
 )
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""

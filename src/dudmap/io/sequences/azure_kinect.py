@@ -17,8 +17,8 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_FILE, foreign, open_plain, parse_json
 from dudmap.io.sequences import images
-from dudmap.io.sequences.lens import RATIONAL, Lens
-from dudmap.io.sequences.message_stream import MessageStream
+from dudmap.io.sequences.bag_file import MessageStream
+from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 from dudmap.io.sequences.recording import Recording
 
 BEFORE = 1_000_000_000

@@ -1,23 +1,25 @@
-"""Binary glTF 2.0 files, which browsers and Blender open.
+"""Mesh files: PLY, OBJ, STL, binary glTF 2.0 and USDZ.
 
-Written here and not by trimesh, since glTF wants linear vertex colours with a material that says that they are not to
-be lit again: sRGB bytes look pale, and without a material a viewer takes metal.
+glTF is written here and not by trimesh, since it wants linear vertex colours with a material that says that they are
+not to be lit again: sRGB bytes look pale, and without a material a viewer takes metal.
 """
 
 import json
 import struct
+import tempfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
+from dudmap.atomic_file import atomic_file, put_in_place
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.extras import extra
 from dudmap.io.exporting.gravity import up_of, y_up
-from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.mesh_editing import edited, rotated
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
 """Component types of accessors."""
@@ -31,13 +33,12 @@ MATERIAL = {
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh of a run. Vertices keep the map's axes; the node turns them to y up.
+    """Write the mesh in the axes of the map, in the format of the file's ending: PLY, OBJ or STL."""
+    edited(run.surface, options).save(path)
 
-    Raises:
-        MapError: There is no mesh.
-        ConfigError: An option is invalid.
-        OSError: The file cannot be written.
-    """
+
+def write_glb(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the mesh as binary glTF. Vertices keep the map's axes; the node turns them to y up."""
     mesh = edited(run.surface, options)
     T = np.eye(4)
     T[:3, :3] = y_up(up_of(run, options))
@@ -100,3 +101,34 @@ def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
     out = np.full((len(colors), 4), 65535, "<u2")
     out[:, :3] = np.rint(65535 * linear_light(np.arange(256, dtype=np.uint8))).astype(np.uint16)[colors]
     return out
+
+
+def write_usdz(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the mesh as USDZ, y up, metres, with its colours as ``displayColor``."""
+    with extra("export", "writing .usdz"):
+        # by name, since type checkers see none of the classes of usd-core
+        sdf, usd, geom, utils, vt = (import_module(f"pxr.{n}") for n in ("Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"))
+    mesh = rotated(edited(run.surface, options), y_up(up_of(run, options)))
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
+        layer = Path(folder) / "map.usdc"
+        stage = usd.Stage.CreateNew(str(layer))
+        geom.SetStageUpAxis(stage, geom.Tokens.y)
+        geom.SetStageMetersPerUnit(stage, 1.0)
+        prim = geom.Mesh.Define(stage, "/map")
+        stage.SetDefaultPrim(prim.GetPrim())
+        prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices)))
+        prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.normals)))
+        prim.SetNormalsInterpolation(geom.Tokens.vertex)
+        prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+        prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1)))
+        prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
+        prim.CreateDoubleSidedAttr(True)
+        corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
+        prim.CreateExtentAttr(vt.Vec3fArray.FromNumpy(corners))
+        colors = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        colors.Set(vt.Vec3fArray.FromNumpy(linear_light(mesh.colors).astype(np.float32)))
+        stage.Save()
+        packed = Path(folder) / "packed.usdz"
+        if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(layer)), str(packed)):
+            raise OSError(f"usd-core could not write {path}")
+        put_in_place(packed, path)
