@@ -1,4 +1,4 @@
-"""A bag by the package rosbags, with access to single messages: its topics, the times of their messages from its index, and the messages themselves.
+"""A bag by the package rosbags: its topics, times of messages from its index, and single messages.
 
 rosbags trusts what it reads. Here decompression is limited, an SQLite file must be nothing but tables, and messages are
 decoded by the definitions that ROS publishes for their types: of those in a bag rosbags would make Python code. Topics
