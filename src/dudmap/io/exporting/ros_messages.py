@@ -23,7 +23,6 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_simplification import simplified
 from dudmap.errors import DatasetError
 from dudmap.extras import extra
-from dudmap.io.exporting import ros_messages as ros
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
@@ -276,7 +275,7 @@ class McapWriter:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
             from rosbags.typesys import Stores, get_typestore
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self.types, self.file = ros.MessageTypes(self._store.types.__getitem__), folder / f"{folder.name}.mcap"
+        self.types, self.file = MessageTypes(self._store.types.__getitem__), folder / f"{folder.name}.mcap"
         self._connections: dict[str, Any] = {}
         self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         if compressed:
@@ -308,14 +307,14 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
         put_in_place(writer.file, path)
 
 
-def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:
+def _messages(types: MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:
     """Topic, time and message of everything in a run, in order of time."""
-    stamps, Ts, frame = run.trajectory.timestamps, run.trajectory.Ts_world_camera, ros.MAP_FRAME
+    stamps, Ts, frame = run.trajectory.timestamps, run.trajectory.Ts_world_camera, MAP_FRAME
     first = float(stamps[0])
-    yield "/path", first, ros.path(types, first, stamps, Ts, frame)
+    yield "/path", first, path(types, first, stamps, Ts, frame)
     if run.mesh is not None:
-        yield "/points", first, ros.cloud(types, first, run.mesh.vertices, run.mesh.colors, frame)
-        yield "/mesh", first, ros.mesh_marker(types, first, simplified(run.mesh, MESH_TRIANGLES), frame)
+        yield "/points", first, cloud(types, first, run.mesh.vertices, run.mesh.colors, frame)
+        yield "/mesh", first, mesh_marker(types, first, simplified(run.mesh, MESH_TRIANGLES), frame)
     movers = {round(line["timestamp"], 6): line["movers"] for line in run.movers}
     before = first, Ts[0]
     had_movers = False
@@ -323,9 +322,9 @@ def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, f
         elapsed = stamp - before[0]
         velocity = se3.log(se3.inverse(before[1]) @ T) / elapsed if elapsed > 0 else np.zeros(6)
         before = stamp, T
-        yield "/tf", stamp, ros.transforms(types, [ros.transform(types, stamp, T, frame, ros.CAMERA_FRAME)])
-        yield "/odometry", stamp, ros.odometry(types, stamp, T, velocity, frame, ros.CAMERA_FRAME)
+        yield "/tf", stamp, transforms(types, [transform(types, stamp, T, frame, CAMERA_FRAME)])
+        yield "/odometry", stamp, odometry(types, stamp, T, velocity, frame, CAMERA_FRAME)
         seen = movers.get(round(stamp, 6), [])
         if seen or had_movers:
-            yield "/movers", stamp, ros.mover_markers(types, stamp, seen, frame)
+            yield "/movers", stamp, mover_markers(types, stamp, seen, frame)
         had_movers = bool(seen)

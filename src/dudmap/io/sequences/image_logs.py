@@ -40,17 +40,43 @@ class FrameEntry(NamedTuple):
     color_time: int = 0
 
 
-class SensRecording(Recording):
+class _FrameLog(Recording):
+    """Base of the formats that hold two images after each header; opening walks over the headers."""
+
+    options: tuple[str, ...] = ("depth_unit",)
+    _entries: list[FrameEntry]
+
+    def _images(self, index: int) -> tuple[bytes, bytes]:
+        """Data of the two images of a frame, in the order of the file."""
+        entry = self._entries[index]
+        with open_plain(self.path) as file:
+            file.seek(entry.offset)
+            return file.read(entry.sizes[0]), file.read(entry.sizes[1])
+
+    def _depth(self, data: bytes, name: str, *, compressed: bool) -> NDArray[np.float32]:
+        """Depth (H, W), metres, of 16-bit values that are raw or deflated by zlib."""
+        height, width = self.camera.shape
+        expected = 2 * height * width
+        if compressed:
+            try:
+                data = zlib.decompressobj().decompress(data, expected + 1)
+            except zlib.error as error:
+                raise FrameError(f"{name}: the depth image is damaged, {error}") from None
+        if len(data) != expected:
+            raise FrameError(f"{name}: the depth image has {len(data)} bytes; expected {expected} of {width}x{height}")
+        values = np.frombuffer(data, "<u2").reshape(height, width).astype(np.uint16, copy=False)
+        return images.metres(values, self.camera.depth_scale, name)
+
+
+class SensRecording(_FrameLog):
     """Recording in a ``.sens`` file.
 
-    Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
-    colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
+    The colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
     holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
     """
 
     format = "ScanNet .sens"
     suffix = ".sens"
-    options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -110,18 +136,17 @@ class SensRecording(Recording):
         return entry, pose
 
     def _frame(self, index: int, name: str) -> Frame:
-        entry = self._entries[index]
-        color_data, depth_data = _read(self.path, entry)
+        color_data, depth_data = self._images(index)
         color = images.decode_color(color_data, f"the colour image of {name}")
         expected = self.camera if self.calibration is None else self.calibration.camera
         if color.shape[:2] != expected.shape:
             raise FrameError(f"{name}: the colour image has another size than the file's header says")
-        values = decode_values(depth_data, self.camera.shape, compressed=self._deflated, name=name)
-        depth = images.metres(values, self.camera.depth_scale, name)
-        return Frame(float(self.timestamps[index]), depth, color, 1e-6 * entry.color_time if self.timed else None)
+        depth = self._depth(depth_data, name, compressed=self._deflated)
+        taken = 1e-6 * self._entries[index].color_time if self.timed else None
+        return Frame(float(self.timestamps[index]), depth, color, taken)
 
 
-class KlgRecording(Recording):
+class KlgRecording(_FrameLog):
     """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
     Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
@@ -131,7 +156,6 @@ class KlgRecording(Recording):
 
     format = "ElasticFusion .klg"
     suffix = ".klg"
-    options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -150,22 +174,22 @@ class KlgRecording(Recording):
         self.camera = known.camera(*self._size(known), 1000.0)
 
     def _frame(self, index: int, name: str) -> Frame:
-        depth_data, color_data = _read(self.path, self._entries[index])
-        raw = len(depth_data) == 2 * self.camera.width * self.camera.height
-        values = decode_values(depth_data, self.camera.shape, compressed=not raw, name=name)
-        if len(color_data) == 3 * self.camera.width * self.camera.height:
+        depth_data, color_data = self._images(index)
+        pixels = self.camera.width * self.camera.height
+        depth = self._depth(depth_data, name, compressed=len(depth_data) != 2 * pixels)
+        if len(color_data) == 3 * pixels:
             color = np.frombuffer(color_data, np.uint8).reshape(*self.camera.shape, 3).copy()
         else:
             color = images.decode_color(color_data, f"the colour image of {name}")
         if color.shape[:2] != self.camera.shape:
             raise FrameError(f"{name}: the colour image is not {self.camera.width}x{self.camera.height} pixels")
-        return Frame(float(self.timestamps[index]), images.metres(values, self.camera.depth_scale, name), color)
+        return Frame(float(self.timestamps[index]), depth, color)
 
     def _size(self, known: intrinsics.Intrinsics) -> tuple[int, int]:
         """Width and height of the images."""
         if "width" in known.values:
             return int(known.values["width"]), int(known.values["height"])
-        _, color = _read(self.path, self._entries[0])
+        _, color = self._images(0)
         if color.startswith(images.JPEG):
             height, width = images.decode_color(color, f"the first colour image of {self.path}").shape[:2]
             return width, height
@@ -193,32 +217,8 @@ class KlgRecording(Recording):
         return entries
 
 
-def _read(path: Path, entry: FrameEntry) -> tuple[bytes, bytes]:
-    """Data of the two images of a frame."""
-    with open_plain(path) as file:
-        file.seek(entry.offset)
-        return file.read(entry.sizes[0]), file.read(entry.sizes[1])
-
-
 def _unpack(file: IO[bytes], form: str) -> tuple:
     return struct.unpack(form, file.read(struct.calcsize(form)))
-
-
-def decode_values(data: bytes, shape: tuple[int, int], *, compressed: bool, name: str) -> NDArray[np.uint16]:
-    """16-bit depth values (H, W) of a buffer, raw or deflated by zlib.
-
-    Raises:
-        FrameError: The data cannot be inflated, or are not of this size.
-    """
-    expected = 2 * shape[0] * shape[1]
-    if compressed:
-        try:
-            data = zlib.decompressobj().decompress(data, expected + 1)
-        except zlib.error as error:
-            raise FrameError(f"{name}: the depth image is damaged, {error}") from None
-    if len(data) != expected:
-        raise FrameError(f"{name}: the depth image has {len(data)} bytes; expected {expected} of {shape[1]}x{shape[0]}")
-    return np.frombuffer(data, dtype="<u2").reshape(shape).astype(np.uint16, copy=False)
 
 
 LARGEST_COMMAND = 315 + 2359
