@@ -22,12 +22,11 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.io.exporting.ros_messages import seconds_of
-from dudmap.io.sequences import bag_messages, intrinsics
+from dudmap.io.sequences import Recording, bag_messages, intrinsics
 from dudmap.io.sequences.bag_file import BagFile, MessageTimes
 from dudmap.io.sequences.bag_messages import STATIC_TOPIC, TOPIC, TransformTree, motion_of
 from dudmap.io.sequences.image_folder import PROBES, size
 from dudmap.io.sequences.intrinsics import Lens
-from dudmap.io.sequences.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

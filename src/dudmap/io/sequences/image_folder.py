@@ -17,8 +17,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
-from dudmap.io.sequences import camera_files, images, intrinsics
-from dudmap.io.sequences.recording import Recording
+from dudmap.io.sequences import Recording, camera_files, images, intrinsics
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""

@@ -18,8 +18,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, open_plain, parse_json
-from dudmap.io.sequences import images, intrinsics
-from dudmap.io.sequences.recording import Recording
+from dudmap.io.sequences import Recording, images, intrinsics
 
 SENS_VERSION = 4
 """The version of the format that ScanNet publishes."""
