@@ -29,6 +29,8 @@ WORLDS: dict[str, dict[str, Any]] = {
     },
     "kinect-v1": {"frames": 40, "situation": "people_at_start", "sensor": "kinect_v1"},
 }
+SAMPLES = 100_000
+"""Points sampled on each surface; shares then vary by at most 0.03 %, a third of the smallest margin."""
 EXCERPT = "freiburg1_xyz"
 """Twelve real frames among the test fixtures."""
 FIGURES: dict[str, tuple[str, float, float]] = {
@@ -84,7 +86,8 @@ def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
     rows = []
     for entry in entries:
         sequence = entry.open()
-        rows.append({"sequence": entry.name} | measure_sequence(sequence, config, entry.surfaces(sequence)))
+        row = measure_sequence(sequence, config, entry.surfaces(sequence), samples=SAMPLES)
+        rows.append({"sequence": entry.name} | row)
     return rows
 
 
