@@ -28,7 +28,7 @@ from dudmap.errors import StateError
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic.recording import SyntheticSequence
 
-SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+SMALL = Camera(fx=196.9, fy=196.9, cx=119.5, cy=89.5, width=240, height=180)
 CONFIG = Config().override(
     [
         "volume.voxel_size=0.02",
@@ -63,7 +63,7 @@ class Rendered:
 def lost_and_found():
     """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps; the colour
     is taken after the depth."""
-    yaw = np.concatenate([np.zeros(6), np.full(8, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 20)), np.zeros(8)])
+    yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 22)), np.zeros(10)])
     base = synthetic.sequence(movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=15.0,
                               noise="realsense")  # fmt: skip
     Ts, up = base.ground_truth.Ts_world_camera.copy(), base.scene.home[:3, 1]
