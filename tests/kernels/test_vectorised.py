@@ -64,9 +64,7 @@ def signatures():
 def compiled(signatures, sources, **settings):
     """Counts per kernel, compiled by a fresh process; ``sources`` are the kernels with their variants, None as they
     are. What the kernels call may come from the cache."""
-    wanted = [
-        (module.__name__, name, signatures[name], sources[name]) for module, name in FEWEST if name in sources
-    ]
+    wanted = [(module.__name__, name, signatures[name], sources[name]) for module, name in FEWEST if name in sources]
     program = Path(__file__).with_name("vectors.py")
     done = subprocess.run(
         [sys.executable, str(program)],
