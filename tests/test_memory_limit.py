@@ -17,6 +17,9 @@ from dudmap.lab.synthetic.ring_corridor import ring_corridor
 from triangles import triangles
 
 FRAMES = 58
+SETTINGS = [
+    "volume.voxel_size=0.01", "preprocess.depth_max=3", "loops.keep_distance=0.3", "dynamics.start_seconds=0",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +29,7 @@ def corridor():
 
 
 def processed(corridor, max_blocks=None, dark=(), settings=()):
-    config = Config().override(
-        ["volume.voxel_size=0.01", "preprocess.depth_max=3", "loops.keep_distance=0.3", *settings]
-    )
+    config = Config().override([*SETTINGS, *settings])
     camera, frames = corridor
     slam, most = Slam(camera, config, max_blocks=max_blocks), 0
     for index, frame in enumerate(frames):
