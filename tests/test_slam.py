@@ -206,20 +206,13 @@ def digest():
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads_or_the_run():
-    """This process has at least two threads where pytest-xdist started it."""
+    """This process has at least two threads where pytest-xdist started it, the other one has one."""
     command = [sys.executable, "-c", "import test_slam; print(test_slam.digest())"]
-    digests = {
-        subprocess.run(
-            command,
-            cwd=Path(__file__).parent,
-            env={**os.environ, "DUDMAP_THREADS": threads},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-        for threads in ("1", "3")
-    }
-    assert digests == {digest()}
+    done = subprocess.run(
+        command, cwd=Path(__file__).parent, env={**os.environ, "DUDMAP_THREADS": "1"}, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == digest()
 
 
 def test_importing_dudmap_is_light():
