@@ -13,9 +13,10 @@ import platform
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+import vectors
+from vectors import counts
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu import filtering, integration, labeling, registration, sampling
@@ -62,13 +63,16 @@ def signatures():
 
 
 def compiled(signatures, sources, **settings):
-    """Counts per kernel, compiled by a fresh process; ``sources`` are the kernels with their variants, None as they
-    are. What the kernels call may come from the cache."""
-    wanted = [(module.__name__, name, signatures[name], sources[name]) for module, name in FEWEST if name in sources]
-    program = Path(__file__).with_name("vectors.py")
+    """Counts per kernel, compiled anew for this processor, or by a process with other settings of numba's compiler.
+
+    ``sources`` are the kernels with their variants, None as they are. What they call may come from the cache.
+    """
+    wanted = [(module, name, signatures[name], sources[name]) for module, name in FEWEST if name in sources]
+    if not settings:
+        return {name: counts(getattr(module, name), *rest) for module, name, *rest in wanted}
     done = subprocess.run(
-        [sys.executable, str(program)],
-        input=pickle.dumps(wanted),
+        [sys.executable, vectors.__file__],
+        input=pickle.dumps([(module.__name__, *rest) for module, *rest in wanted]),
         capture_output=True,
         env=os.environ | settings,
         check=False,
