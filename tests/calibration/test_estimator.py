@@ -27,13 +27,17 @@ NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
 REACH = np.array([1.6, 1.65, 1.55])
 
 
-def pose(t: float) -> np.ndarray:
-    """A hand-held camera that looks around a corner, speeding up and slowing down about all axes."""
+def poses(t: np.ndarray) -> np.ndarray:
+    """A hand-held camera that looks around a corner, speeding up and slowing down about all axes, at times (n,)."""
     angles = [0.20 * np.sin(2.1 * t), 0.22 * np.sin(2.7 * t + 1), 0.18 * np.sin(3.3 * t + 2)]
     shift = [0.10 * np.sin(2.4 * t + 0.5), 0.08 * np.sin(3.1 * t), 0.08 * np.sin(1.9 * t + 1.5)]
-    T = se3.exp(np.array([0, 0, 0, *angles]))
-    T[:3, 3] = shift
-    return T
+    Ts = se3.exp_all(np.stack([*np.zeros((3, len(t))), *angles], axis=1))
+    Ts[:, :3, 3] = np.stack(shift, axis=1)
+    return Ts
+
+
+def pose(t: float) -> np.ndarray:
+    return poses(np.array([t]))[0]
 
 
 def hits(rays: np.ndarray, origins: np.ndarray) -> np.ndarray:
@@ -67,11 +71,9 @@ def record(truth: Calibration, index: int) -> Frame:
         r2 = (straight**2).sum(-1, keepdims=True)
         straight = distorted / (1 + k1 * r2 + k2 * r2**2)
     rays = np.concatenate([straight, np.ones((*u.shape, 1))], -1)
-    origins = np.empty_like(rays)
-    for row in range(of.height):
-        tau = truth.delay + truth.readout * ((row + 0.5) / of.height - 0.5)
-        T = pose(t + tau) @ se3.inverse(truth.T_color_depth)
-        rays[row], origins[row] = rays[row] @ T[:3, :3].T, T[:3, 3]
+    taus = truth.delay + truth.readout * ((np.arange(of.height) + 0.5) / of.height - 0.5)
+    Ts = poses(t + taus) @ se3.inverse(truth.T_color_depth)
+    rays, origins = rays @ Ts[:, :3, :3].swapaxes(1, 2), np.broadcast_to(Ts[:, None, :3, 3], rays.shape)
     gray = 255 * shade(hits(rays, origins)) + np.random.default_rng(index).normal(0, 1.5, u.shape)
     color = np.clip(np.round(gray), 0, 255).astype(np.uint8)
     return Frame(t, depth, np.repeat(color[..., None], 3, axis=2))
