@@ -87,7 +87,10 @@ class RosBag(Recording):
         if path.is_dir():
             return (path / "metadata.yaml").is_file()
         magic = MAGIC.get(path.suffix.lower())
-        return magic is not None and starts_with(path, magic)
+        if magic is None or not path.is_file():
+            return False
+        with open_plain(path, pointers=True) as file:  # which Git LFS may have to fetch
+            return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
     def _frame(self, index: int, name: str) -> Frame:
         depth, values, color, image = self._decoded(index, self.camera.depth_scale)
@@ -226,10 +229,11 @@ class RosBag(Recording):
         width, height = (info.width, info.height) if info.width and info.height else shape
         units = self._units()
         camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
-        return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
+        return Lens(camera) if rectified else Lens.of(camera, self._model_of(image, info), tuple(map(float, D)))
 
-    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
-        return Lens.of(camera, model, coefficients)
+    def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
+        """Model of the lens of an image with its camera_info."""
+        return info.distortion_model
 
     @cached_property
     def _transforms(self) -> TransformTree:
@@ -245,14 +249,6 @@ class RosBag(Recording):
                 messages = (message for _, message in self._bag.messages(found, limit))
                 tree.add(messages, static=topic == STATIC_TOPIC)
         return tree
-
-
-def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file starts with these bytes, or will once Git LFS has fetched it."""
-    if not path.is_file():
-        return False
-    with open_plain(path, pointers=True) as file:
-        return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
 
 def _equal(one: Lens, other: Lens) -> bool:
@@ -309,15 +305,11 @@ class RealSenseRecording(RosBag):
             return None
         return motions[0] @ se3.inverse(motions[1])
 
-    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
-        """Lens of a stream; the camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
+    def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
+        """The camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
-        model = re.search(r"model=([^;]*)", self._bag.first(text).data) if text else None
-        self._model = model[1] if model else ""
-        return super()._lens(connection, image, shape)
-
-    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
-        return Lens.of(camera, self._model or model, coefficients)
+        found = re.search(r"model=([^;]+)", self._bag.first(text).data) if text else None
+        return found[1] if found else info.distortion_model
 
     def _units(self) -> float:
         sensor = re.match(r"/device_\d+/sensor_\d+", self._topics.depth.topic)
