@@ -21,7 +21,7 @@ from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
 from off_course import LIMIT, off_course
 
-FRAMES = 12
+FRAMES = 14
 FIRST = 5
 """First frame compared: the silhouette of a mover is complete once the map has seen the space around it."""
 WIDTH, HEIGHT = 320, 240
