@@ -21,9 +21,11 @@ if worker is not None:
     if not (caches / worker).exists() and (caches / "common").exists():
         shutil.copytree(caches / "common", caches / worker)
     os.environ["NUMBA_CACHE_DIR"] = str(caches / worker)
-    # The cores are shared by the workers; at least two threads, so that the code for several threads is tested.
+    # The cores are shared by the workers. The first one has at least two threads, so that whole systems run on several;
+    # more threads than cores cost a tenth of the time. What threads share has tests with given numbers of them.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    os.environ.setdefault("DUDMAP_THREADS", str(max(2, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))))
+    fewest = 2 if worker == "gw0" else 1
+    os.environ.setdefault("DUDMAP_THREADS", str(max(fewest, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))))
 
 if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
     import cv2

@@ -25,7 +25,7 @@ EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
 def demo(tmp_path_factory):
     """Run folder and metrics of the demo, cut after the person has crossed half of the room."""
     out = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "dudmap", "demo", "--max-frames", "80", "--out", str(out), "--json"]
+    command = [sys.executable, "-m", "dudmap", "demo", "--max-frames", "60", "--out", str(out), "--json"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # peak memory of a process of its own
     assert result.returncode == 0, result.stderr
     return out, json.loads(result.stdout)
@@ -33,7 +33,7 @@ def demo(tmp_path_factory):
 
 def test_the_demo_is_accurate(demo):
     _, metrics = demo
-    assert metrics["frames"] == metrics["tracked"] == 80
+    assert metrics["frames"] == metrics["tracked"] == 60
     assert metrics["lost"] == 0
     assert metrics["ate_rmse_m"] <= 0.01
     assert metrics["mask_iou_frames"] >= 10
@@ -43,8 +43,8 @@ def test_the_demo_is_accurate(demo):
 
 def test_the_demo_leaves_a_run_folder_with_a_picture(demo):
     out, metrics = demo
-    assert len(Trajectory.load(out / "trajectory.txt")) == 80
-    assert len(list((out / "masks").glob("*.png"))) == 80
+    assert len(Trajectory.load(out / "trajectory.txt")) == 60
+    assert len(list((out / "masks").glob("*.png"))) == 60
     mesh = Mesh.load(out / "mesh.ply")
     assert (len(mesh.vertices), len(mesh.faces)) == (metrics["mesh_vertices"], metrics["mesh_triangles"])
     assert TsdfVolume.load(out / "map.npz").num_blocks == metrics["map_blocks"]

@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,13 +21,21 @@ SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py")
 POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def all_calls():
+    """All calls of methods in the package, with their file."""
+    nodes = ((path, node) for path in SOURCES for node in ast.walk(parsed(path)))
+    return [(path, node) for path, node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+
+
 def calls(name):
     """All calls of a method of this name in the package, with their file."""
-    for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call):
-                if name == (node.func.attr if isinstance(node.func, ast.Attribute) else ""):
-                    yield path, node
+    return ((path, node) for path, node in all_calls() if node.func.attr == name)
 
 
 @pytest.mark.parametrize("name", ["read_text", "write_text"])
@@ -40,7 +49,7 @@ def test_no_image_is_opened_by_a_name_that_opencv_cannot_read_on_windows():
 
 def test_no_module_needs_posix_when_it_is_imported():
     for path in SOURCES:
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in parsed(path).body:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert not POSIX_ONLY & set(names), path

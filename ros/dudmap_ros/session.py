@@ -12,7 +12,7 @@ from dudmap.core.result import FrameResult
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting import ros_messages as ros
-from dudmap.io.sequences.bag_images import color_of, depth_of
+from dudmap.io.sequences.bag_messages import color_of, depth_of
 
 
 def default_parameters() -> dict[str, Any]:

@@ -17,11 +17,17 @@ CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
 @pytest.fixture(scope="module")
 def room():
-    return synthetic.sequence("room", movers=(), frames=30, noise="none", seed=5, camera=CAMERA)
+    sequence: Any = synthetic.sequence("room", movers=(), frames=30, noise="none", seed=5, camera=CAMERA)
+    return sequence
 
 
-def test_no_term_pulls_in_an_exact_world(room):
-    for pull in measure_pulls(room, Config(), stride=3):
+@pytest.fixture(scope="module")
+def exact_pulls(room):
+    return measure_pulls(room, Config(), stride=3)
+
+
+def test_no_term_pulls_in_an_exact_world(exact_pulls):
+    for pull in exact_pulls:
         # the size of an image pixel there is 1 cm, twice that of the full images for which the docs state the figures
         assert np.abs(pull.mean[:3]).max() < 1.0, pull
         assert np.abs(pull.mean[3:]).max() < 0.03, pull
@@ -45,11 +51,11 @@ class Displaced:
         return replace(frame, color=np.ascontiguousarray(np.roll(frame.color, shift, axis=1)))
 
 
-def test_colours_that_alternate_sideways_spread_the_poses_that_colour_wants(room):
+def test_colours_that_alternate_sideways_spread_the_poses_that_colour_wants(room, exact_pulls):
     """A shift of every other image by 2 f / z pixels is a sideways motion; distances must not notice it."""
     displaced: Any = Displaced(room, 2)
-    exact = {pull.term: pull for pull in measure_pulls(room, Config())}
-    shifted = {pull.term: pull for pull in measure_pulls(displaced, Config())}
+    exact = {pull.term: pull for pull in exact_pulls}
+    shifted = {pull.term: pull for pull in measure_pulls(displaced, Config(), stride=3)}
 
     def sideways(pull):
         """Shift of the image that the correction causes at 2 m, pixels: both motions move it alike."""
@@ -59,8 +65,8 @@ def test_colours_that_alternate_sideways_spread_the_poses_that_colour_wants(room
     assert np.allclose(shifted["distances"].corrections, exact["distances"].corrections, atol=1e-6)
 
 
-def test_table_has_a_row_for_each_term(room):
-    table = bias_table(measure_pulls(room, Config(), stride=15))
+def test_table_has_a_row_for_each_term(exact_pulls):
+    table = bias_table(exact_pulls)
     assert [row.split("|")[1].strip() for row in table.splitlines()[2:]] == ["distances", "colour", "both"]
 
 

@@ -1,5 +1,6 @@
 """The accuracy gate: figures must stay as good as recorded in gate.toml, and a spoiled system must be caught."""
 
+import pickle
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,24 @@ ENTRIES = {entry.name: entry for entry in gate.gate_entries(HERE / "fixtures")}
 
 def failures(rows, recorded=RECORDED):
     return {(check["sequence"], check["figure"]) for check in gate.compare(rows, recorded) if not check["passed"]}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _rooms_are_built_once():
+    """The surfaces of a scene are divided into triangles once for all recordings of it."""
+    from dudmap.lab.synthetic import recording
+
+    made, tessellate = {}, recording.tessellate
+
+    def once(*scene):
+        key = pickle.dumps(scene[:-1])
+        if key not in made:
+            made[key] = tessellate(*scene)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "tessellate", once)
+        yield
 
 
 @pytest.mark.parametrize("name", ENTRIES)

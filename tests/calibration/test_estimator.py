@@ -1,6 +1,7 @@
 """Recovery of the calibration from analytic images of three textured walls, taken by a moving camera."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,13 +27,17 @@ NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
 REACH = np.array([1.6, 1.65, 1.55])
 
 
-def pose(t: float) -> np.ndarray:
-    """A hand-held camera that looks around a corner, speeding up and slowing down about all axes."""
+def poses(t: np.ndarray) -> np.ndarray:
+    """A hand-held camera that looks around a corner, speeding up and slowing down about all axes, at times (n,)."""
     angles = [0.20 * np.sin(2.1 * t), 0.22 * np.sin(2.7 * t + 1), 0.18 * np.sin(3.3 * t + 2)]
     shift = [0.10 * np.sin(2.4 * t + 0.5), 0.08 * np.sin(3.1 * t), 0.08 * np.sin(1.9 * t + 1.5)]
-    T = se3.exp(np.array([0, 0, 0, *angles]))
-    T[:3, 3] = shift
-    return T
+    Ts = se3.exp_all(np.stack([*np.zeros((3, len(t))), *angles], axis=1))
+    Ts[:, :3, 3] = np.stack(shift, axis=1)
+    return Ts
+
+
+def pose(t: float) -> np.ndarray:
+    return poses(np.array([t]))[0]
 
 
 def hits(rays: np.ndarray, origins: np.ndarray) -> np.ndarray:
@@ -66,21 +71,25 @@ def record(truth: Calibration, index: int) -> Frame:
         r2 = (straight**2).sum(-1, keepdims=True)
         straight = distorted / (1 + k1 * r2 + k2 * r2**2)
     rays = np.concatenate([straight, np.ones((*u.shape, 1))], -1)
-    origins = np.empty_like(rays)
-    for row in range(of.height):
-        tau = truth.delay + truth.readout * ((row + 0.5) / of.height - 0.5)
-        T = pose(t + tau) @ se3.inverse(truth.T_color_depth)
-        rays[row], origins[row] = rays[row] @ T[:3, :3].T, T[:3, 3]
+    taus = truth.delay + truth.readout * ((np.arange(of.height) + 0.5) / of.height - 0.5)
+    Ts = poses(t + taus) @ se3.inverse(truth.T_color_depth)
+    rays, origins = rays @ Ts[:, :3, :3].swapaxes(1, 2), np.broadcast_to(Ts[:, None, :3, 3], rays.shape)
     gray = 255 * shade(hits(rays, origins)) + np.random.default_rng(index).normal(0, 1.5, u.shape)
     color = np.clip(np.round(gray), 0, 255).astype(np.uint8)
     return Frame(t, depth, np.repeat(color[..., None], 3, axis=2))
 
 
-def estimate(truth: Calibration):
+@cache
+def recorded(name: str) -> tuple[Calibration, list[Frame]]:
+    """A calibration that differs from the given one by some steps, and the frames taken with it."""
+    truth = Calibration.registered(CAMERA).retract(np.array([STEPS[name].get(key, 0.0) for key in PARAMETERS]))
+    return truth, [record(truth, index) for index in range(FRAMES)]
+
+
+def estimate(frames: list[Frame]):
     given = Calibration.registered(CAMERA)
     preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
-    for index in range(FRAMES):
-        frame = record(truth, index)
+    for index, frame in enumerate(frames):
         wrong = se3.exp(np.random.default_rng(1000 + index).normal(0, 5e-4, 6))  # tracking is not perfect
         collector.add(preprocess(frame), pose(frame.timestamp) @ wrong, np.zeros(CAMERA.shape, bool))
     return CalibrationEstimator(given, SensorConfig()).estimate(collector.keyframes)
@@ -108,9 +117,8 @@ both do together is measured by the displacement of the colours."""
 
 @pytest.mark.parametrize("name", STEPS)
 def test_what_is_wrong_is_found_and_what_is_right_stays(name):
-    step = np.array([STEPS[name].get(key, 0.0) for key in PARAMETERS])
-    truth = Calibration.registered(CAMERA).retract(step)
-    result = estimate(truth)
+    truth, frames = recorded(name)
+    result = estimate(frames)
     error = result.calibration.step_to(truth)
     for key, value in zip(PARAMETERS, error, strict=True):
         assert abs(value) < TOLERANCE.get(key, TOLERANCE.get(key.split("_")[0], np.inf)), (key, value)
@@ -121,7 +129,7 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
     }  # fmt: skip
     expected = {"as given": set(), "place": {"geometry"}, "lens and timing": {"timing", "lens"}}
     assert moved >= expected[name]
-    if not step.any():
+    if name == "as given":
         assert not result.calibration.estimated
         assert result.calibration.is_registered(CAMERA)
     assert np.all(np.isfinite(result.calibration.sigma))
@@ -133,21 +141,20 @@ class Walls:
     name, camera, calibration, ground_truth = "walls", CAMERA, None, None
     timestamps = np.arange(FRAMES) / FPS
 
-    def __init__(self, truth: Calibration) -> None:
-        self.truth, self.read = truth, []
+    def __init__(self, frames: list[Frame]) -> None:
+        self.frames, self.read = frames, []
 
     def __len__(self) -> int:
         return FRAMES
 
     def __getitem__(self, index: int) -> Frame:
         self.read.append(index)
-        return record(self.truth, index)
+        return self.frames[index]
 
 
 def test_a_recording_is_calibrated_in_one_quick_pass():
-    step = np.array([STEPS["place"].get(key, 0.0) for key in PARAMETERS])
-    truth, said = Calibration.registered(CAMERA).retract(step), []
-    walls = Walls(truth)
+    (truth, frames), said = recorded("place"), []
+    walls = Walls(frames)
     found = calibrate_sequence(walls, Config(), Calibration.registered(CAMERA), notice=said.append).calibration
     assert walls.read == list(range(FRAMES))
     assert "log_focal" in found.estimated
@@ -160,7 +167,7 @@ def test_the_images_of_the_quick_pass_are_halved_and_its_result_is_for_whole_one
     given = Calibration(replace(whole, fx=500.0, cx=322.0), np.eye(4), 0.01)
     depth, color = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     depth[:, 320:], color[:, 320:] = 3.0, 200
-    whole_sequence = Walls(given)
+    whole_sequence = Walls([])
     whole_sequence.camera = whole
     whole_sequence.timestamps = np.arange(5) / (2.0 / INTERVAL)  # twice as fast as needed
     excerpt = _Excerpt(whole_sequence, given, 1, 5)
@@ -232,8 +239,7 @@ def test_groups_that_explain_nothing_without_each_other_are_found_together():
 
 def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
     preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
-    for index in range(12):
-        frame = record(Calibration.registered(CAMERA), index)
+    for frame in recorded("as given")[1][:12]:
         collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
     given = Calibration.registered(CAMERA)
     adjustment, pairs = Adjustment(given, SensorConfig()), PairSet([Pair(*collector.keyframes[:2])])
@@ -249,8 +255,7 @@ def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
 def test_relative_poses_follow_the_poses_of_both_frames():
     """A step of the frames' poses in the normal equations of a pair against differences of its depth residuals."""
     preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
-    for index in range(30):
-        frame = record(Calibration.registered(CAMERA), index)
+    for frame in recorded("as given")[1][:30]:
         collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
     given = Calibration.registered(CAMERA)
     adjustment = Adjustment(given, SensorConfig())

@@ -12,7 +12,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import CameraError
 from dudmap.io.cameras import open_camera
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.lens import Lens
+from dudmap.io.sequences.intrinsics import Lens
 from recordings import HEIGHT, WIDTH
 from software_device import COLOR_WIDTH, T_COLOR_DEPTH, color, millimetres, record
 

@@ -64,8 +64,8 @@ def test_both_cameras_are_recorded(tmp_path):
 def test_a_slow_disk_costs_frames_of_the_recording_and_no_time(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path / "walk.mcap", CAMERA, None)
     let = threading.Event()
-    write = recorder._messages.write
-    monkeypatch.setattr(recorder._messages, "write", lambda *args: (let.wait(), write(*args)))
+    write = recorder._write
+    monkeypatch.setattr(recorder, "_write", lambda *args: (let.wait(), write(*args)))
     start = time.perf_counter()
     for index in range(AHEAD + 20):
         recorder.put(frame(index))
@@ -83,7 +83,7 @@ def test_a_full_disk_is_told_at_the_end(tmp_path, monkeypatch):
     def full(*args):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(recorder._messages, "write", full)
+    monkeypatch.setattr(recorder, "_write", full)
     for index in range(3):
         recorder.put(frame(index))
     with pytest.raises(CameraError, match=r"walk.mcap is incomplete: .*No space left"):

@@ -100,13 +100,13 @@ def test_full_size_labels_follow_the_depth_edge():
 @pytest.fixture(scope="module")
 def recording():
     sequence = synthetic.sequence("room", movers=("person",), frames=60, camera=SMALL, noise="none")
-    return sequence, [sequence[index] for index in range(60)]
+    return sequence, {index: sequence[index] for index in range(18, 60)}
 
 
-def overlap(recording, *assignments: str) -> float:
+def overlap(recording, *assignments: str, step: int = 1) -> float:
     sequence, frames = recording
     slam, scores = Slam(sequence.camera, Config().override(assignments)), []
-    for index, frame in enumerate(frames):
+    for index, frame in list(frames.items())[::step]:
         mask, truth = slam.process(frame).dynamic_mask, sequence.mask(index)
         if truth.mean() > 0.05:
             scores.append((mask & truth).sum() / (mask | truth).sum())
@@ -126,6 +126,6 @@ def test_the_threshold_rule_leaves_an_empty_room_alone():
 
 
 def test_every_method_runs_and_none_labels_nothing(recording):
-    assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028") > 0.1
-    assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false") > 0.05
-    assert overlap(recording, "dynamics.method=none") == 0.0
+    assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028", step=2) > 0.1
+    assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false", step=2) > 0.05
+    assert overlap(recording, "dynamics.method=none", step=2) == 0.0

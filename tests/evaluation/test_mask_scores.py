@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError
-from dudmap.evaluation.segmentation import MaskFolders, MaskPair, compare_masks
+from dudmap.evaluation.segmentation import MaskPair, compare_masks, mask_pairs
 
 
 def rectangle(height=10, width=20, rows=(0, 0), columns=(0, 0)):
@@ -60,11 +60,10 @@ def test_true_masks_are_named_by_colour_and_found_ones_by_depth(tmp_path):
     reference = write_masks(tmp_path / "recording", depths - 0.018, "mask")
     lines = [f"{t - 0.018:.6f} mask/{t - 0.018:.6f}.png" for t in depths]
     (reference / "mask.txt").write_text("\n".join(lines) + "\n")
-    assert compare_masks(MaskFolders(run, reference)).mean_iou < 0.9
+    assert compare_masks(*mask_pairs(run, reference)).mean_iou < 0.9
     lines = [f"{t - 0.018:.6f} rgb/{t}.png {t:.6f} depth/{t}.png" for t in depths]
     (reference / "associations.txt").write_text("\n".join(lines) + "\n")
-    pairs = MaskFolders(run, reference)
-    result = compare_masks(pairs, num_missing=pairs.num_missing)
+    result = compare_masks(*mask_pairs(run, reference))
     assert result.mean_iou == 1
     assert result.num_missing == 1
     np.testing.assert_allclose(result.timestamps, depths[:5])
@@ -74,18 +73,18 @@ def test_two_folders_of_masks(tmp_path):
     stamps = [1.0, 1.1, 1.2]
     first, second = write_masks(tmp_path / "a", stamps), write_masks(tmp_path / "b", stamps)
     (second / "masks" / "readme.png").write_bytes(b"not named by a time")
-    assert compare_masks(MaskFolders(first, second / "masks")).overall_iou == 1
+    assert compare_masks(*mask_pairs(first, second / "masks")).overall_iou == 1
 
 
 def test_errors_are_one_sentence(tmp_path):
     run = write_masks(tmp_path / "run", [1.0, 1.1])
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="run with --save-masks"):
-        MaskFolders(tmp_path / "empty", run)
+        mask_pairs(tmp_path / "empty", run)
     with pytest.raises(DatasetError, match="there is no folder"):
-        MaskFolders(tmp_path / "none", run)
+        mask_pairs(tmp_path / "none", run)
     with pytest.raises(DatasetError, match=r"within 20 ms of one of .* \(9\.000 to 9\.100 s\)"):
-        MaskFolders(run, write_masks(tmp_path / "late", [9.0, 9.1]))
+        mask_pairs(run, write_masks(tmp_path / "late", [9.0, 9.1]))
     with pytest.raises(DatasetError, match="20x10 pixels but the true one is 20x12"):
         compare_masks([MaskPair(0.0, rectangle(), rectangle(height=12))])
     with pytest.raises(DatasetError, match="nothing can be compared"):

@@ -53,11 +53,11 @@ def test_point_to_triangle_is_that_of_trimesh():
 @pytest.mark.parametrize("kind", ["fine", "coarse", "mixed"])
 def test_distance_to_a_surface_is_exact_whatever_its_triangles(kind):
     if kind == "fine":
-        shape = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
+        shape = trimesh.creation.icosphere(subdivisions=4, radius=0.35)
     elif kind == "coarse":
         shape = trimesh.creation.box((2.0, 1.0, 3.0))
     else:
-        small = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
+        small = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
         small.apply_translation([0, 0, 2.0])
         shape = trimesh.util.concatenate([trimesh.creation.box((2.0, 1.0, 3.0)), small])
     points = np.random.default_rng(4).uniform(-2, 2, (800, 3)).astype(np.float32)

@@ -24,11 +24,10 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting.exporters import EXPORTERS, export_run
-from dudmap.io.exporting.gltf import linear_light
 from dudmap.io.exporting.gravity import find_floor
 from dudmap.io.exporting.mesh_editing import without_specks
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.mesh_files import linear_light
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from exported_runs import CAMERA, VOXEL, make_run
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import ExportOptions
 
 
 def triangle(size: float, x: float) -> Mesh:

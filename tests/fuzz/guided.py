@@ -37,7 +37,7 @@ with atheris.instrument_imports(include=["dudmap", "rosbags"]):
     import dudmap.io.exporting.run_content
     import dudmap.io.sequences
     import dudmap.io.sequences.camera_files
-    import dudmap.io.sequences.masks
+    import dudmap.io.sequences.images
 
     dudmap.io.sequences.readers()
 

@@ -67,7 +67,7 @@ def test_bombs_in_bags(monkeypatch):
 
 def test_a_bomb_in_a_phone_recording():
     lzfse = pytest.importorskip("lzfse")
-    from dudmap.io.sequences.record3d import largest_unpacked
+    from dudmap.io.sequences.image_logs import largest_unpacked
 
     for data in (b"", b"a", np.linspace(0, 1, 20_000, dtype=np.float32).tobytes(), bytes(100_000), os.urandom(30_000)):
         assert largest_unpacked(lzfse.compress(data)) >= len(data)

@@ -114,7 +114,7 @@ def test_meshes_in_pieces_and_live_are_that_of_a_map_in_memory():
     """Every triangle of every piece is one of the whole mesh, bit for bit, so that pieces meet without cracks."""
     whole, paged = volume(levels=1), volume(MAX_BLOCKS, levels=1)
     live = IncrementalMesh(paged)
-    for number in range(80):
+    for number in [*range(0, 72, 2), *range(72, 80)]:
         walk([whole, paged], [number])
         if number % 6 == 0 or number > 70:  # on the way back what has changed may be gone some frames later
             live.update()

@@ -170,6 +170,11 @@ def room():
     return true_map(record("room", 1))
 
 
+@pytest.fixture(scope="module")
+def same_room():
+    return true_map(record("room", 3, "handheld"))
+
+
 def test_two_maps_of_one_room_are_joined_at_the_true_pose(room):
     other = true_map(record("room", 3, "handheld"))
     pair = compare_maps(room.saved, other.saved)
@@ -234,9 +239,8 @@ def run_folder(folder, found, times):
     return folder
 
 
-def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path):
-    other, third = true_map(record("room", 3, "handheld")), true_map(record("room", 5))
-    a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", other, [0.0, 1.0, 2.0])
+def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, same_room, tmp_path):
+    a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", same_room, [0.0, 1.0, 2.0])
     out = tmp_path / "ab"
     tree = merge_runs(a, b, out)
     assert sorted(path.name for path in out.iterdir()) == [
@@ -250,8 +254,8 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path
     assert len(shown.mesh.faces) == tree["mesh_triangles"]
     assert "5 of 5 frames were tracked" in write_report(out, tmp_path / "report.html").read_text()
     merged = SavedMap.load(out)
-    assert len(merged.keyframes) == len(room.saved.keyframes) + len(other.saved.keyframes)
-    again = merge_runs(out, run_folder(tmp_path / "c", third, [5.0]), tmp_path / "abc")
+    assert len(merged.keyframes) == len(room.saved.keyframes) + len(same_room.saved.keyframes)
+    again = merge_runs(out, run_folder(tmp_path / "c", room, [5.0]), tmp_path / "abc")
     assert again["trajectories"] == ["trajectory.txt", "trajectory-2.txt", "trajectory-3.txt"]
     with pytest.raises(DudmapError, match="is one of the runs to be merged"):
         merge_runs(a, b, a)

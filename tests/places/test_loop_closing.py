@@ -246,7 +246,7 @@ def test_a_loop_takes_the_drift_out(round_trip):
 
 def test_maps_are_joined_when_a_place_is_recognised():
     """Carried elsewhere with closed eyes, a second map for a while, then a look back at the first place."""
-    yaw = np.concatenate([np.zeros(12), np.full(28, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 60)), np.zeros(20)])
+    yaw = np.concatenate([np.zeros(12), np.full(26, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 42)), np.zeros(20)])
     sequence = turned(yaw)
     slam = Slam(SMALL)
     results = [slam.process(sequence[i]) for i in range(len(sequence))]

@@ -76,7 +76,7 @@ def test_markup_in_the_other_files(name, tmp_path):
     text = (folder / name).read_text()
     refusals = []
     numbers = list(re.finditer(r"[\d.]+|\w+", text))
-    for match in numbers[:: max(1, len(numbers) // 40)]:
+    for match in numbers[:: max(1, len(numbers) // 20)]:
         (folder / name).write_text(text[: match.start()] + MARKUP.replace('"', "'") + text[match.end() :])
         try:
             checked(write_report(folder))

@@ -9,7 +9,7 @@ import pytest
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.video import Video
+from dudmap.io.sequences.phones import Video
 from layouts import arkit_scenes, color, polycam, stray_scanner, write
 
 

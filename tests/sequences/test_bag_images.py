@@ -9,7 +9,7 @@ import pytest
 
 from bags import millimetres
 from dudmap.errors import FrameError
-from dudmap.io.sequences.bag_images import color_of, depth_of
+from dudmap.io.sequences.bag_messages import color_of, depth_of
 from recordings import HEIGHT, WIDTH, color_image
 
 

@@ -55,11 +55,12 @@ def cache(tmp_path, monkeypatch):
 def pack(folder, file):
     """Archive that holds a folder, as data sets are packed."""
     if file.suffix == ".zip":
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for path in sorted(folder.rglob("*")):
                 archive.write(path, path.relative_to(folder.parent))
     else:
-        with tarfile.open(file, "w:gz" if file.suffix == ".tgz" else "w") as archive:
+        kind = {"mode": "w:gz", "compresslevel": 1} if file.suffix == ".tgz" else {"mode": "w"}
+        with tarfile.open(file, **kind) as archive:
             archive.add(folder, folder.name)
     return file
 

@@ -15,7 +15,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.masks import MaskFolder
+from dudmap.io.sequences.images import MaskFolder
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 CAMERA = Camera(fx=80, fy=80, cx=31.5, cy=23.5, width=64, height=48)

@@ -6,7 +6,7 @@ import pytest
 from bags import START, BagWriter, K, millimetres
 from dudmap.core.geometry import se3
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.realsense import RealSenseRecording
+from dudmap.io.sequences.bag import RealSenseRecording
 from recordings import HEIGHT, WIDTH, color_image
 from software_device import T_COLOR_DEPTH, record
 

@@ -27,8 +27,9 @@ from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import StateError
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic.recording import SyntheticSequence
+from rendered import Rendered
 
-SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+SMALL = Camera(fx=196.9, fy=196.9, cx=119.5, cy=89.5, width=240, height=180)
 CONFIG = Config().override(
     [
         "volume.voxel_size=0.02",
@@ -42,36 +43,22 @@ EVERY = 0.3
 TIMES = "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb"
 
 
-class Rendered:
-    """A synthetic sequence whose frames are rendered once."""
-
-    def __init__(self, sequence):
-        self.name, self.camera, self.calibration = sequence.name, sequence.camera, None
-        self.timestamps, self.ground_truth = sequence.timestamps, sequence.ground_truth
-        self._frames = [sequence[index] for index in range(len(sequence))]
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def mask(self, index):
-        return None
-
-
 def lost_and_found():
     """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps; the colour
     is taken after the depth."""
-    yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 26)), np.zeros(18)])
+    yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 22)), np.zeros(10)])
     base = synthetic.sequence(movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=15.0,
                               noise="realsense")  # fmt: skip
     Ts, up = base.ground_truth.Ts_world_camera.copy(), base.scene.home[:3, 1]
     for T, angle in zip(Ts, np.radians(yaw), strict=True):
         T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), angle * up]))[:3, :3] @ T[:3, :3]
     moved = Trajectory(base.timestamps, Ts)
-    return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0,
-                                      faults=FAULTS))  # fmt: skip
+    recording = Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0,
+                                           faults=FAULTS))  # fmt: skip
+    recording.mask = lambda index: None
+    for index in range(len(recording)):  # before processes are forked
+        recording[index]
+    return recording
 
 
 def begin(sequence, out, every=EVERY, **options):

@@ -1,6 +1,7 @@
 """Runs of every kind that are interrupted in this process and continued from their folder."""
 
 import json
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -66,7 +67,8 @@ def both(recording, tmp_path, passes=1, **options):
 def next_frame(out):
     from dudmap.app.state.database import StateReader
 
-    return StateReader(out / "state.db").meta()["next"]
+    with closing(StateReader(out / "state.db")) as reader:
+        return reader.meta()["next"]
 
 
 def test_one_pass_with_given_masks(recording, tmp_path):

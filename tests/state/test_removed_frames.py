@@ -14,7 +14,10 @@ from dudmap.lab import synthetic
 from state_differences import differences
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
-SETTINGS = ["loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0.5", "similarity.max_translation=1e-9"]
+SETTINGS = [
+    "loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0.5", "similarity.max_translation=1e-9",
+    "dynamics.start_seconds=0",
+]  # fmt: skip
 
 
 @pytest.fixture

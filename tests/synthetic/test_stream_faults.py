@@ -18,7 +18,7 @@ from dudmap.lab.benchmark.stream_faults import fault_row, measure_stream_faults,
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
-FRAMES = 25
+FRAMES = 23
 CONFIG = Config().override(["volume.voxel_size=0.02"])
 REJECTED = {
     "duplicated": "duplicate",

@@ -28,7 +28,7 @@ class Tab:
     """A page with its errors and requests."""
 
     def __init__(self, browser):
-        self.page = browser.new_page(viewport={"width": 1100, "height": 900})
+        self.page = browser.new_page(viewport={"width": 720, "height": 560})
         self.errors, self.requests = [], []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)

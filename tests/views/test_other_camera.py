@@ -17,8 +17,7 @@ from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.io.exporting.exporters import export_run
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.sequences import open_sequence
 from dudmap.io.sequences.images import read_mask
 from dudmap.lab import synthetic

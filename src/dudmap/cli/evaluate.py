@@ -178,14 +178,13 @@ def masks(
     out: OutOption = None,
 ) -> None:
     """Score dynamic masks: precision, recall and IoU, per frame and overall."""
-    from dudmap.evaluation.segmentation import MaskFolders, compare_masks
+    from dudmap.evaluation.segmentation import SCORED_COVERAGE, compare_masks, mask_pairs
 
-    pairs = MaskFolders(estimate, reference)
-    result = compare_masks(pairs, num_missing=pairs.num_missing)
+    result = compare_masks(*mask_pairs(estimate, reference))
     figures: Figures = {"estimate": str(estimate), "reference": str(reference), "frames": len(result.timestamps)}
     for key in ("overall_precision", "overall_recall", "overall_iou", "mean_iou", "false_alarm_share"):
         figures[key] = _rounded(getattr(result, key))
-    figures |= {"scored_frames": result.num_scored, "scored_coverage": result.scored_coverage}
+    figures |= {"scored_frames": result.num_scored, "scored_coverage": SCORED_COVERAGE}
     figures["missing_frames"] = result.num_missing
     if per_frame:
         columns = ("timestamps", "coverage", "found_share", "precision", "recall", "iou")
@@ -208,12 +207,12 @@ def _plot_trajectory(
     absolute = ate(found, true, align, max_difference)
     pictures = [target / "trajectory.png", target / "error.png"]
     plots.plot_trajectories(pictures[0], found, true, absolute)
-    plots.plot_error(pictures[1], absolute)
+    plots.plot_errors(pictures[1], absolute)
     try:
         relative = rpe(found, true, 1.0, "s", max_difference)
     except DatasetError:  # the reason is among the figures
         return pictures
-    plots.plot_rpe(target / "rpe.png", relative)
+    plots.plot_errors(target / "rpe.png", relative)
     return [*pictures, target / "rpe.png"]
 
 

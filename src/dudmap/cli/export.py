@@ -47,7 +47,7 @@ def export(
 ) -> None:
     """Write trajectory, surface, space or images of a run for another program."""
     from dudmap.io.exporting.exporters import export_run
-    from dudmap.io.exporting.options import ExportOptions
+    from dudmap.io.exporting.run_content import ExportOptions
 
     low, high = o.numbers(heights, 2, "--heights")
     options = ExportOptions(

@@ -40,8 +40,7 @@ def render(
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.io.exporting.gravity import up_of
-    from dudmap.io.exporting.options import ExportOptions
-    from dudmap.io.exporting.run_content import RunContent
+    from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
     orbit = orbit or (trajectory is None and out.suffix.lower() == rendering.PICTURE)
     if (trajectory is None) == (not orbit):

@@ -13,8 +13,8 @@ from dudmap.atomic_file import atomic_path
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
-from dudmap.evaluation.segmentation import MaskResult
-from dudmap.evaluation.trajectory import AteResult, PoseErrors, RpeResult
+from dudmap.evaluation.segmentation import SCORED_COVERAGE, MaskResult
+from dudmap.evaluation.trajectory import AteResult, RpeResult
 from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
@@ -49,20 +49,15 @@ def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, r
     _save(figure, path)
 
 
-def plot_error(path: Path, result: AteResult) -> None:
-    """Position and orientation error over time."""
-    labels = "position error, mm", "orientation error, deg", "time, s"
-    _plot_errors(path, result, f"absolute error, alignment: {result.alignment}", labels)
-
-
-def plot_rpe(path: Path, result: RpeResult) -> None:
-    """Relative pose error over time."""
-    per = f"over {result.delta:g} {result.unit}"
-    labels = f"translation, mm {per}", f"rotation, deg {per}", "time of the first pose, s"
-    _plot_errors(path, result, f"relative pose error {per}", labels)
-
-
-def _plot_errors(path: Path, result: PoseErrors, title: str, labels: tuple[str, str, str]) -> None:
+def plot_errors(path: Path, result: AteResult | RpeResult) -> None:
+    """Absolute or relative errors of position and orientation over time."""
+    if isinstance(result, AteResult):
+        title = f"absolute error, alignment: {result.alignment}"
+        labels = "position error, mm", "orientation error, deg", "time, s"
+    else:
+        per = f"over {result.delta:g} {result.unit}"
+        title = f"relative pose error {per}"
+        labels = f"translation, mm {per}", f"rotation, deg {per}", "time of the first pose, s"
     figure, (translation, rotation) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     translation.plot(t, 1000 * result.trans_errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
@@ -140,11 +135,11 @@ def plot_masks(path: Path, result: MaskResult) -> None:
     """Precision, recall and intersection over union, and the true and estimated dynamic shares, over time."""
     figure, (quality, shares) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
-    scored = result.coverage > result.scored_coverage
+    scored = result.coverage > SCORED_COVERAGE
     quality.plot(t[scored], result.iou[scored], ".", color=ESTIMATE, markersize=4, label="IoU")
     quality.plot(t[scored], result.recall[scored], color=SECOND, linewidth=0.8, label="recall")
     quality.plot(t[scored], result.precision[scored], color="#2e8b57", linewidth=0.8, label="precision")
-    quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * result.scored_coverage:g} % dynamic")
+    quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * SCORED_COVERAGE:g} % dynamic")
     quality.set_title(f"mean IoU {result.mean_iou:.3f} over {result.num_scored} frames")
     quality.legend(loc="lower left")
     shares.fill_between(t, 100 * result.coverage, color="#b9c4d0", label="true mask")

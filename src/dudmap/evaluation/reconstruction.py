@@ -9,6 +9,7 @@ that is not positive a ``ConfigError``.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
 from dudmap.evaluation.surface import Surface
+from dudmap.evaluation.trajectory import Statistics
 
 Distances = NDArray[np.float32]
 
@@ -30,26 +32,7 @@ HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
 """Histogram of the distances: bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
 
 
-@dataclass(frozen=True)
-class DistanceStatistics:
-    """Distances from one surface to the other, metres."""
-
-    mean: float
-    median: float
-    rmse: float
-    p95: float
-    max: float
-
-    @classmethod
-    def of(cls, distances: Distances) -> "DistanceStatistics":
-        """Statistics of distances (N,)."""
-        d = distances.astype(np.float64)
-        median, p95 = np.percentile(d, [50, 95])
-        return cls(float(d.mean()), float(median), float(np.sqrt(np.mean(d**2))), float(p95), float(d.max()))
-
-
-@dataclass(frozen=True)
-class ThresholdScore:
+class ThresholdScore(NamedTuple):
     """Precision and recall at a distance (Knapitsch et al. 2017, Tanks and Temples, eq. 3-5).
 
     Attributes:
@@ -85,8 +68,8 @@ class SurfaceResult:
         num_samples: Number of points sampled on each surface.
     """
 
-    accuracy: DistanceStatistics
-    completeness: DistanceStatistics
+    accuracy: Statistics
+    completeness: Statistics
     scores: tuple[ThresholdScore, ...]
     area_m2: float | None
     reference_area_m2: float | None
@@ -106,15 +89,13 @@ class SurfaceResult:
             for key in ("mean", "median", "rmse", "p95", "max"):
                 out[f"{name}_{key}_m"] = round(getattr(statistics, key), 6)
         for score in self.scores:
-            suffix = f"{1000 * score.distance:g}mm"
-            out[f"precision_{suffix}"] = round(score.precision, 5)
-            out[f"recall_{suffix}"] = round(score.recall, 5)
-            out[f"f_score_{suffix}"] = round(score.f_score, 5)
-        for key in ("ghost_distance", "ghost_area_m2", "ghost_share", "missing_share", "area_m2", "reference_area_m2"):
+            for key in ("precision", "recall", "f_score"):
+                out[f"{key}_{1000 * score.distance:g}mm"] = round(getattr(score, key), 5)
+        out["ghost_distance_m"] = round(self.ghost_distance, 5)
+        for key in ("ghost_area_m2", "ghost_share", "missing_share", "area_m2", "reference_area_m2"):
             value = getattr(self, key)
-            out["ghost_distance_m" if key == "ghost_distance" else key] = None if value is None else round(value, 5)
-        out["num_samples"] = self.num_samples
-        return out
+            out[key] = None if value is None else round(value, 5)
+        return out | {"num_samples": self.num_samples}
 
 
 def compare_surfaces(
@@ -139,13 +120,10 @@ def compare_surfaces(
         points: Accept point clouds, whose points serve as samples and which have no area.
     """
     thresholds = tuple(thresholds)
-    for name, value in (
-        ("samples", samples),
-        ("the ghost distance", ghost_distance),
-        *(("a threshold", t) for t in thresholds),
-    ):
-        if not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"{name} is {value}; expected a positive number")
+    _check_positive("samples", samples)
+    _check_positive("the ghost distance", ghost_distance)
+    for threshold in thresholds:
+        _check_positive("a threshold", threshold)
     truth = _surface(reference, "the reference", points)
     found = Surface(estimate, "the estimate", points=points)
     part = truth if observed is None else _surface(observed, "the observed part of the reference", points)
@@ -154,8 +132,8 @@ def compare_surfaces(
     ghost_share = float(np.mean(to_truth > ghost_distance))
     edges = np.linspace(0.0, HISTOGRAM_LARGEST, HISTOGRAM_BINS + 1)
     return SurfaceResult(
-        accuracy=DistanceStatistics.of(to_truth),
-        completeness=DistanceStatistics.of(to_found),
+        accuracy=Statistics.of(to_truth),
+        completeness=Statistics.of(to_found),
         scores=tuple(_score(to_truth, to_found, threshold) for threshold in thresholds),
         area_m2=found.area,
         reference_area_m2=part.area,
@@ -170,6 +148,11 @@ def compare_surfaces(
     )
 
 
+def _check_positive(name: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise ConfigError(f"{name} is {value}; expected a positive number")
+
+
 def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
     """Surface of a mesh; a given ``Surface`` is returned unchanged, so that its search tree is built once."""
     return mesh if isinstance(mesh, Surface) else Surface(mesh, name, points=points)
@@ -177,8 +160,7 @@ def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
 
 def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
     """The estimate, each vertex coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
-    if not (np.isfinite(largest) and largest > 0):
-        raise ConfigError(f"the distance at the end of the colour scale is {largest}; expected a positive number")
+    _check_positive("the distance at the end of the colour scale", largest)
     distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)
     return Mesh(estimate.vertices, estimate.faces, distance_colors(distances, largest), estimate.normals)
 

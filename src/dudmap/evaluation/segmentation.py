@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.association import associate, read_list, read_pairs
 from dudmap.errors import DatasetError
-from dudmap.io.sequences.images import read_mask
-from dudmap.io.sequences.masks import stamped_masks
+from dudmap.io.sequences.images import read_mask, stamped_masks
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,9 +42,8 @@ class MaskResult:
         overall_precision: Precision over the pixels of all frames together.
         overall_recall: Recall over the pixels of all frames together.
         overall_iou: Intersection over union over the pixels of all frames together.
-        mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``scored_coverage``.
+        mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``SCORED_COVERAGE``.
         num_scored: Number of those frames.
-        scored_coverage: Threshold on the coverage for ``mean_iou``.
         false_alarm_share: Mean ``found_share`` over the frames whose true mask is empty.
         num_missing: Number of true masks without an estimated one.
     """
@@ -61,7 +59,6 @@ class MaskResult:
     overall_iou: float
     mean_iou: float
     num_scored: int
-    scored_coverage: float
     false_alarm_share: float
     num_missing: int
 
@@ -71,16 +68,13 @@ def mask_iou(estimate: Mask, reference: Mask) -> float:
     return np.count_nonzero(estimate & reference) / np.count_nonzero(estimate | reference)
 
 
-def compare_masks(
-    pairs: Iterable[MaskPair], *, scored_coverage: float = SCORED_COVERAGE, num_missing: int = 0
-) -> MaskResult:
+def compare_masks(pairs: Iterable[MaskPair], num_missing: int = 0) -> MaskResult:
     """Precision, recall and intersection over union, per frame and over all frames.
 
     Every pixel counts, whether it has a depth reading or not.
 
     Args:
         pairs: Estimated and true masks of the same frames.
-        scored_coverage: Frames with a smaller true share of dynamic pixels do not count for ``mean_iou``.
         num_missing: Number of true masks without a partner; copied to the result.
 
     Raises:
@@ -100,7 +94,7 @@ def compare_masks(
         raise DatasetError("there is no frame with a found and a true mask; nothing can be compared")
     stamps, size, both, found, truth = np.array(rows, dtype=np.float64).T
     iou, coverage = _ratio(both, found + truth - both), truth / size
-    scored, empty = coverage > scored_coverage, truth == 0
+    scored, empty = coverage > SCORED_COVERAGE, truth == 0
     total_both, total_found, total_true = both.sum(), found.sum(), truth.sum()
     return MaskResult(
         timestamps=stamps,
@@ -114,40 +108,33 @@ def compare_masks(
         overall_iou=float(_ratio(total_both, total_found + total_true - total_both)),
         mean_iou=float(iou[scored].mean()) if scored.any() else float("nan"),
         num_scored=int(np.count_nonzero(scored)),
-        scored_coverage=scored_coverage,
         false_alarm_share=float((found / size)[empty].mean()) if empty.any() else float("nan"),
         num_missing=num_missing,
     )
 
 
-class MaskFolders:
-    """Estimated masks of a run and the true ones, paired by time; iterating reads the pairs from disk.
+def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int]:
+    """Estimated masks of a run and the true ones, paired by time and read one after the other.
 
     Args:
         estimate: Run folder with masks/, or a folder of PNG files named by their time stamp.
         reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by their time stamp.
 
-    Attributes:
-        num_missing: Number of true masks without an estimated one.
+    Returns:
+        The pairs, and the number of true masks without an estimated one.
 
     Raises:
         DatasetError: A folder holds no masks, or no two masks are close enough in time.
     """
-
-    def __init__(self, estimate: Path, reference: Path) -> None:
-        found, true = _estimated_masks(estimate), _true_masks(reference)
-        pairs = associate(np.array([stamp for stamp, _ in found]), np.array([stamp for stamp, _ in true]))
-        if not pairs:
-            raise DatasetError(
-                f"no mask of {estimate} ({found[0][0]:.3f} to {found[-1][0]:.3f} s) lies within 20 ms of one of "
-                f"{reference} ({true[0][0]:.3f} to {true[-1][0]:.3f} s); give the reference of the same recording"
-            )
-        self._pairs = [(true[j][0], found[i][1], true[j][1]) for i, j in sorted(pairs)]
-        self.num_missing = len(true) - len(pairs)
-
-    def __iter__(self) -> Iterator[MaskPair]:
-        for stamp, found, true in self._pairs:
-            yield MaskPair(stamp, read_mask(found), read_mask(true))
+    found, true = _estimated_masks(estimate), _true_masks(reference)
+    pairs = associate(np.array([stamp for stamp, _ in found]), np.array([stamp for stamp, _ in true]))
+    if not pairs:
+        raise DatasetError(
+            f"no mask of {estimate} ({found[0][0]:.3f} to {found[-1][0]:.3f} s) lies within 20 ms of one of "
+            f"{reference} ({true[0][0]:.3f} to {true[-1][0]:.3f} s); give the reference of the same recording"
+        )
+    read = (MaskPair(true[j][0], read_mask(found[i][1]), read_mask(true[j][1])) for i, j in sorted(pairs))
+    return read, len(true) - len(pairs)
 
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:

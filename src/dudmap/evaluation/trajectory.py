@@ -21,9 +21,6 @@ Numbers = NDArray[np.float64]
 Align = Literal["se3", "origin", "none"]
 Unit = Literal["s", "m", "frames"]
 
-STATISTICS = "rmse", "mean", "median", "max"
-"""Statistics of every error."""
-
 FEWEST_PAIRS = 3
 SMALLEST_SPREAD = 1e-3
 """Positions that spread less than this across their principal direction (metres, and as a share of the spread along
@@ -32,20 +29,25 @@ PATH_TOLERANCE = 0.1
 """Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
 
-@dataclass(frozen=True)
-class ErrorStatistics:
-    """Root mean square, mean, median and maximum of errors, in their unit."""
+STATISTICS = "rmse", "mean", "median", "max"
+"""Statistics that figures of trajectories give."""
+
+
+class Statistics(NamedTuple):
+    """Root mean square, mean, median, maximum and 95 % quantile of errors, in their unit."""
 
     rmse: float
     mean: float
     median: float
     max: float
+    p95: float
 
     @classmethod
-    def of(cls, errors: Numbers) -> "ErrorStatistics":
+    def of(cls, errors: NDArray) -> "Statistics":
         """Statistics of errors (N,)."""
-        rmse = float(np.sqrt(np.mean(errors**2)))
-        return cls(rmse, float(errors.mean()), float(np.median(errors)), float(errors.max()))
+        e = errors.astype(np.float64)
+        median, p95 = np.percentile(e, [50, 95])
+        return cls(float(np.sqrt(np.mean(e**2))), float(e.mean()), float(median), float(e.max()), float(p95))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class PoseErrors:
     @classmethod
     def of(cls, timestamps: Numbers, E: Numbers, *more: Any) -> Self:  # noqa: ANN401
         """Result of the rigid motions E (N, 4, 4) that are the errors; ``more`` are the fields of the class itself."""
-        return cls(timestamps, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E)), *more)
+        return cls(timestamps, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(se3.rotation_angles(E)), *more)
 
     @property
     def num_pairs(self) -> int:
@@ -73,14 +75,14 @@ class PoseErrors:
         return len(self.timestamps)
 
     @cached_property
-    def trans(self) -> ErrorStatistics:
+    def trans(self) -> Statistics:
         """Statistics of the translations, metres."""
-        return ErrorStatistics.of(self.trans_errors)
+        return Statistics.of(self.trans_errors)
 
     @cached_property
-    def rot_deg(self) -> ErrorStatistics:
+    def rot_deg(self) -> Statistics:
         """Statistics of the rotations, degrees."""
-        return ErrorStatistics.of(self.rot_errors_deg)
+        return Statistics.of(self.rot_errors_deg)
 
     @property
     def rmse(self) -> float:
@@ -101,11 +103,6 @@ class AteResult(PoseErrors):
     T_reference_estimate: Numbers
     alignment: str
 
-    def figures(self) -> dict[str, float]:
-        """All statistics by name and unit, for tables and JSON."""
-        out = {f"ate_{key}_m": getattr(self.trans, key) for key in STATISTICS}
-        return out | {f"ate_rot_{key}_deg": getattr(self.rot_deg, key) for key in STATISTICS}
-
 
 @dataclass(frozen=True, eq=False)
 class RpeResult(PoseErrors):
@@ -118,11 +115,6 @@ class RpeResult(PoseErrors):
 
     delta: float
     unit: str
-
-    def figures(self) -> dict[str, float]:
-        """All statistics by name and unit, for tables and JSON; meaningful for a delta of one unit."""
-        out = {f"rpe_trans_{key}_m_per_{self.unit}": getattr(self.trans, key) for key in STATISTICS}
-        return out | {f"rpe_rot_{key}_deg_per_{self.unit}": getattr(self.rot_deg, key) for key in STATISTICS}
 
 
 class PosePairs(NamedTuple):
@@ -251,17 +243,23 @@ def trajectory_figures(
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)
     out: dict[str, float | int | str | None] = {"pairs": absolute.num_pairs, "alignment": absolute.alignment}
-    out |= absolute.figures()
+    out |= _figures(absolute, "ate_{}_m", "ate_rot_{}_deg")
     out |= {"drift_rmse_m": from_start.rmse, "rotation_rmse_deg": from_start.rot_deg.rmse}
     units: tuple[Unit, ...] = ("s", "m")
     for unit in units:
+        names = f"rpe_trans_{{}}_m_per_{unit}", f"rpe_rot_{{}}_deg_per_{unit}"
         try:
-            out |= rpe(estimate, reference, 1.0, unit, max_difference).figures()
+            out |= _figures(rpe(estimate, reference, 1.0, unit, max_difference), *names)
         except DatasetError as error:
-            out |= dict.fromkeys(f"rpe_trans_{key}_m_per_{unit}" for key in STATISTICS)
-            out |= dict.fromkeys(f"rpe_rot_{key}_deg_per_{unit}" for key in STATISTICS)
+            out |= {name.format(key): None for name in names for key in STATISTICS}
             out[f"rpe_per_{unit}_missing"] = str(error)
     return out
+
+
+def _figures(errors: PoseErrors, trans: str, rot: str) -> dict[str, float]:
+    """Statistics of translations and rotations by names that are made of theirs."""
+    return {name.format(key): getattr(statistics, key)
+            for name, statistics in ((trans, errors.trans), (rot, errors.rot_deg)) for key in STATISTICS}  # fmt: skip
 
 
 def path_figures(estimate: Trajectory) -> dict[str, float]:
@@ -320,15 +318,6 @@ def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArra
     i = np.arange(len(position))
     keep = (j > i) & (np.abs(position[j] - wanted) <= tolerance + 1e-9)
     return i[keep], j[keep]
-
-
-def rotation_angles(Ts: Numbers) -> Numbers:
-    """Angles (N,) in radians, in [0, pi], of the rotations of (N, 4, 4) or (N, 3, 3) matrices.
-
-    Computed from ``|R - I|_F^2 = 8 sin^2(angle / 2)``, which is accurate for small angles where the trace is not.
-    """
-    chord = np.linalg.norm(Ts[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -19,7 +19,7 @@ from dudmap.atomic_file import atomic_file
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.geometry.mesh_simplification import clustered
 from dudmap.fleet.workers import Workers
-from dudmap.io.exporting.gltf import encoded
+from dudmap.io.exporting.mesh_files import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
     from dudmap.core.tracking.frame_view import FrameView
     from dudmap.io.sequences import Sequence
-    from dudmap.io.sequences.masks import MaskFolder
+    from dudmap.io.sequences.images import MaskFolder
 
 AHEAD = 4
 """Number of frames of a recording on disk that are read ahead of the processed one."""

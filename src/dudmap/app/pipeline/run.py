@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dudmap.core.places.saved_map import SavedMap
     from dudmap.core.slam import Slam
     from dudmap.io.sequences import Sequence
-    from dudmap.io.sequences.masks import MaskFolder
+    from dudmap.io.sequences.images import MaskFolder
 
 
 def run(
@@ -321,7 +321,7 @@ def _saved(first_pass: object) -> str:
 
 def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":
     """The external masks of a run, if there are any."""
-    from dudmap.io.sequences.masks import MaskFolder
+    from dudmap.io.sequences.images import MaskFolder
 
     return None if folder is None else MaskFolder(folder, sequence.timestamps, sequence.camera)
 

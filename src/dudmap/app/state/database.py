@@ -139,7 +139,9 @@ class StateDatabase:
         self._chunks = used
         alive = {id(snapshot.arrays[n]) for n in snapshot.constant}
         self._constants = {key: value for key, value in self._constants.items() if key in alive}
-        self._execute("PRAGMA wal_checkpoint(TRUNCATE)")  # without effect while another process reads
+        self._execute("PRAGMA busy_timeout = 0")  # what a reader still needs stays in the log: it is not waited for
+        self._execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        self._execute("PRAGMA busy_timeout = 5000")
 
     def close(self) -> None:
         """Close the file."""

@@ -18,7 +18,7 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
 from dudmap.errors import DudmapError
 from dudmap.extras import extra
-from dudmap.io.exporting.gltf import encoded
+from dudmap.io.exporting.mesh_files import encoded
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera

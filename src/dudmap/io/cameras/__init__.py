@@ -1,4 +1,4 @@
-"""Live cameras: one small class per driver, all with the interface ``LiveCamera``."""
+"""Live cameras: one class per driver, all with the interface ``LiveCamera``."""
 
 from abc import ABC, abstractmethod
 from importlib import import_module
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 __all__ = ["CAMERAS", "CameraFrame", "LiveCamera", "driver", "open_camera"]
 
 CAMERAS = {
-    "realsense": "realsense:RealSenseCamera",
-    "oak": "oak:OakCamera",
-    "orbbec": "orbbec:OrbbecCamera",
-    "iphone": "iphone:IPhoneCamera",
-    "openni": "openni:OpenNiCamera",
+    "realsense": "drivers:RealSenseCamera",
+    "oak": "drivers:OakCamera",
+    "orbbec": "drivers:OrbbecCamera",
+    "iphone": "drivers:IPhoneCamera",
+    "openni": "drivers:OpenNiCamera",
     "replay": "replay:ReplayCamera",
 }
 """Module and class of every camera by its name; without a name the first of them that is connected is taken."""

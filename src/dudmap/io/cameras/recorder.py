@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.errors import CameraError
 from dudmap.io.exporting import ros_messages as ros
-from dudmap.io.exporting.mcap import McapWriter
+from dudmap.io.exporting.ros_messages import McapWriter
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -53,8 +53,14 @@ class Recorder:
             raise CameraError(f"cannot record to {path}, which exists; name another file")
         self.path, self.written, self.dropped = path, 0, 0
         self._folder = path.with_name(f"{path.stem}.recording")
-        self._messages = _Messages(camera, calibration)
-        self._writer = _open_writer(self._folder)
+        self._camera, self._calibration, self._last = camera, calibration, -1
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if self._folder.exists():
+                raise CameraError(f"{self._folder} is left from a recording that was cut off; remove it")
+            self._writer = McapWriter(self._folder, "recording", compressed=False)
+        except OSError as error:
+            raise CameraError(f"cannot record to {path.parent}: {error.strerror or error}") from error
         self._error: Exception | None = None
         self._queue: Queue[Frame | None] = Queue(AHEAD)
         self._thread = Thread(target=self._run, name="dudmap-recorder", daemon=True)
@@ -92,23 +98,15 @@ class Recorder:
                 self.dropped += 1
                 continue
             try:
-                self._messages.write(self._writer, frame)
+                self._write(frame)
                 self.written += 1
             except Exception as error:  # reported by close
                 self._error = error
                 self.dropped += 1
 
-
-class _Messages:
-    """Frames as messages of ROS 2."""
-
-    def __init__(self, camera: "Camera", calibration: "Calibration | None") -> None:
-        self._camera, self._calibration = camera, calibration
-        self._last = -1
-
-    def write(self, writer: McapWriter, frame: "Frame") -> None:
+    def _write(self, frame: "Frame") -> None:
         """Write images and camera_info of a frame; with the first one the place of the colour camera."""
-        types, calibration = writer.types, self._calibration
+        writer, types, calibration = self._writer, self._writer.types, self._calibration
         recorded = max(round(frame.timestamp * 1e9), self._last + 1)
         depth_frame, depth_space = (COLOR_FRAME, ALIGNED) if calibration is None else (DEPTH_FRAME, DEPTH)
         if self._last < 0 and calibration is not None:
@@ -134,13 +132,3 @@ class _Messages:
                 if np.array_equal(values.astype(np.float32) / np.float32(1000), depth):
                     return values, "16UC1"
         return depth, "32FC1"
-
-
-def _open_writer(folder: Path) -> McapWriter:
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        if folder.exists():
-            raise CameraError(f"{folder} is left from a recording that was cut off; remove it")
-        return McapWriter(folder, "recording", compressed=False)
-    except OSError as error:
-        raise CameraError(f"cannot record to {folder.parent}: {error.strerror or error}") from error

@@ -1,13 +1,14 @@
-"""The table of exporters: the ending of the target, or its whole name, tells the format."""
+"""The table of exporters: the ending of the target, or its whole name, tells the format. Trajectories as text."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
+from dudmap.atomic_file import write_text
+from dudmap.core.geometry import se3
 from dudmap.errors import ConfigError
-from dudmap.io.exporting.options import MESH_OPTIONS, ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import MESH_OPTIONS, ExportOptions, RunContent
 
 
 @dataclass(frozen=True)
@@ -34,23 +35,23 @@ class Exporter:
 _GRID = ("crop", "drop_pieces_below", "up", "resolution")
 _VIEWS = ("crop", "drop_pieces_below", "sequence", "camera", "every")
 EXPORTERS: dict[str, Exporter] = {
-    ".ply": Exporter("mesh", "mesh_editing:write", MESH_OPTIONS),
-    ".obj": Exporter("mesh", "mesh_editing:write", MESH_OPTIONS),
-    ".stl": Exporter("mesh without colours", "mesh_editing:write", MESH_OPTIONS),
-    ".glb": Exporter("mesh for browsers and Blender, y up", "gltf:write", (*MESH_OPTIONS, "up")),
-    ".usdz": Exporter("mesh for USD programs, y up", "usd:write", (*MESH_OPTIONS, "up")),
-    ".points.ply": Exporter("point cloud", "point_clouds:write_ply", _GRID[:2]),
-    ".pcd": Exporter("point cloud of PCL", "point_clouds:write_pcd", _GRID[:2]),
-    ".laz": Exporter("point cloud, compressed LAS 1.4", "point_clouds:write_laz", _GRID[:2]),
-    ".e57": Exporter("point cloud, ASTM E57", "point_clouds:write_e57", _GRID[:2]),
+    ".ply": Exporter("mesh", "mesh_files:write", MESH_OPTIONS),
+    ".obj": Exporter("mesh", "mesh_files:write", MESH_OPTIONS),
+    ".stl": Exporter("mesh without colours", "mesh_files:write", MESH_OPTIONS),
+    ".glb": Exporter("mesh for browsers and Blender, y up", "mesh_files:write_glb", (*MESH_OPTIONS, "up")),
+    ".usdz": Exporter("mesh for USD programs, y up", "mesh_files:write_usdz", (*MESH_OPTIONS, "up")),
+    ".points.ply": Exporter("point cloud", "mesh_files:write_ply", _GRID[:2]),
+    ".pcd": Exporter("point cloud of PCL", "mesh_files:write_pcd", _GRID[:2]),
+    ".laz": Exporter("point cloud, compressed LAS 1.4", "mesh_files:write_laz", _GRID[:2]),
+    ".e57": Exporter("point cloud, ASTM E57", "mesh_files:write_e57", _GRID[:2]),
     ".npz": Exporter("occupancy and distance grids (ESDF), z up", "grids:write_npz", _GRID),
     "map.yaml": Exporter("2D occupancy map for nav2, with map.pgm", "grids:write_nav2", (*_GRID, "heights")),
     "transforms.json": Exporter("folder for nerfstudio", "view_synthesis:write_nerfstudio", _VIEWS),
     "cameras.txt": Exporter("folder in COLMAP's text format", "view_synthesis:write_colmap", _VIEWS),
-    ".tum": Exporter("trajectory, TUM", "trajectories:write_tum"),
-    ".kitti": Exporter("trajectory, KITTI", "trajectories:write_kitti"),
-    ".csv": Exporter("trajectory, EuRoC", "trajectories:write_euroc"),
-    ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "mcap:write"),
+    ".tum": Exporter("trajectory, TUM", "exporters:write_tum"),
+    ".kitti": Exporter("trajectory, KITTI", "exporters:write_kitti"),
+    ".csv": Exporter("trajectory, EuRoC", "exporters:write_euroc"),
+    ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "ros_messages:write"),
 }
 """Exporters by the name of the file, or its ending."""
 
@@ -83,3 +84,29 @@ def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None
     to.parent.mkdir(parents=True, exist_ok=True)
     exporter.write(run, to, options)
     return to
+
+
+EUROC_HEADER = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)  # fmt: skip
+
+
+def write_tum(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write ``timestamp tx ty tz qx qy qz qw``, one pose a line."""
+    run.trajectory.save(path)
+
+
+def write_kitti(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the upper three rows of each pose, 12 numbers a line; the format has no times."""
+    rows = [" ".join(f"{number:.9f}" for number in T[:3].reshape(-1)) for T in run.trajectory.Ts_world_camera]
+    write_text(path, "\n".join(rows) + "\n")
+
+
+def write_euroc(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the columns of EuRoC's ``state_groundtruth_estimate0/data.csv`` up to the orientation."""
+    lines = [EUROC_HEADER]
+    for stamp, T in zip(run.trajectory.timestamps, run.trajectory.Ts_world_camera, strict=True):
+        x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
+        numbers = (*T[:3, 3], w, x, y, z)
+        lines.append(f"{round(stamp * 1e9)}," + ",".join(f"{number:.9f}" for number in numbers))
+    write_text(path, "\n".join(lines) + "\n")

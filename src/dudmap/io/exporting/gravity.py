@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.mesh_editing import face_vectors
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 CONE = np.cos(np.radians(45))
 """The floor's normal is looked for within 45 degrees of the mean direction that the cameras held up."""
@@ -44,28 +43,28 @@ def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
     """Unit vector (3,) against gravity: the given one, else the normal of level surfaces, else what cameras held up."""
     if options.up is not None:
         return _unit(options.up)
-    floor = _level_floor(run)
-    return mean_camera_up(run) if floor is None else floor.up
+    floor = _floor(run, options)
+    return _mean_camera_up(run) if floor is None else floor.up
 
 
 def find_floor(run: RunContent, options: ExportOptions) -> Floor:
     """The floor of a map."""
-    up = None if options.up is None else _unit(options.up)
-    height = None if up is None else floor_height(run.surface, up)
-    floor = _level_floor(run) if up is None else None if height is None else Floor(up, height)
+    floor = _floor(run, options)
     if floor is None:
         raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
     return floor
 
 
-def _level_floor(run: RunContent) -> Floor | None:
-    """The floor by level surfaces; None if there are none."""
-    up = level_normal(run.surface, mean_camera_up(run))
+def _floor(run: RunContent, options: ExportOptions) -> Floor | None:
+    """The floor along the given direction, else by level surfaces; None if there is none."""
+    up = level_normal(run.surface, _mean_camera_up(run)) if options.up is None else _unit(options.up)
     height = None if up is None else floor_height(run.surface, up)
-    return None if up is None or height is None else fitted(run.surface, Floor(up, height))
+    if up is None or height is None:
+        return None
+    return Floor(up, height) if options.up is not None else fitted(run.surface, Floor(up, height))
 
 
-def mean_camera_up(run: RunContent) -> NDArray[np.float64]:
+def _mean_camera_up(run: RunContent) -> NDArray[np.float64]:
     """Mean direction (3,) of the upper edge of the images."""
     return _unit(-run.trajectory.Ts_world_camera[:, :3, 1].mean(axis=0))
 

@@ -1,5 +1,6 @@
 """Grids for robots: occupied, free and unknown space and distances to the surface, z up, and a 2D map for nav2."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +16,7 @@ from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.gravity import find_floor, z_up
 from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Values of cells, those of ROS' ``nav_msgs/OccupancyGrid``."""
@@ -83,25 +83,20 @@ class SpaceGrid:
                 "a part of the map by --crop or --drop-pieces-below"
             )
         grid = cls(np.full(shape, UNKNOWN, np.int8), np.zeros(shape, bool), first * resolution, resolution, T_grid_map)
-        grid._observe(volume)
+        T_map_grid = se3.inverse(T_grid_map)
+        for cells, centres in grid._centres():
+            sdf, free = look_up(volume, centres @ T_map_grid[:3, :3].T + T_map_grid[:3, 3])
+            grid.occupancy.reshape(-1)[cells[free | (sdf > 0)]] = FREE
+            grid.behind.reshape(-1)[cells] = sdf < 0
         grid.occupancy[tuple((np.floor(points / resolution).astype(int) - first).T)] = OCCUPIED
         return grid
 
-    def _observe(self, volume: TsdfVolume) -> None:
-        """Mark what was seen to be free, and what lies behind a surface."""
-        T_map_grid = se3.inverse(self.T_grid_map)
-        occupancy, behind = self.occupancy.reshape(-1), self.behind.reshape(-1)
-        for start in range(0, len(occupancy), CHUNK):
-            cells = np.arange(start, min(start + CHUNK, len(occupancy)))
-            points = self.centres(cells) @ T_map_grid[:3, :3].T + T_map_grid[:3, 3]
-            sdf, free = look_up(volume, points)
-            occupancy[cells[free | (sdf > 0)]] = FREE
-            behind[cells] = sdf < 0
-
-    def centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Centres (n, 3), metres, axes of the grid, of cells numbered in C order."""
-        numbers = np.stack(np.unravel_index(cells, self.occupancy.shape), axis=1)
-        return self.origin + (numbers + 0.5) * self.resolution
+    def _centres(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Numbers (n,) in C order and centres (n, 3), metres, axes of the grid, of all cells, ``CHUNK`` at once."""
+        for start in range(0, self.occupancy.size, CHUNK):
+            cells = np.arange(start, min(start + CHUNK, self.occupancy.size))
+            numbers = np.stack(np.unravel_index(cells, self.occupancy.shape), axis=1)
+            yield cells, self.origin + (numbers + 0.5) * self.resolution
 
     def distances(self, mesh: Mesh) -> NDArray[np.float32]:
         """Euclidean signed distance (X, Y, Z) of each centre to the nearest vertex of the surface, metres; negative
@@ -112,10 +107,7 @@ class SpaceGrid:
         from scipy.spatial import KDTree
 
         tree = KDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
-        out = np.empty(self.occupancy.size, np.float32)
-        for start in range(0, len(out), CHUNK):
-            cells = np.arange(start, min(start + CHUNK, len(out)))
-            out[cells] = tree.query(self.centres(cells))[0]
+        out = np.concatenate([tree.query(centres)[0].astype(np.float32) for _, centres in self._centres()])
         out = out.reshape(self.occupancy.shape)
         return np.where(self.behind, -out, out)
 
@@ -146,7 +138,7 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     float32, metres; ``origin`` (3,), lower corner of the first cell; ``resolution``, metres; ``T_grid_map`` (4, 4)
     from the world of the run to the axes of the grid: z up from the floor, x along the first view.
     """
-    grid, mesh = _grid(run, options)
+    mesh, grid = _grid(run, options)
     with atomic_file(path) as file:
         np.savez_compressed(
             file, format=FORMAT, occupancy=grid.occupancy, esdf=grid.distances(mesh), origin=grid.origin,
@@ -158,9 +150,9 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write ``map.yaml`` and ``map.pgm`` beside it, as nav2's map server reads them."""
     if not options.heights[0] < options.heights[1]:
         raise ConfigError(f"found --heights {options.heights}; expected the lower one first")
-    grid, _ = _grid(run, options)
+    _, grid = _grid(run, options)
     cells = flat(grid, options.heights)
-    image = np.select([cells == OCCUPIED, cells == FREE], [PIXELS[OCCUPIED], PIXELS[FREE]], PIXELS[UNKNOWN])
+    image = np.select([cells == value for value in PIXELS], list(PIXELS.values()))
     picture = path.with_suffix(".pgm")
     rows = np.flipud(image.T).astype(np.uint8)  # the first row of the picture has the largest y
     header = f"P5\n# {run.folder.name}\n{rows.shape[1]} {rows.shape[0]}\n255\n"
@@ -195,7 +187,7 @@ def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
     return np.select([np.any(inside == OCCUPIED, axis=2), free], [OCCUPIED, FREE], UNKNOWN).astype(np.int8)
 
 
-def _grid(run: RunContent, options: ExportOptions) -> tuple[SpaceGrid, Mesh]:
-    """The space around the chosen part of the surface, and that part."""
+def _grid(run: RunContent, options: ExportOptions) -> tuple[Mesh, SpaceGrid]:
+    """The chosen part of the surface, and the space around it."""
     mesh = edited(run.surface, options)
-    return SpaceGrid.of(run.volume, mesh, z_up(find_floor(run, options)), options.resolution), mesh
+    return mesh, SpaceGrid.of(run.volume, mesh, z_up(find_floor(run, options)), options.resolution)

@@ -4,7 +4,6 @@ An option with an impossible value is a ``ConfigError``, and a mesh of which not
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +11,11 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
-from dudmap.io.exporting.options import Box, ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import Box, ExportOptions
 
 SPECK = 0.02
 """Diagonal of a connected piece of the mesh below which it is left out unless an option says otherwise, metres: loose
 pieces of a few voxels are noise of the depth readings."""
-
-
-def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh in the axes of the map, in the format of the file's ending: PLY, OBJ or STL."""
-    edited(run.surface, options).save(path)
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:

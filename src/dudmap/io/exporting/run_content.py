@@ -1,10 +1,10 @@
-"""The results in a run folder, as exporters take them.
+"""What exporters take: the results in a run folder, and the options of an export.
 
 What is missing, damaged or of a newer version is a ``DatasetError``, and a ``MapError`` if it is the mesh or the map.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from dudmap import __version__
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import DatasetError, MapError
+from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class RunContent:
 
     def mask_files(self) -> dict[float, Path]:
         """Masks of what moves by time stamp of the depth image."""
-        from dudmap.io.sequences.masks import stamped_masks
+        from dudmap.io.sequences.images import stamped_masks
 
         folder = self.folder / "masks"
         masks = dict(stamped_masks(folder)) if folder.is_dir() else {}
@@ -128,3 +128,54 @@ def _metrics(folder: Path) -> dict[str, Any]:
 def _numbers(version: str) -> list[int]:
     """Major and minor number of a version."""
     return [int(number) for number in re.findall(r"\d+", version)[:2]]
+
+
+Box = tuple[float, float, float, float, float, float]
+MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
+"""Options that change the mesh."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of an export; each format takes some of them.
+
+    Attributes:
+        max_triangles: Largest number of triangles.
+        crop: Lower and upper corner of the part of the map to keep, metres, world frame.
+        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres; None leaves
+            out those less than 2 cm across.
+        fill_holes: Holes whose border is at most so long are closed, metres.
+        up: Direction against gravity in the world frame; None for the normal of the floor in the map.
+        resolution: Edge of the cells of grids, metres.
+        heights: Lower and upper end of the robot above the floor, metres.
+        sequence: Recording that the run was made from; None for the one that the run names.
+        camera: Intrinsics of that recording, as ``--camera`` takes them; None for those of the run.
+        every: Every so many frames of the recording are exported.
+    """
+
+    max_triangles: int | None = None
+    crop: Box | None = None
+    drop_pieces_below: float | None = None
+    fill_holes: float | None = None
+    up: tuple[float, float, float] | None = None
+    resolution: float = 0.05
+    heights: tuple[float, float] = (0.1, 1.8)
+    sequence: Path | None = None
+    camera: str | None = None
+    every: int = 1
+
+    def check(self, taken: tuple[str, ...], name: str) -> None:
+        """Check that only options are set that a format takes.
+
+        Raises:
+            ConfigError: Another one is set.
+        """
+        for field in fields(self):
+            if getattr(self, field.name) != field.default and field.name not in taken:
+                known = ", ".join(option_name(option) for option in taken) or "no option"
+                raise ConfigError(f"{name} does not take {option_name(field.name)}; it takes {known}")
+
+
+def option_name(field: str) -> str:
+    """Name of an option on the command line."""
+    return "--" + field.replace("_", "-")

@@ -17,11 +17,10 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.input_files import damaged
 from dudmap.io.exporting.mesh_editing import edited
-from dudmap.io.exporting.options import ExportOptions
-from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
+from dudmap.io.sequences.image_folder import OPENGL_AXES
 from dudmap.io.sequences.images import read_mask
 from dudmap.io.sequences.intrinsics import DISTORTION_KEYS
-from dudmap.io.sequences.poses import OPENGL_AXES
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence

@@ -1,24 +1,23 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
+from abc import ABC, abstractmethod
 from dataclasses import astuple, replace
 from functools import cache
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError, printable
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, FrameError, printable
 from dudmap.input_files import damaged
-from dudmap.io.sequences.recording import Recording
-
-if TYPE_CHECKING:
-    from dudmap.core.frames.frame import Frame
-    from dudmap.core.geometry.calibration import Calibration
-    from dudmap.core.geometry.camera import Camera
-    from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.io.sequences import intrinsics
 
 __all__ = ["Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
 
@@ -38,19 +37,19 @@ class Sequence(Protocol):
     @property
     def name(self) -> str: ...  # noqa: D102
     @property
-    def camera(self) -> "Camera": ...  # noqa: D102
+    def camera(self) -> Camera: ...  # noqa: D102
     @property
-    def calibration(self) -> "Calibration | None": ...  # noqa: D102
+    def calibration(self) -> Calibration | None: ...  # noqa: D102
     @property
     def timestamps(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property
-    def ground_truth(self) -> "Trajectory | None": ...  # noqa: D102
+    def ground_truth(self) -> Trajectory | None: ...  # noqa: D102
 
     def __len__(self) -> int:
         """Number of frames."""
         ...
 
-    def __getitem__(self, index: int) -> "Frame":
+    def __getitem__(self, index: int) -> Frame:
         """Frame number ``index``.
 
         Raises:
@@ -61,6 +60,83 @@ class Sequence(Protocol):
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame if known; used for evaluation only."""
         ...
+
+
+class Recording(ABC):
+    """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame when asked for it.
+
+    A format sets the times, the cameras and their sources in its constructor, and reads a frame in ``_frame``.
+    Constructors take the options of the format, too; they raise a ``DatasetError`` for a recording that is damaged or
+    of another kind, and a ``MissingExtraError`` where a package is missing.
+
+    Args:
+        path: The folder or file.
+        camera: Intrinsics of the depth images that replace those of the recording.
+
+    Attributes:
+        format: Name of the format, for people.
+        options: Names of the options of ``open_sequence`` that the format has.
+        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
+            that they are assumed.
+        timed: Whether the times were read or their rate was given; False where they are invented.
+        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
+    """
+
+    format = ""
+    options: tuple[str, ...] = ()
+    suffix = ""
+    """Suffix of the files of the format, where it is that of files."""
+    layout: tuple[str, ...] = ()
+    """Patterns of files and folders that all lie in every folder of the format."""
+    timed = True
+    camera: Camera
+    calibration: Calibration | None = None
+    timestamps: NDArray[np.float64]
+    ground_truth: Trajectory | None = None
+    sources: dict[str, str]
+    opened: dict[str, Any]
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.name = self.path.resolve().stem
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether an existing folder or file has this format, judged by names and first bytes only."""
+        if cls.suffix:
+            return path.suffix.lower() == cls.suffix and path.is_file()
+        return path.is_dir() and all(any(path.glob(pattern)) for pattern in cls.layout)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame number ``index``.
+
+        Raises:
+            FrameError: An image is missing, damaged, or has another size than its camera.
+        """
+        index = range(len(self))[index]
+        name = f"frame {index} of {self.path}"
+        with damaged(FrameError, name):
+            return self._frame(index, name)
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame, None if it is not known."""
+        return None
+
+    @abstractmethod
+    def _frame(self, index: int, name: str) -> Frame:
+        """A frame; ``name`` is used in messages."""
+
+    def _set_cameras(self, own: Camera, color: Calibration, source: str, given: Camera | str | None) -> None:
+        """Set the cameras: those of the file, where the depth camera may be given instead."""
+        known = intrinsics.given(given) if given else None
+        self.camera = known.camera(own.width, own.height, own.depth_scale) if known else own
+        one_size = (color.camera.width, color.camera.height) == (own.width, own.height)
+        self.calibration = None if color.is_registered(self.camera) or (known and one_size) else color
+        unit = known.source if known and "depth_scale" in known.values else source
+        self.sources = {"intrinsics": known.source if known else source, "depth unit": unit, "times": source}
 
 
 READERS = (
@@ -84,9 +160,9 @@ READERS = (
     "numbered:NumberedSequence",
     "image_logs:SensRecording",
     "image_logs:KlgRecording",
-    "record3d:Record3DRecording",
+    "image_logs:Record3DRecording",
     "azure_kinect:AzureKinectRecording",
-    "realsense:RealSenseRecording",
+    "bag:RealSenseRecording",
     "bag:RosBag",
 )
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
@@ -121,7 +197,7 @@ def is_timed(sequence: object) -> bool:
 
 def open_sequence(
     path: str | Path,
-    camera: "Camera | str | None" = None,
+    camera: Camera | str | None = None,
     fps: float | None = None,
     depth_unit: float | None = None,
     **options: Any,  # noqa: ANN401

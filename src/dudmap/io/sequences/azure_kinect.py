@@ -16,10 +16,9 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_FILE, foreign, open_plain, parse_json
-from dudmap.io.sequences import images
-from dudmap.io.sequences.lens import RATIONAL, Lens
-from dudmap.io.sequences.message_stream import MessageStream
-from dudmap.io.sequences.recording import Recording
+from dudmap.io.sequences import Recording, images
+from dudmap.io.sequences.bag_file import MessageStream
+from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 BEFORE = 1_000_000_000
 """A pass starts this long before the wanted time, nanoseconds, as a seek need not be exact."""

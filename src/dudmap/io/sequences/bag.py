@@ -1,5 +1,10 @@
-"""ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), through the package rosbags."""
+"""ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), and RealSense recordings, through the package rosbags.
 
+RealSense recordings (``.db3`` files of librealsense since March 2026, ``.bag`` files of earlier ones) are ROS bags with
+topics of their own; the package reads them without the driver, with random access, which the driver does not offer.
+"""
+
+import re
 import weakref
 from functools import cached_property
 from pathlib import Path
@@ -9,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import LARGEST_GAP, associate
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -16,12 +22,11 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.io.exporting.ros_messages import seconds_of
-from dudmap.io.sequences import bag_images, bag_topics, intrinsics
+from dudmap.io.sequences import Recording, bag_messages, intrinsics
 from dudmap.io.sequences.bag_file import BagFile, MessageTimes
-from dudmap.io.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
+from dudmap.io.sequences.bag_messages import STATIC_TOPIC, TOPIC, TransformTree, motion_of
 from dudmap.io.sequences.image_folder import PROBES, size
-from dudmap.io.sequences.lens import Lens
-from dudmap.io.sequences.recording import Recording
+from dudmap.io.sequences.intrinsics import Lens
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -59,7 +64,7 @@ class RosBag(Recording):
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None, topics: str | None = None) -> None:
         super().__init__(path)
-        chosen = bag_topics.parse(topics)
+        chosen = bag_messages.chosen_topics(topics)
         self._bag = BagFile(self.path)
         weakref.finalize(self, self._bag.close)
         with foreign(DatasetError, f"the bag {self.path}"):
@@ -67,7 +72,7 @@ class RosBag(Recording):
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
         """Set topics, times and pairs of messages, and the cameras."""
-        self._topics = bag_topics.find(self._bag.connections, chosen, str(self.path))
+        self._topics = bag_messages.find_topics(self._bag.connections, chosen, str(self.path))
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
         self._pairs = self._associated(depth, color)
@@ -82,7 +87,10 @@ class RosBag(Recording):
         if path.is_dir():
             return (path / "metadata.yaml").is_file()
         magic = MAGIC.get(path.suffix.lower())
-        return magic is not None and starts_with(path, magic)
+        if magic is None or not path.is_file():
+            return False
+        with open_plain(path, pointers=True) as file:  # which Git LFS may have to fetch
+            return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
     def _frame(self, index: int, name: str) -> Frame:
         depth, values, color, image = self._decoded(index, self.camera.depth_scale)
@@ -103,8 +111,8 @@ class RosBag(Recording):
         topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
         with foreign(FrameError, name):
             color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
-            values = bag_images.depth_of(depth, depth_scale, f"the depth image of {name}")
-            return depth, values, color, bag_images.color_of(color, f"the colour image of {name}")
+            values = bag_messages.depth_of(depth, depth_scale, f"the depth image of {name}")
+            return depth, values, color, bag_messages.color_of(color, f"the colour image of {name}")
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -216,15 +224,16 @@ class RosBag(Recording):
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
-        rectified = "rect" in bag_topics.base(image.topic).rpartition("/")[2] and P[0] > 0
+        rectified = "rect" in bag_messages.base(image.topic).rpartition("/")[2] and P[0] > 0
         fx, cx, fy, cy = (P[0], P[2], P[5], P[6]) if rectified else (K[0], K[2], K[4], K[5])
         width, height = (info.width, info.height) if info.width and info.height else shape
         units = self._units()
         camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
-        return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
+        return Lens(camera) if rectified else Lens.of(camera, self._model_of(image, info), tuple(map(float, D)))
 
-    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
-        return Lens.of(camera, model, coefficients)
+    def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
+        """Model of the lens of an image with its camera_info."""
+        return info.distortion_model
 
     @cached_property
     def _transforms(self) -> TransformTree:
@@ -242,17 +251,97 @@ class RosBag(Recording):
         return tree
 
 
-def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file starts with these bytes, or will once Git LFS has fetched it."""
-    if not path.is_file():
-        return False
-    with open_plain(path, pointers=True) as file:
-        return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
-
-
 def _equal(one: Lens, other: Lens) -> bool:
     """Whether two lenses project alike, to the accuracy with which drivers write intrinsics."""
     a, b = one.camera, other.camera
     numbers = [(c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)) for c in (a, b)]
     alike = len(numbers[0]) == len(numbers[1]) and np.allclose(*numbers, rtol=0, atol=1e-3)
     return a.shape == b.shape and alike and one.model == other.model
+
+
+TOPICS = b"/device_0/sensor_"
+"""Start of the topics of the first camera's streams."""
+HEAD = 1 << 18
+"""Bytes at the start of a file among which the topics are looked for."""
+
+
+class RealSenseRecording(RosBag):
+    """Recording of a RealSense camera; depth is registered by the factory calibration in the file.
+
+    The frames' times are those of the camera: in the metadata of every frame (``.db3``, whose headers hold the times of
+    recording) or in the headers (``.bag``). The depth unit is the camera's option of that name.
+    """
+
+    format = "RealSense recording"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a .bag or .db3 file has the topics of librealsense."""
+        if path.suffix.lower() not in (".bag", ".db3") or not path.is_file():
+            return False
+        with open_plain(path, pointers=True) as file:
+            head = file.read(HEAD)
+        return head.startswith(MAGIC[path.suffix.lower()]) and TOPICS in head
+
+    def _times(self, connection: "Connection") -> MessageTimes:
+        found = super()._times(connection)
+        metadata = self._beside(connection, "image/metadata", "std_msgs/msg/String")
+        if metadata is None:
+            return found
+        stamps = {}
+        for time, message in self._bag.messages([metadata]):
+            if match := re.search(r"(?:^|;)timestamp=([\d.]+)", message.data):
+                stamps[time] = 1e-3 * float(match[1])
+        kept = np.array([int(time) in stamps for time in found.recorded])
+        if not kept.any():
+            return found
+        recorded = found.recorded[kept]
+        return MessageTimes(recorded, np.array([stamps[int(time)] for time in recorded]), True)
+
+    def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
+        """Motion through the reference of both streams, whose points the file takes to either stream."""
+        motions = [self._motion(connection) for connection in (self._topics.color, self._topics.depth)]
+        if motions[0] is None or motions[1] is None:
+            return None
+        return motions[0] @ se3.inverse(motions[1])
+
+    def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
+        """The camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
+        text = self._beside(image, "camera_info", "std_msgs/msg/String")
+        found = re.search(r"model=([^;]+)", self._bag.first(text).data) if text else None
+        return found[1] if found else info.distortion_model
+
+    def _units(self) -> float:
+        sensor = re.match(r"/device_\d+/sensor_\d+", self._topics.depth.topic)
+        topic = f"{sensor[0]}/option/Depth_Units/value" if sensor else ""
+        for connection in self._bag.connections:
+            if connection.topic == topic and connection.msgcount:
+                unit = float(self._bag.first(connection).data)
+                return round(1 / unit, 2) if unit > 0 else MILLIMETRES  # the option is a float32
+        return MILLIMETRES
+
+    def _motion(self, image: "Connection") -> NDArray[np.float64] | None:
+        """Motion (4, 4) of points of the reference into a stream, from its topic ``tf/...``."""
+        found = self._beside(image, "tf/", "")
+        return None if found is None else _motion(self._bag.first(found))
+
+    def _beside(self, image: "Connection", name: str, msgtype: str) -> "Connection | None":
+        """First topic of the same stream whose name goes on with ``name``."""
+        stream = re.match(r"/device_\d+/sensor_\d+/\w+", image.topic)
+        prefix = f"{stream[0] if stream else image.topic}/{name}"
+        for connection in self._bag.connections:
+            right = connection.topic.startswith(prefix) and connection.msgtype.startswith(msgtype)
+            if right and connection.msgcount:
+                return connection
+        return None
+
+
+def _motion(message: Any) -> NDArray[np.float64]:  # noqa: ANN401 - the type is made from the bag
+    """Motion of a geometry_msgs/Transform, or of text with the rotation column by column."""
+    if not hasattr(message, "data"):
+        return motion_of(message)
+    T = np.eye(4)
+    numbers = [float(number) for number in re.findall(r"[-+\d.eE]*\d[\d.]*", message.data)]
+    T[:3, :3] = se3.nearest_rotation(np.array(numbers[:9]).reshape(3, 3).T)
+    T[:3, 3] = numbers[9:12]
+    return T

@@ -1,4 +1,4 @@
-"""A bag by the package rosbags: its topics, the times of their messages from its index, and the messages themselves.
+"""A bag by the package rosbags: its topics, times of messages from its index, and single messages.
 
 rosbags trusts what it reads. Here decompression is limited, an SQLite file must be nothing but tables, and messages are
 decoded by the definitions that ROS publishes for their types: of those in a bag rosbags would make Python code. Topics
@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
 from urllib.parse import quote
 
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_RATIO, RATIO_FREE_BYTES, open_plain, read_text
-from dudmap.io.sequences.message_stream import MessageStream
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -293,3 +293,61 @@ class _BoundedFile:
         if self._left < 0:
             raise ValueError(f"one of its files unpacks to more than {LARGEST_RATIO} times its size")
         return data
+
+
+JUMP = 2_000_000_000
+"""A message that lies further ahead than this, nanoseconds, is searched for; a nearer one is waited for in the stream,
+which costs less than opening a new one."""
+
+
+class MessageStream:
+    """Access to messages by topic and time of recording in nanoseconds.
+
+    Messages that are asked for in order are streamed through one pass over the file, in which those of the other topics
+    that are not asked for yet are kept until they lie behind; a jump opens a new pass at the wanted time.
+
+    Args:
+        start: Opens a pass over the messages of some topics from a time on: topic, time and content of each.
+
+    Attributes:
+        lock: Held while the file is read, which may be by a thread of its own.
+    """
+
+    def __init__(self, start: Callable[[list[str], int], Generator[tuple[str, int, bytes]]]) -> None:
+        self.lock = Lock()
+        self._start = start
+        self._passing: Generator[tuple[str, int, bytes]] | None = None
+        self._kept: dict[tuple[str, int], bytes] = {}
+        self._position = -1
+
+    def read(self, wanted: list[tuple[str, int]]) -> list[bytes]:
+        """Messages of these topics, which are the same in every call, at these times.
+
+        Raises:
+            KeyError: There is no such message.
+        """
+        with self.lock:
+            missing = {key for key in wanted if key not in self._kept}
+            first = min((time for _, time in missing), default=self._position)
+            if missing and (self._passing is None or not 0 <= first - self._position <= JUMP):
+                self.close()
+                self._passing = self._start([topic for topic, _ in wanted], first)
+            while missing:
+                topic, time, data = next(self._passing or iter(()), ("", -1, b""))
+                if time < 0:
+                    self._passing = None
+                    raise KeyError("there is no such message")
+                self._position = time
+                self._kept[topic, time] = data
+                missing.discard((topic, time))
+            out = [self._kept[key] for key in wanted]
+            oldest = min(time for _, time in wanted)
+            self._kept = {key: data for key, data in self._kept.items() if key[1] >= oldest}
+        return out
+
+    def close(self) -> None:
+        """End the pass."""
+        if self._passing is not None:
+            self._passing.close()
+        self._passing = None
+        self._kept.clear()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError
-from dudmap.input_files import LARGEST_TREE, load_array, read_json, read_text
+from dudmap.input_files import LARGEST_TREE, damaged, load_array, read_json, read_text
 from dudmap.io.sequences.intrinsics import DISTORTION_KEYS, KEYS, Intrinsics, camera_values, from_file, from_matrix
 
 FILES = (
@@ -49,8 +49,11 @@ def find(folder: Path) -> Intrinsics | None:
     """Intrinsics that lie in a folder or in the one above it; None without a file of a known name."""
     for place in (folder, folder.resolve().parent):
         for file in (place / name for name in FILES):
+            if file.is_file() and file.suffix == ".npy":
+                with damaged(DatasetError, f"the array {file}"):
+                    return from_matrix(np.asarray(load_array(file), dtype=np.float64).ravel(), file)
             if file.is_file():
-                return _from_array(file) if file.suffix == ".npy" else from_file(file)
+                return from_file(file)
         files = [place / name for name in TREES if (place / name).is_file()]
         if place is folder:
             files = [file for file in sorted(place.iterdir()) if re.fullmatch(NAMED, file.name.lower())]
@@ -158,13 +161,6 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
         return read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
-
-
-def _from_array(file: Path) -> Intrinsics:
-    try:
-        return from_matrix(np.asarray(load_array(file), dtype=np.float64).ravel(), file)
-    except (OSError, ValueError, EOFError) as error:
-        raise DatasetError(f"cannot read the array {file}: {error}") from error
 
 
 def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  # noqa: ANN401

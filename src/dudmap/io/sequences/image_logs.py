@@ -1,9 +1,11 @@
-"""Files that hold frame after frame: ScanNet's ``.sens`` (Dai et al. 2017) and the ``.klg`` of ElasticFusion."""
+"""Files that hold frame after frame: ScanNet's ``.sens`` (Dai et al. 2017), ElasticFusion's ``.klg``, and the ``.r3d``
+of the iPhone application Record3D, a ZIP archive of JPEG colour and LZFSE depth."""
 
 import struct
+import zipfile
 import zlib
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,9 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
-from dudmap.input_files import LARGEST_FILE, open_plain
-from dudmap.io.sequences import images, intrinsics
-from dudmap.io.sequences.recording import Recording
+from dudmap.extras import extra
+from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, open_plain, parse_json
+from dudmap.io.sequences import Recording, images, intrinsics
 
 SENS_VERSION = 4
 """The version of the format that ScanNet publishes."""
@@ -37,17 +39,43 @@ class FrameEntry(NamedTuple):
     color_time: int = 0
 
 
-class SensRecording(Recording):
+class _FrameLog(Recording):
+    """Base of the formats that hold two images after each header; opening walks over the headers."""
+
+    options: tuple[str, ...] = ("depth_unit",)
+    _entries: list[FrameEntry]
+
+    def _images(self, index: int) -> tuple[bytes, bytes]:
+        """Data of the two images of a frame, in the order of the file."""
+        entry = self._entries[index]
+        with open_plain(self.path) as file:
+            file.seek(entry.offset)
+            return file.read(entry.sizes[0]), file.read(entry.sizes[1])
+
+    def _depth(self, data: bytes, name: str, *, compressed: bool) -> NDArray[np.float32]:
+        """Depth (H, W), metres, of 16-bit values that are raw or deflated by zlib."""
+        height, width = self.camera.shape
+        expected = 2 * height * width
+        if compressed:
+            try:
+                data = zlib.decompressobj().decompress(data, expected + 1)
+            except zlib.error as error:
+                raise FrameError(f"{name}: the depth image is damaged, {error}") from None
+        if len(data) != expected:
+            raise FrameError(f"{name}: the depth image has {len(data)} bytes; expected {expected} of {width}x{height}")
+        values = np.frombuffer(data, "<u2").reshape(height, width).astype(np.uint16, copy=False)
+        return images.metres(values, self.camera.depth_scale, name)
+
+
+class SensRecording(_FrameLog):
     """Recording in a ``.sens`` file.
 
-    Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
-    colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
+    The colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
     holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
     """
 
     format = "ScanNet .sens"
     suffix = ".sens"
-    options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -107,18 +135,17 @@ class SensRecording(Recording):
         return entry, pose
 
     def _frame(self, index: int, name: str) -> Frame:
-        entry = self._entries[index]
-        color_data, depth_data = _read(self.path, entry)
+        color_data, depth_data = self._images(index)
         color = images.decode_color(color_data, f"the colour image of {name}")
         expected = self.camera if self.calibration is None else self.calibration.camera
         if color.shape[:2] != expected.shape:
             raise FrameError(f"{name}: the colour image has another size than the file's header says")
-        values = decode_values(depth_data, self.camera.shape, compressed=self._deflated, name=name)
-        depth = images.metres(values, self.camera.depth_scale, name)
-        return Frame(float(self.timestamps[index]), depth, color, 1e-6 * entry.color_time if self.timed else None)
+        depth = self._depth(depth_data, name, compressed=self._deflated)
+        taken = 1e-6 * self._entries[index].color_time if self.timed else None
+        return Frame(float(self.timestamps[index]), depth, color, taken)
 
 
-class KlgRecording(Recording):
+class KlgRecording(_FrameLog):
     """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
     Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
@@ -128,7 +155,6 @@ class KlgRecording(Recording):
 
     format = "ElasticFusion .klg"
     suffix = ".klg"
-    options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -147,22 +173,22 @@ class KlgRecording(Recording):
         self.camera = known.camera(*self._size(known), 1000.0)
 
     def _frame(self, index: int, name: str) -> Frame:
-        depth_data, color_data = _read(self.path, self._entries[index])
-        raw = len(depth_data) == 2 * self.camera.width * self.camera.height
-        values = decode_values(depth_data, self.camera.shape, compressed=not raw, name=name)
-        if len(color_data) == 3 * self.camera.width * self.camera.height:
+        depth_data, color_data = self._images(index)
+        pixels = self.camera.width * self.camera.height
+        depth = self._depth(depth_data, name, compressed=len(depth_data) != 2 * pixels)
+        if len(color_data) == 3 * pixels:
             color = np.frombuffer(color_data, np.uint8).reshape(*self.camera.shape, 3).copy()
         else:
             color = images.decode_color(color_data, f"the colour image of {name}")
         if color.shape[:2] != self.camera.shape:
             raise FrameError(f"{name}: the colour image is not {self.camera.width}x{self.camera.height} pixels")
-        return Frame(float(self.timestamps[index]), images.metres(values, self.camera.depth_scale, name), color)
+        return Frame(float(self.timestamps[index]), depth, color)
 
     def _size(self, known: intrinsics.Intrinsics) -> tuple[int, int]:
         """Width and height of the images."""
         if "width" in known.values:
             return int(known.values["width"]), int(known.values["height"])
-        _, color = _read(self.path, self._entries[0])
+        _, color = self._images(0)
         if color.startswith(images.JPEG):
             height, width = images.decode_color(color, f"the first colour image of {self.path}").shape[:2]
             return width, height
@@ -190,29 +216,123 @@ class KlgRecording(Recording):
         return entries
 
 
-def _read(path: Path, entry: FrameEntry) -> tuple[bytes, bytes]:
-    """Data of the two images of a frame."""
-    with open_plain(path) as file:
-        file.seek(entry.offset)
-        return file.read(entry.sizes[0]), file.read(entry.sizes[1])
-
-
 def _unpack(file: IO[bytes], form: str) -> tuple:
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
-def decode_values(data: bytes, shape: tuple[int, int], *, compressed: bool, name: str) -> NDArray[np.uint16]:
-    """16-bit depth values (H, W) of a buffer, raw or deflated by zlib.
+LARGEST_COMMAND = 315 + 2359
+"""Bytes that one command of an LZFSE block can write."""
+
+
+class Record3DRecording(Recording):
+    """Recording in a ``.r3d`` file.
+
+    The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same
+    place, so that the depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Readings
+    of confidence 0 are left out. The poses in the file are estimates of ARKit and therefore no ground truth.
+    """
+
+    format = "Record3D .r3d"
+    suffix = ".r3d"
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        super().__init__(path)
+        self._lzfse = _lzfse(self.path)
+        try:
+            open_plain(self.path).close()
+            self._zip = zipfile.ZipFile(self.path)
+        except zipfile.BadZipFile as error:
+            raise DatasetError(f"{self.path} is not a whole .r3d file: {error}") from None
+        self._numbers = sorted(
+            int(Path(member).stem) for member in self._zip.namelist()
+            if member.startswith("rgbd/") and member.endswith(".depth") and Path(member).stem.isdigit()
+        )  # fmt: skip
+        if not self._numbers:
+            raise DatasetError(f"{self.path} holds no depth images rgbd/N.depth")
+        color, size, times = self._metadata()
+        self.timestamps = times
+        self._set_cameras(color.resized(*size), Calibration(color), "the metadata of the file", camera)
+        self.sources["depth unit"] = "the format"
+
+    def _frame(self, index: int, name: str) -> Frame:
+        number = self._numbers[index]
+        color = images.decode_color(self._member(f"rgbd/{number}.jpg"), f"rgbd/{number}.jpg of {self.path}")
+        return Frame(float(self.timestamps[index]), self._depth(number), color)
+
+    def _depth(self, number: int) -> NDArray[np.float32]:
+        values = self._unpacked(f"rgbd/{number}.depth", "<f4")
+        depth = images.metres(values, 1.0, f"rgbd/{number}.depth of {self.path}")
+        if f"rgbd/{number}.conf" in self._zip.NameToInfo:
+            depth[self._unpacked(f"rgbd/{number}.conf", "u1") == 0] = 0
+        return depth
+
+    def _unpacked(self, member: str, kind: str) -> NDArray[Any]:
+        """Image (H, W) of a member that holds the pixels of the depth camera, compressed by LZFSE."""
+        name, width, height = f"{member} of {self.path}", self.camera.width, self.camera.height
+        packed = self._member(member)
+        if largest_unpacked(packed) > RATIO_FREE_BYTES:
+            raise FrameError(f"{name} unpacks to too much; expected {width}x{height} pixels")
+        try:
+            data = self._lzfse.decompress(packed)
+        except (self._lzfse.error, MemoryError) as error:
+            # where a block ends too early, the decoder asks for more and more memory, which it does not use
+            raise FrameError(f"{name} cannot be decompressed: {error or 'a block ends too early'}") from error
+        if len(data) != np.dtype(kind).itemsize * width * height:
+            raise FrameError(f"{name} has {len(data)} bytes; expected {width}x{height} pixels of {kind}")
+        return np.frombuffer(data, kind).reshape(height, width)
+
+    def _member(self, name: str) -> bytes:
+        try:
+            if self._zip.getinfo(name).file_size > LARGEST_FILE:
+                raise FrameError(f"{name} in {self.path} has more than {LARGEST_FILE / 1e6:.0f} MB")
+            return self._zip.read(name)
+        except (RuntimeError, *DAMAGE) as error:
+            raise FrameError(f"cannot read {name} in {self.path}: {error}") from None
+
+    def _metadata(self) -> tuple[Camera, tuple[int, int], NDArray[np.float64]]:
+        """Colour camera, size of the depth images, and times (N,) in seconds of the frames."""
+        try:
+            tree: dict[str, Any] = parse_json(self._member("metadata"))
+            fx, _, _, _, fy, _, cx, cy, _ = (float(number) for number in tree["K"])  # column by column
+            color = Camera(fx, fy, cx, cy, int(tree["w"]), int(tree["h"]))
+            size = int(tree["dw"]), int(tree["dh"])
+            stamps = tree.get("frameTimestamps") or [n / float(tree["fps"]) for n in range(max(self._numbers) + 1)]
+            times = np.array([stamps[number] for number in self._numbers], dtype=np.float64)
+        except DAMAGE as error:
+            raise DatasetError(f"cannot understand the metadata of {self.path}: {error!r}") from None
+        if np.any(np.diff(times) <= 0):
+            raise DatasetError(f"the frame times in the metadata of {self.path} do not increase")
+        return color, size, times
+
+
+def largest_unpacked(packed: bytes) -> int:
+    """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks alone.
+
+    A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (reference implementation of
+    Apple, lzfse_internal.h, whose decoder does not stop at the size that the block declares); other blocks declare it.
 
     Raises:
-        FrameError: The data cannot be inflated, or are not of this size.
+        ValueError: A block is cut off or of another kind.
     """
-    expected = 2 * shape[0] * shape[1]
-    if compressed:
-        try:
-            data = zlib.decompressobj().decompress(data, expected + 1)
-        except zlib.error as error:
-            raise FrameError(f"{name}: the depth image is damaged, {error}") from None
-    if len(data) != expected:
-        raise FrameError(f"{name}: the depth image has {len(data)} bytes; expected {expected} of {shape[1]}x{shape[0]}")
-    return np.frombuffer(data, dtype="<u2").reshape(shape).astype(np.uint16, copy=False)
+    total, at = 0, 0
+    while packed[at : at + 4] != b"bvx$":
+        if (len(packed) < at + 32 and packed[at : at + 4] == b"bvx2") or len(packed) < at + 8:
+            raise ValueError("its LZFSE data are cut off")
+        kind, size = struct.unpack_from("<4sI", packed, at)
+        if kind == b"bvx2":
+            first, second, third = struct.unpack_from("<3Q", packed, at + 8)
+            literals, commands = first >> 20 & 0xFFFFF, first >> 40 & 0xFFFFF
+            total += max(size, commands * LARGEST_COMMAND)
+            at += max(third & 0xFFFFFFFF, 32) + literals + (second >> 40 & 0xFFFFF)
+        elif kind in (b"bvxn", b"bvx-"):
+            total += size
+            at += 12 + struct.unpack_from("<I", packed, at + 8)[0] if kind == b"bvxn" else 8 + size
+        else:
+            raise ValueError(f"its LZFSE data have no block at byte {at}")
+    return total
+
+
+def _lzfse(path: Path) -> Any:  # noqa: ANN401 - an optional package
+    with extra("record3d", f"the recording {path}"):
+        import lzfse  # pyright: ignore[reportMissingImports]
+    return lzfse

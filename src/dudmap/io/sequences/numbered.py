@@ -16,8 +16,7 @@ from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, read_json, read_text
 from dudmap.io.sequences import camera_files, intrinsics
 from dudmap.io.sequences.camera_files import IMAGES
-from dudmap.io.sequences.image_folder import ImageFolder
-from dudmap.io.sequences.poses import read_matrices, rigid_trajectory
+from dudmap.io.sequences.image_folder import ImageFolder, read_matrices, rigid_trajectory
 
 DEPTH_WORDS = ("depth",)
 COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img", "mono")
