@@ -113,7 +113,7 @@ def calibrate_sequence(
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
     collector, submap = KeyframeCollector(small.calibration.camera, GAP * small.interval), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
-        for number, read in enumerate(frames, start=1):
+        for number, (_, read, *_) in enumerate(frames, start=1):
             progress(number, len(small))
             if isinstance(read.frame, FrameError) or read.prepared is None:
                 continue

@@ -5,8 +5,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dudmap.app.pipeline.frame_source import open_masks
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run import Job, open_masks, run
+from dudmap.app.pipeline.run import Job, run
 from dudmap.app.pipeline.run_folder import RunReport, locked
 from dudmap.app.pipeline.storing import RunStore, check_recording, stored_options
 from dudmap.app.state.system import on_device

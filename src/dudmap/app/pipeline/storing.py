@@ -59,7 +59,6 @@ class RunOptions(BaseModel):
     save_map: bool = True
     masks: Path | None = None
     ahead: int = AHEAD
-    live: bool = False
     passes: int = 1
     saved_map: Path | None = None
     localize: bool = False
