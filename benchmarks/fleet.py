@@ -179,7 +179,7 @@ def separate_pairs(folders: list[Path], runs: list[TrueRun], report: FleetReport
     more = [more[k] for k in np.random.default_rng(0).permutation(len(more))]
     compared = [pair for pair in pairs if pair in known]
     with Workers(workers) as crew:
-        extra = register_pairs(folders, sorted(more[: max(0, count - len(compared))]), crew)
+        extra = register_pairs(folders, sorted(more[: max(0, count - len(compared))]), crew, {})
     found = [known[pair] for pair in compared] + [one.pair for one in extra]
     suggested = sum(pair.hypothesis is not None for pair in found)
     return {"pairs": len(found), "suggested_by_features": suggested, "joined": sum(p.T_a_b is not None for p in found)}

@@ -17,13 +17,12 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
-from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.errors import DudmapError, MapError
 from dudmap.fleet.agreement import agreement
-from dudmap.fleet.block_sums import BlockSums, block_sums, fused
-from dudmap.fleet.map_fusion import fuse_maps
+from dudmap.fleet.map_fusion import BlockSums, block_sums, fuse_maps, fused
 from dudmap.fleet.map_merging import compare_maps
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, surface_points
-from dudmap.fleet.two_runs import merge_runs
+from dudmap.fleet.merge import merge_runs
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -158,11 +157,6 @@ def test_what_stood_in_one_run_and_was_gone_in_the_other_leaves_the_map():
     behind = sample_map(merged, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.01], [0.0, 0.0, 2.0]]))
     assert (behind.sdf[:2] > 0.02).all()
     np.testing.assert_allclose(behind.sdf[2], 0, atol=2e-3)
-
-
-def test_other_voxel_sizes_are_refused():
-    with pytest.raises(ConfigError, match=r"voxels of 0\.02 and 0\.05 m cannot be merged"):
-        fuse_maps([wall(), wall(config=VolumeConfig(voxel_size=0.05))], [np.eye(4)] * 2)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
-from dudmap.fleet.run_graph import SIGMA_DISTANCE, Join, consistent, drift_covariance, solve, supported
-from dudmap.fleet.smallest_cuts import best_cut
+from dudmap.fleet.run_graph import SIGMA_DISTANCE, Join, best_cut, consistent, drift_covariance, solve, supported
 
 RUNS = 24
 

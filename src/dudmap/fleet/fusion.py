@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.fleet.fused_range import FusedRange
-from dudmap.fleet.inputs import MapHeader
-from dudmap.fleet.map_fusion import RangeFusion, ReachedBlocks
-from dudmap.fleet.open_maps import open_map, reached_blocks
+from dudmap.fleet.inputs import MapHeader, open_map, reached_blocks
+from dudmap.fleet.map_fusion import FusedRange, RangeFusion, ReachedBlocks
 from dudmap.fleet.tiles import Tile, write_tile
 from dudmap.fleet.workers import Workers
 

@@ -1,7 +1,9 @@
-"""Fusion of maps with known relative poses, a range of blocks at a time.
+"""Fusion of maps with known relative poses, a range of blocks at a time: sums of integers, divided and rounded once.
 
-A range is all blocks whose Morton codes lie between two numbers. It is fused on its own, from sums to which the maps
-are added one after the other in any order, so that neither all maps nor the whole result need to be in memory.
+The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, and a weighted mean of several maps is the
+quotient of two sums: ``sdf = sum(w_i sdf_i) / sum(w_i)``. The sums are integers, so that any order and any grouping of
+the maps give the same voxels. A range is all blocks whose Morton codes lie between two numbers; neither all maps nor
+the whole result need to be in memory.
 """
 
 from collections.abc import Sequence
@@ -11,13 +13,243 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.backends.cpu.points import COLUMNS, EMPTY, INTENSITY, OBSERVED, RED, SDF, UNSEEN, WEIGHT, sample_points
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.voxel_blocks import BLOCK
-from dudmap.errors import ConfigError
-from dudmap.fleet.block_sums import MAX_COUNT, PROBES, VOXELS, BlockSums, block_sums, empty_counts, fused
-from dudmap.fleet.fused_range import FusedRange, joined
+from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
+
+
+@dataclass(frozen=True, eq=False)
+class FusedRange:
+    """Blocks of the result.
+
+    Attributes:
+        codes: (n,) int64 Morton codes.
+        has_voxels: (n,) bool; the others were seen to be empty.
+        free_count: (n,) uint8 observations of emptiness.
+        geometry, colors: (m, 512) int32 packed voxels of the blocks that have some, in the same order.
+    """
+
+    codes: NDArray[np.int64]
+    has_voxels: NDArray[np.bool_]
+    free_count: NDArray[np.uint8]
+    geometry: NDArray[np.int32]
+    colors: NDArray[np.int32]
+
+    def chosen(self, keep: NDArray[np.bool_]) -> "FusedRange":
+        """Some of the blocks (n,)."""
+        rows = keep[self.has_voxels]
+        return FusedRange(
+            self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
+        )
+
+    @classmethod
+    def of(cls, volume: TsdfVolume) -> "FusedRange":
+        """All blocks of a map."""
+        blocks, n = volume.blocks, volume.blocks.num_entries
+        has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
+        codes = morton.encode(blocks.coords[:n])
+        return cls(codes, has_voxels, blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots])
+
+    def volume(self, like: TsdfVolume) -> TsdfVolume:
+        """The blocks as a map with the camera and the parameters of another."""
+        out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
+        entries = np.flatnonzero(self.has_voxels).astype(np.int32)
+        coords = morton.decode(self.codes)
+        out.blocks = VoxelBlocks.restored(coords, self.free_count, entries, self.geometry, self.colors)
+        return out
+
+
+def joined(parts: Sequence[FusedRange]) -> FusedRange:
+    """Blocks of several ranges, which have none in common."""
+    names = FusedRange.__dataclass_fields__
+    return FusedRange(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+VOXELS = BLOCK**3
+MAX_COUNT = 255
+"""Largest weight of a voxel and number of observations of emptiness of a block."""
+
+MAX_STEPS = 32767
+"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSums:
+    """Sums over maps of the content of n blocks.
+
+    Attributes:
+        coords: (n, 3) int32 coordinates of the blocks.
+        weight, distance: (n, 512) int64, sum of the weights, and of weight times distance in steps.
+        shade_weight, shade: (n, 512) int64, the same of the intensities 1..255.
+        color_weight, color: (n, 512) and (n, 512, 3) int64, the same of the colours in quarters of a grey level.
+        free: (n,) int64, observations of emptiness of maps in which the block has no voxels.
+    """
+
+    coords: NDArray[np.int32]
+    weight: NDArray[np.int64]
+    distance: NDArray[np.int64]
+    shade_weight: NDArray[np.int64]
+    shade: NDArray[np.int64]
+    color_weight: NDArray[np.int64]
+    color: NDArray[np.int64]
+    free: NDArray[np.int64]
+
+    @classmethod
+    def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
+        """Sums over no map."""
+        n = len(coords)
+        shapes = *[(n, VOXELS)] * 5, (n, VOXELS, 3), (n,)
+        return cls(coords, *(np.zeros(shape, np.int64) for shape in shapes))
+
+    def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
+        """Sums over some of the blocks."""
+        return BlockSums(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def add(self, rows: NDArray[np.intp], other: "BlockSums") -> None:
+        """Add sums over the same blocks as ``rows`` (k,) of these."""
+        assert np.array_equal(self.coords[rows], other.coords)
+        for name in list(self.__dataclass_fields__)[1:]:
+            getattr(self, name)[rows] += getattr(other, name)
+
+
+def block_sums(
+    volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None, sdf_unit: float
+) -> BlockSums:
+    """Content of one map at blocks of a grid with voxels of the same size.
+
+    Args:
+        volume: The map.
+        coords: (n, 3) blocks of the grid.
+        T_volume_grid: (4, 4) world of the grid to that of the map; the content is interpolated trilinearly. None: the
+            grid is that of the map, whose words are taken as they are.
+        sdf_unit: Metres per step of the distances of the sums.
+    """
+    if T_volume_grid is None:
+        return _exact_sums(volume, coords)
+    voxels = (coords[:, None].astype(np.float64) * BLOCK + _LOCAL).reshape(-1, 3)
+    rows, states = _samples(volume, voxels, T_volume_grid)
+    states, rows = states.reshape(-1, VOXELS), rows.reshape(-1, VOXELS, COLUMNS)
+    known = (states != UNSEEN) & np.any(states == OBSERVED, axis=1)[:, None]
+    weight = np.where(known, np.minimum(np.rint(rows[..., WEIGHT]), MAX_COUNT), 0).astype(np.int32)
+    distance = np.rint(rows[..., SDF] * np.float32(volume.sdf_unit / sdf_unit)).astype(np.int32)
+    shade = np.rint(rows[..., INTENSITY]).astype(np.int32)
+    color = np.rint(rows[..., RED : RED + 3]).astype(np.int32)
+    return _sums(coords, weight, distance, shade, color, _least_emptiness(volume, rows, states))
+
+
+def empty_counts(
+    volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None
+) -> NDArray[np.int64]:
+    """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``.
+
+    On another grid a block is empty if ``PROBES`` of it are: a part of it that the map never saw can be missed if it is
+    smaller than half a block.
+    """
+    if T_volume_grid is None:
+        entries = hashing.find_all(volume.blocks.table, volume.blocks.coords, coords)
+        return np.where(entries >= 0, volume.blocks.free_count[np.maximum(entries, 0)], 0).astype(np.int64)
+    rows, states = _samples(volume, (coords[:, None].astype(np.float64) * BLOCK + PROBES).reshape(-1, 3), T_volume_grid)
+    return _least_emptiness(volume, rows.reshape(len(coords), -1, COLUMNS), states.reshape(len(coords), -1))
+
+
+_LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
+PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Points (27, 3) of a block, in voxels."""
+
+
+def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
+    """Content of blocks (n, 3) of a map as it is."""
+    blocks, slots = volume.blocks, volume.slots_at(coords)
+    held = slots >= 0
+    words = np.where(held[:, None], blocks.geometry[np.maximum(slots, 0)], 0)
+    colors = np.where(held[:, None], blocks.colors[np.maximum(slots, 0)], 0)
+    channels = np.stack([(colors >> shift) & 0x3FF for shift in (20, 10, 0)], axis=-1)
+    free = np.where(held, 0, empty_counts(volume, coords, None))
+    return _sums(coords, (words >> 8) & 0xFF, words >> 16, words & 0xFF, channels, free)
+
+
+def _samples(
+    volume: TsdfVolume, voxels: NDArray[np.float64], T_volume_grid: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """``sample_points`` of a map at voxels (n, 3) of a grid."""
+    blocks, motion = volume.blocks, T_volume_grid[:3].copy()
+    motion[:, 3] /= volume.voxel_size
+    return sample_points(
+        blocks.table, blocks.coords, blocks.slot_of, blocks.free_count, blocks.geometry, blocks.colors, voxels, motion,
+        volume.truncation / volume.sdf_unit, float(volume.config.carve_rate),
+    )  # fmt: skip
+
+
+def _least_emptiness(volume: TsdfVolume, rows: NDArray[np.float32], states: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Observations of emptiness (n,) of blocks of whose points (n, k) all lie in blocks without voxels, 0 of others."""
+    empty = np.all(states == EMPTY, axis=1)
+    least = np.rint(rows[..., WEIGHT].min(axis=1) / volume.config.carve_rate)
+    return np.where(empty, least, 0).astype(np.int64)
+
+
+def _sums(
+    coords: NDArray[np.int32],
+    weight: NDArray[np.int32],
+    distance: NDArray[np.int32],
+    shade: NDArray[np.int32],
+    color: NDArray[np.int32],
+    free: NDArray[np.int64],
+) -> BlockSums:
+    """Sums of a single map from its values; an intensity or colour of 0 is unknown."""
+    wide = weight.astype(np.int64)
+    shade_weight = wide * (shade > 0)
+    color_weight = wide * np.any(color > 0, axis=-1)
+    return BlockSums(
+        coords, wide, wide * distance, shade_weight, shade_weight * shade, color_weight,
+        color_weight[..., None] * color, free,
+    )  # fmt: skip
+
+
+def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
+    """Divide the sums once.
+
+    Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps`` with the
+    weight ``carve_rate`` per observation, so that what stood in one run and was gone in the others leaves the map. A
+    block that is then empty everywhere loses its voxels.
+
+    Args:
+        sums: Of all maps.
+        free_steps: Truncation distance in steps.
+        carve_rate: Weight of an observation of emptiness.
+        free_after: Observations of emptiness from which a block is free space.
+    """
+    held = np.any(sums.weight > 0, axis=1)
+    emptiness = (carve_rate * sums.free * held)[:, None]
+    weight = sums.weight.astype(np.int64) + emptiness
+    distance = _rounded(sums.distance + free_steps * emptiness, weight)
+    shade = _rounded(sums.shade, sums.shade_weight)
+    channels = _rounded(sums.color, sums.color_weight[..., None])
+    distance = np.clip(distance, -MAX_STEPS, MAX_STEPS)
+    packed = (distance << 16) | (np.minimum(weight, MAX_COUNT) << 8) | shade
+    colors = (channels[..., 0] << 20) | (channels[..., 1] << 10) | channels[..., 2]
+    least = weight.min(axis=1) // carve_rate
+    empty = held & (least >= free_after) & np.all(distance * 10 >= 9 * free_steps, axis=1)
+    count = np.where(held, np.where(empty, least, 0), sums.free)
+    has_voxels = held & ~empty
+    known = (weight > 0)[has_voxels]
+    return FusedRange(
+        morton.encode(sums.coords),
+        has_voxels,
+        np.minimum(count, MAX_COUNT).astype(np.uint8),
+        np.where(known, packed[has_voxels], 0).astype(np.int32),
+        np.where(known, colors[has_voxels], 0).astype(np.int32),
+    )
+
+
+def _rounded(total: NDArray, weight: NDArray) -> NDArray:
+    """``total / weight`` to the nearest whole number, halves up; 0 without weight."""
+    weight = np.broadcast_to(weight, total.shape)
+    divisor = np.where(weight > 0, weight, 1)
+    return np.where(weight > 0, (2 * total + divisor) // (2 * divisor), 0)
+
 
 RANGE_BLOCKS = 4096
 """Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
@@ -108,13 +340,9 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
     the same grid any order gives the same voxels.
 
     Args:
-        volumes: The maps; the result has the camera and the parameters of the first.
+        volumes: The maps, with voxels of one size; the result has the camera and the parameters of the first.
         Ts_world_volume: Pose (4, 4) of each in the world of the result.
-
-    Raises:
-        ConfigError: The voxels differ in size.
     """
-    check_voxel_sizes(volumes)
     reached = [ReachedBlocks.of_volume(*one) for one in zip(volumes, Ts_world_volume, strict=True)]
     near = np.unique(np.concatenate([one.near for one in reached]))
     borders = [0, *near[RANGE_BLOCKS::RANGE_BLOCKS].tolist(), np.iinfo(np.int64).max]
@@ -128,18 +356,6 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
             fusion.add(volume, T, one)
         parts.append(fusion.fused())
     return joined(parts).volume(volumes[0])
-
-
-def check_voxel_sizes(volumes: Sequence[TsdfVolume]) -> None:
-    """Maps with voxels of different sizes have no common grid.
-
-    Raises:
-        ConfigError: They differ.
-    """
-    sizes = sorted({round(volume.voxel_size, 9) for volume in volumes})
-    if len(sizes) > 1:
-        found = " and ".join(f"{size:g}" for size in sizes)
-        raise ConfigError(f"maps with voxels of {found} m cannot be merged; repeat one run with the other's voxel_size")
 
 
 def _batches(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:

@@ -90,7 +90,7 @@ def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     Raises:
         MapError: A map has no surface.
     """
-    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
+    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
     if not found:
         return MapPair(None, NOT_RECOGNISED)

@@ -38,8 +38,7 @@ def relative_poses(
     a: Sequence[Keyframe],
     b: Sequence[Keyframe],
     camera: Camera,
-    config: RelocalizationConfig | None = None,
-    sensor: SensorConfig | None = None,
+    sensor: SensorConfig,
 ) -> list[Hypothesis]:
     """Relative poses of two maps, those with more agreeing features first; empty if no place of b is known in a.
 
@@ -50,10 +49,9 @@ def relative_poses(
         a: Keyframes of one map.
         b: Keyframes of the other.
         camera: Camera of a.
-        config: Thresholds of the recognition.
         sensor: Noise of the depth readings.
     """
-    database = KeyframeDatabase(config or RelocalizationConfig(), camera, sensor)
+    database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []
     for number, keyframe in enumerate(b):
         for place in database.match(keyframe.features, a):
@@ -77,11 +75,7 @@ def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
 
 
 def _average(votes: list[tuple]) -> NDArray[np.float64]:
-    """Weighted mean of relative poses, taken where the cameras stood so that no lever arm enters.
-
-    The cameras seen by the mean pose are the weighted least-squares fit of their votes: rotation from the mean of the
-    rotation matrices, translation from the mean difference of the positions.
-    """
+    """Weighted mean of relative poses, taken where the cameras stood so that no lever arm enters."""
     weights = np.array([vote[3] for vote in votes], float)
     Ts, cameras = np.stack([vote[1] for vote in votes]), np.stack([vote[2] for vote in votes])
     T = np.eye(4)
