@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from dudmap.app.viewing.report import write_report
 from dudmap.app.viewing.run_files import RunFiles
-from dudmap.app.viewing.stored_view import frames_of
 from dudmap.config import Config, VolumeConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -240,7 +239,7 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path
     assert json.loads((out / "merge.json").read_text()) == tree
     np.testing.assert_allclose(Trajectory.load(out / "trajectory-2.txt").Ts_world_camera[1], tree["T_a_b"], atol=1e-6)
     shown = RunFiles.load(out)
-    assert [frame.timestamp for frame in frames_of(shown)] == [0.0, 1.0]
+    assert [frame.timestamp for frame in shown.figures()] == [0.0, 1.0]
     assert len(shown.mesh.faces) == tree["mesh_triangles"]
     assert "5 of 5 frames were tracked" in write_report(out, tmp_path / "report.html").read_text()
     merged = SavedMap.load(out)

@@ -27,7 +27,7 @@ def view(
     token: o.TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
-    from dudmap.app.viewing.stored_view import open_run
+    from dudmap.app.viewing.live_view import open_run
 
     window = open_run(run, host, port, token)
     say(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)

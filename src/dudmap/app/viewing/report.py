@@ -105,7 +105,7 @@ def scene_data(run: RunFiles) -> dict[str, Any]:
     movers = [
         [
             {"id": m.id, "box": m.box.round(3).tolist(), "speed": round(m.speed, 3)}
-            for m in run.movers.get(f"{t:.6f}", [])
+            for m in run.boxes.get(f"{t:.6f}", ())
         ]
         for t in times
     ]

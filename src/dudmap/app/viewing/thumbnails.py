@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run_folder import WRITTEN
+from dudmap.app.viewing.run_files import FOLDER
 from dudmap.app.viewing.snapshot import FrameImages
 from dudmap.atomic_file import write_bytes
 from dudmap.errors import FrameError
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
 
-FOLDER = "thumbnails"
 NUMBER = 36
 """Number of frames that are kept: about 1.5 MB of JPEG files, and a strip that can still be looked through."""
 
