@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dudmap import Config
-from dudmap.app.pipeline.calibration import calibrate_start
-from dudmap.app.pipeline.calibration_report import findings
+from dudmap.app.pipeline.calibration import calibrate_start, findings
 from dudmap.core.calibration.estimator import GROUPS, Estimate
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera

@@ -12,10 +12,10 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.run_folder import LOCK, RunLock
 from dudmap.app.pipeline.storing import RunOptions, Storing
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.identity import code_fingerprint, recording_fingerprint
-from dudmap.app.state.run_lock import NAME, RunLock
+from dudmap.app.state.system import code_fingerprint, recording_fingerprint
 from dudmap.config import Config
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.errors import DudmapError, StateError
@@ -25,7 +25,7 @@ from recordings import write_recording
 HOLD = """
 import sys, time
 from pathlib import Path
-from dudmap.app.state.run_lock import RunLock
+from dudmap.app.pipeline.run_folder import RunLock
 with RunLock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -42,10 +42,10 @@ def test_the_holder_is_named_and_a_killed_one_holds_nothing(tmp_path):
         other.send_signal(signal.SIGKILL)
         other.communicate()
     with RunLock(tmp_path):
-        assert json.loads((tmp_path / NAME).read_text())["pid"] == os.getpid()
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
         with pytest.raises(DudmapError, match=f"in use by process {os.getpid()} "):
             RunLock(tmp_path)
-    assert not (tmp_path / NAME).exists()
+    assert not (tmp_path / LOCK).exists()
     RunLock(tmp_path).close()
 
 

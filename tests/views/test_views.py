@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from dudmap.app.views.background import BackgroundRenderer, continued, exposure_gain
 from dudmap.app.views.cleaning import clean_recording, unlike, with_shadow
-from dudmap.app.views.rendering import looking_at, orbit, render_run
-from dudmap.app.views.video import VideoWriter
+from dudmap.app.views.rendering import VideoWriter, looking_at, orbit, render_run
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera

@@ -70,7 +70,7 @@ class CommandGroup(TyperGroup):
         except Exception as error:  # a defect of ours, whatever it is
             if isinstance(error, ImportError) and "failed to map segment" in str(error):
                 fail(not_enough_memory(error))
-            from dudmap.app.pipeline.crash_report import report_crash
+            from dudmap.app.pipeline.observer import report_crash
 
             fail(str(report_crash(error, Path.cwd())))
         except KeyboardInterrupt as interrupt:

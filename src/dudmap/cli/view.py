@@ -45,8 +45,7 @@ def observers(
     An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
     until ctrl-C, unless nobody sits at the terminal.
     """
-    from dudmap.app.pipeline.crash_report import report_crash
-    from dudmap.app.pipeline.event_log import EventLog
+    from dudmap.app.pipeline.observer import EventLog, report_crash
 
     events = EventLog(log)
     with ExitStack() as stack:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.pipeline.focal_check import WRONG, focal_error
-from dudmap.app.pipeline.image_checks import image_warnings
+from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
 from dudmap.io.sequences.intrinsics import BY_NAME
 

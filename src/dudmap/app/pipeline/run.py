@@ -107,8 +107,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names what was
             saved.
     """
-    from dudmap.app.pipeline.calibration import calibrate_start
-    from dudmap.app.pipeline.calibration_report import ASSUMED
+    from dudmap.app.pipeline.calibration import ASSUMED, calibrate_start
 
     out = Path(out)
     if live and not isinstance(sequence, LiveCamera):

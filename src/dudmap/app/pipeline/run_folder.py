@@ -1,13 +1,17 @@
-"""The run folder: creation, cleaning and writing of all result files."""
+"""The run folder: its lock, creation, cleaning and writing of all result files."""
 
 import json
+import os
 import re
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +19,6 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
-from dudmap.app.state.run_lock import RunLock
 from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.core.geometry.mesh_pieces import save_pieces
@@ -23,13 +26,98 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import is_recording
-from dudmap.own_folder import make_folder, remove_files
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
 
 if TYPE_CHECKING:
     from dudmap.core.objects.object_map import RigidObject
     from dudmap.core.slam import Slam
     from dudmap.io.cameras import LiveCamera
     from dudmap.io.sequences import Sequence
+
+LOCK = ".lock"
+LOCKED_BYTE = 1 << 20
+"""Place of the locked byte on Windows, behind the text, which others must be able to read."""
+
+
+class RunLock:
+    """Holds the lock of a folder while it is open; the operating system gives it up when the process ends, however.
+
+    Args:
+        folder: The run folder, which exists.
+
+    Raises:
+        DudmapError: Another process, or another run of this one, holds the lock; the sentence says which.
+        OSError: The file cannot be written, or is a link or anything but a plain file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = OwnFolder(folder, linked=True)
+        try:
+            self._file = self._locked(folder)
+        except BaseException:
+            self._folder.close()
+            raise
+        about = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(" ", "seconds")}
+        self._file.truncate(0)
+        self._file.write(json.dumps(about).encode())
+        self._file.flush()
+
+    def _locked(self, folder: Path) -> IO[bytes]:
+        while True:
+            file = os.fdopen(self._folder.open(LOCK, os.O_RDWR | os.O_CREAT), "r+b")
+            try:
+                _lock(file)
+            except OSError:
+                holder = file.read(1000).decode(errors="replace")
+                file.close()
+                raise DudmapError(
+                    f"{folder} is in use by {_described(holder)}; wait for it, end it, or name another folder"
+                ) from None
+            there = self._folder.status(LOCK)
+            if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
+                return file
+            file.close()  # whoever held it has removed this file in between
+
+    def close(self) -> None:
+        """Give the lock up and remove its file."""
+        if os.name == "posix":
+            self._folder.remove(LOCK)
+        self._file.close()
+        self._folder.close()
+
+    def __enter__(self) -> "RunLock":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Lock a file for this process.
+
+    Raises:
+        OSError: It is locked.
+    """
+    if os.name == "nt":
+        import msvcrt
+
+        file.seek(LOCKED_BYTE)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+        file.seek(0)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _described(holder: str) -> str:
+    """Who holds a lock, from its file."""
+    try:
+        about = json.loads(holder)
+        return f"process {int(about['pid'])} on {about['host']} since {about['since']}"
+    except (ValueError, KeyError, TypeError):
+        return "another process"
+
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",

@@ -14,8 +14,14 @@ from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.state.checkpoints import Checkpoints
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
-from dudmap.app.state.system import check_code, restore
+from dudmap.app.state.system import (
+    check_code,
+    code_fingerprint,
+    frame_fingerprint,
+    images_fingerprint,
+    recording_fingerprint,
+    restore,
+)
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
 from dudmap.input_files import DAMAGE, read_json

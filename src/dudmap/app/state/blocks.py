@@ -1,4 +1,4 @@
-"""Blocks of the maps on their way into the database and back: only those that changed are copied and written."""
+"""Blocks of the maps and stored frames on their way into the database and back: only what changed is written."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
+from dudmap.core.places.frame_store import EncodedFrame, FrameStore
 from dudmap.errors import StateError
 
 LARGEST_TABLE = 2**26
@@ -234,3 +235,49 @@ def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, A
     window.near = index["near"]
     if not np.array_equal(np.sort(window.near), np.sort(inside[:count])):
         raise StateError("the stored map is damaged: the blocks around the camera are not those of the map")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSnapshot:
+    """What changed in a frame store since the last checkpoint.
+
+    Attributes:
+        number: Number of the store in the database.
+        frames: The frames that the database lacks, by serial: depth, colour and mask as files.
+        gone: Serials of those that it holds, and the store does not any more.
+        serials: Serials of all frames of the store.
+        store: The store.
+    """
+
+    number: int
+    frames: dict[int, EncodedFrame]
+    gone: list[int]
+    serials: set[int]
+    store: FrameStore
+
+
+class StoredFrames:
+    """Knows which frames are in the database."""
+
+    def __init__(self) -> None:
+        self._stores: list[tuple[FrameStore, set[int]]] = []  # the number is the place in the list
+
+    def snapshot(self, store: FrameStore) -> FrameSnapshot:
+        """The frames that the database lacks, and those that it no longer needs; waits until the former are encoded."""
+        number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
+        if number == len(self._stores):
+            self._stores.append((store, set()))
+        stored, serials = self._stores[number][1], set(store.serials)
+        frames = {serial: store.encoded(n) for n, serial in enumerate(store.serials) if serial not in stored}
+        return FrameSnapshot(number, frames, sorted(stored - serials), serials, store)
+
+    def commit(self, frames: list[FrameSnapshot]) -> None:
+        """What these snapshots hold is in the database."""
+        for changed in frames:
+            self._stores[changed.number] = changed.store, changed.serials
+
+    def add(self, store: FrameStore, number: int) -> None:
+        """The frames of a store come from the database."""
+        while len(self._stores) <= number:
+            self._stores.append((store, set()))
+        self._stores[number] = store, set(store.serials)

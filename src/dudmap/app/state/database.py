@@ -20,8 +20,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
-from dudmap.app.state.frames import FrameSnapshot, StoredFrames
+from dudmap.app.state.blocks import VOXELS, FrameSnapshot, MapSnapshot, StoredFrames, StoredMaps
 from dudmap.app.state.tree import Snapshot
 from dudmap.core.map.block_pager import Region
 from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of

@@ -27,8 +27,8 @@ from dudmap.errors import DatasetError, StateError
 from dudmap.input_files import DAMAGE
 
 if TYPE_CHECKING:
+    from dudmap.app.state.blocks import FrameSnapshot, StoredFrames
     from dudmap.app.state.database import StateDatabase, StateReader
-    from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 
 Node = Any
 """A tree of plain values, as JSON has them."""

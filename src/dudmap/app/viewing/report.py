@@ -1,8 +1,13 @@
 """The report of a run: one HTML page that needs neither network nor server."""
 
 import base64
+import gzip
+import hashlib
 import json
 import re
+import string
+from collections.abc import Iterable
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -10,16 +15,67 @@ from typing import Any
 import numpy as np
 
 from dudmap import __version__
-from dudmap.app.viewing.markup import Html, html, joined, script_source
-from dudmap.app.viewing.packed_mesh import packed
 from dudmap.app.viewing.plots import plots
 from dudmap.app.viewing.run_files import RunFiles
 from dudmap.app.viewing.thumbnails import Thumbnails
 from dudmap.atomic_file import write_text
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_simplification import simplified
 from dudmap.errors import DudmapError, printable
 from dudmap.input_files import damaged
+
+
+class Html(str):
+    """Text that is HTML already: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
+
+    __slots__ = ()
+
+
+class _Escaping(string.Formatter):
+    def format_field(self, value: object, format_spec: str) -> str:
+        return value if isinstance(value, Html) else escape(format(value, format_spec))
+
+
+def html(template: str, /, **values: object) -> Html:
+    """HTML of a template in the syntax of ``str.format``, whose values are escaped."""
+    return Html(_Escaping().vformat(template, (), values))
+
+
+def joined(parts: Iterable[object], between: str = "") -> Html:
+    """Parts one after the other; those that are no HTML are escaped."""
+    return Html(between.join(html("{part}", part=part) for part in parts))
+
+
+def script_source(script: str) -> str:
+    """Source in a content security policy that allows this script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+STEPS = 65535
+"""Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
+
+
+def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
+    """Description for the page, and the data as base64 text of a gzip stream.
+
+    The stream holds the positions, uint16 (V, 3), from the corner ``low`` (0) to ``high`` (65535) of the bounding box;
+    the colours, uint8 (V, 3); zeros up to a multiple of 4 bytes; and the faces, int32 (F, 3), each index as the
+    difference to the one before it, which compresses well. All little-endian.
+    """
+    low, high = mesh.vertices.min(axis=0).astype(float), mesh.vertices.max(axis=0).astype(float)
+    positions = np.rint((mesh.vertices - low) / np.maximum(high - low, 1e-9) * STEPS).astype("<u2")
+    steps = np.diff(mesh.faces.reshape(-1), prepend=0).astype("<i4")
+    head = positions.tobytes() + mesh.colors.tobytes()
+    data = gzip.compress(head + bytes(-len(head) % 4) + steps.tobytes(), compresslevel=6, mtime=0)
+    about = {
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh.faces),
+        "low": low.round(6).tolist(),
+        "high": high.round(6).tolist(),
+    }
+    return about, base64.b64encode(data).decode("ascii")
+
 
 REPORT = "report.html"
 TRIANGLES = 200_000
