@@ -74,16 +74,10 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
 
 
 def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
-    """Fuse a range, write its map file and the tiles of its cells.
+    """Fuse a range, write its map file and the tiles of its cells, and for the tiles' parents their meshes into
+    ``work``.
 
-    Args:
-        like: Parameters of the result.
-        out: Folder of the world.
-        work: Folder of files that are needed until the merge ends.
-        cells: The range.
-
-    Returns:
-        The entry of the range in world.json, and the tiles.
+    The parameters of the result are those of ``like``. Returns the entry of the range in world.json, and the tiles.
     """
     empty_map = like.volume()
     low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS

@@ -46,11 +46,7 @@ class MapHeader:
 
     @classmethod
     def read(cls, path: Path, *, blocks: bool = True) -> "MapHeader":
-        """Read a map file, whose voxels are not decompressed.
-
-        Args:
-            path: The map file.
-            blocks: Also read which blocks there are.
+        """Read a map file, whose voxels are not decompressed, with or without which ``blocks`` there are.
 
         Raises:
             MapError: The file is damaged or not a map of this version.
@@ -71,10 +67,7 @@ class MapHeader:
 
 
 def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
-    """Check run folders that are to be merged, without reading their voxels.
-
-    Returns:
-        Parameters of the first map.
+    """Check run folders that are to be merged, without reading their voxels; returns the parameters of the first map.
 
     Raises:
         ConfigError: There are too few or too many runs, one is named twice, or their voxels differ in size.

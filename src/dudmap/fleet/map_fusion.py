@@ -118,14 +118,11 @@ class BlockSums:
 def block_sums(
     volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None, sdf_unit: float
 ) -> BlockSums:
-    """Content of one map at blocks of a grid with voxels of the same size.
+    """Content of one map at blocks (n, 3) of a grid with voxels of the same size, distances in steps of ``sdf_unit``
+    metres.
 
-    Args:
-        volume: The map.
-        coords: (n, 3) blocks of the grid.
-        T_volume_grid: (4, 4) world of the grid to that of the map; the content is interpolated trilinearly. None: the
-            grid is that of the map, whose words are taken as they are.
-        sdf_unit: Metres per step of the distances of the sums.
+    ``T_volume_grid`` (4, 4) brings the world of the grid to that of the map, whose content is interpolated trilinearly;
+    None if the grid is that of the map, whose words are taken as they are.
     """
     if T_volume_grid is None:
         return _exact_sums(volume, coords)
@@ -211,15 +208,10 @@ def _sums(
 def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
     """Divide the sums once.
 
-    Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps`` with the
-    weight ``carve_rate`` per observation, so that what stood in one run and was gone in the others leaves the map. A
-    block that is then empty everywhere loses its voxels.
-
-    Args:
-        sums: Of all maps.
-        free_steps: Truncation distance in steps.
-        carve_rate: Weight of an observation of emptiness.
-        free_after: Observations of emptiness from which a block is free space.
+    Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps``, the
+    truncation distance in steps, with the weight ``carve_rate`` per observation, so that what stood in one run and was
+    gone in the others leaves the map. A block that is then empty everywhere, by ``free_after`` observations, loses its
+    voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
     emptiness = (carve_rate * sums.free * held)[:, None]
@@ -297,12 +289,10 @@ class ReachedBlocks:
 
 
 class RangeFusion:
-    """Sums over maps in some blocks; any order of the maps gives the same result.
+    """Sums over maps in some blocks, by Morton codes; any order of the maps gives the same result.
 
-    Args:
-        near: (n,) Morton codes of blocks that voxels of at least one map reach into.
-        empty: (m,) those of other blocks that are empty in at least one map.
-        like: Map whose camera and parameters the result has.
+    Voxels of at least one map reach into the blocks ``near`` (n,); the other blocks ``empty`` (m,) are empty in at
+    least one. The result has camera and parameters of the map ``like``.
     """
 
     def __init__(self, near: NDArray[np.int64], empty: NDArray[np.int64], like: TsdfVolume) -> None:
@@ -334,14 +324,11 @@ class RangeFusion:
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """One map of several, on the grid of the first.
+    """One map of several with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the
+    first.
 
     A map whose pose is the identity enters voxel by voxel, others by trilinear interpolation. The sums are exact: on
     the same grid any order gives the same voxels.
-
-    Args:
-        volumes: The maps, with voxels of one size; the result has the camera and the parameters of the first.
-        Ts_world_volume: Pose (4, 4) of each in the world of the result.
     """
     reached = [ReachedBlocks.of_volume(*one) for one in zip(volumes, Ts_world_volume, strict=True)]
     near = np.unique(np.concatenate([one.near for one in reached]))

@@ -87,10 +87,7 @@ class SurfacePoints:
 def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int) -> SurfacePoints:
     """At most ``count`` random vertices of the mesh of a map, which lie about evenly on its surface.
 
-    Args:
-        volume: The map.
-        cameras: (k, 3) positions of its keyframes, metres.
-        count: Largest number of points.
+    ``cameras`` (k, 3) are the positions of its keyframes, metres.
 
     Raises:
         MapError: The map is empty.

@@ -214,11 +214,7 @@ def _write_world(
 
 
 def _check_out(out: Path) -> None:
-    """Remove the world that a folder holds.
-
-    Raises:
-        DudmapError: It holds anything else, or cannot be written.
-    """
+    """Remove the world that a folder holds; a ``DudmapError`` if it holds anything else, or cannot be written."""
     try:
         if out.exists() and any(out.iterdir()):
             if not (out / WORLD_FILE).is_file():

@@ -59,12 +59,10 @@ def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDAr
 
 
 def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """How similar the places of each two runs are (n, n), symmetric, 0 on the diagonal.
+    """How similar the places of each two runs are (n, n), symmetric, 0 on the diagonal, from descriptors (k, d) of
+    each.
 
     Every keyframe votes for the runs with the most similar keyframes, as far as they exceed the last of these runs.
-
-    Args:
-        runs: Descriptors (k, d) of the keyframes of each run.
     """
     everything = _whitened(np.concatenate(runs))
     sizes = np.array([len(run) for run in runs], np.int64)

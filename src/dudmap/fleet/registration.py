@@ -65,13 +65,9 @@ def register_pairs(
     workers: Workers,
     guesses: Mapping[tuple[int, int], NDArray[np.float64]],
 ) -> list[RegisteredPair]:
-    """Relative pose of each pair of runs, or why they are not to be joined.
+    """Relative pose of each pair (a, b) of runs, or why they are not to be joined.
 
-    Args:
-        runs: All run folders.
-        pairs: Pairs (a, b) of them.
-        workers: Who compares them.
-        guesses: Relative poses ``T_a_b`` (4, 4) of some pairs, which are tried before those of the features.
+    ``guesses`` are relative poses ``T_a_b`` (4, 4) of some pairs, which are tried before those of the features.
     """
     groups: dict[int, list[int]] = {}
     for a, b in pairs:

@@ -40,16 +40,11 @@ def relative_poses(
     camera: Camera,
     sensor: SensorConfig,
 ) -> list[Hypothesis]:
-    """Relative poses of two maps, those with more agreeing features first; empty if no place of b is known in a.
+    """Relative poses of two maps from their keyframes, best first; empty if no place of b is known in a.
 
-    Each keyframe of b is recognised among those of a (``KeyframeDatabase.match``). Every recognition is a vote for
-    ``T_a_b``; votes that agree where the camera stood are averaged with the numbers of their features as weights.
-
-    Args:
-        a: Keyframes of one map.
-        b: Keyframes of the other.
-        camera: Camera of a.
-        sensor: Noise of the depth readings.
+    Each keyframe of b is recognised among those of a (``KeyframeDatabase.match``), which were seen by ``camera``. Every
+    recognition is a vote for ``T_a_b``; votes that agree where the camera stood are averaged with the numbers of their
+    features as weights. Poses with more agreeing features come first.
     """
     database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []

@@ -23,14 +23,11 @@ Pair = tuple[int, int]
 
 
 def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
-    """Edges that separate at least as many pairs as they are; of all minimum cuts the one with most pairs per edge.
+    """Edges that separate at least as many pairs ``apart`` as they are; of all minimum cuts the one with most pairs per
+    edge.
 
     The minimum cut between two nodes is found by a maximum flow with one unit per edge (Ford and Fulkerson 1956), the
-    cut nearest to each of the two. Empty if there is none.
-
-    Args:
-        edges: Pairs of nodes, each at most once.
-        apart: Pairs of nodes that should not be connected.
+    cut nearest to each of the two. No edge stands twice in ``edges``. Empty if there is none.
     """
     if not edges or not apart:
         return set()
@@ -145,12 +142,8 @@ class RunGraph:
 
 
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
-    """Poses of ``count`` runs.
-
-    Args:
-        count: Number of runs.
-        joins: Relative poses of pairs of them.
-        denied: Pairs of runs that disagree where these joins put them (``supported``).
+    """Poses of ``count`` runs from relative poses of pairs; ``denied`` pairs disagree where these put them
+    (``supported``).
 
     Raises:
         MissingExtraError: GTSAM is not installed.

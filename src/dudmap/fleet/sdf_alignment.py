@@ -56,13 +56,9 @@ def align_maps(
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
-    Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a scale ``c`` that shrinks from step to step (as in
-    graduated non-convexity, Yang et al. 2020), intensities Huber weights.
-
-    Args:
-        a, b: The maps.
-        of_a, of_b: Points on their surfaces.
-        T_a_b: Initial pose, closer than the truncation distance.
+    It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
+    scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities Huber
+    weights.
     """
     exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
     center, scale = np.zeros(3), a.truncation

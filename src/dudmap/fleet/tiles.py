@@ -61,11 +61,8 @@ def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, childr
 
 
 def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path, workers: Workers) -> Tile:
-    """Write all inner tiles above some leaves, whose names are the hexadecimal codes of their cells, level by level.
-
-    Returns:
-        The root.
-    """
+    """Write all inner tiles above some leaves, whose names are the hexadecimal codes of their cells; returns the
+    root."""
     done = {leaf.name: leaf for leaf in leaves}
     inner = _inner_nodes(sorted(int(leaf.name, 16) for leaf in leaves))
     for height in sorted({height for height, _, _ in inner}):
@@ -108,9 +105,8 @@ def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:
 
 
 def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
-    """Inner nodes of the octree above cells, as height, name and names of the children; children come first.
-
-    A node with a single child is left out.
+    """Inner nodes of the octree above cells, as height, name and names of the children; children come first. A node
+    with a single child is left out.
     """
     out: list[tuple[int, str, list[str]]] = []
 

@@ -19,12 +19,8 @@ Result = TypeVar("Result")
 class Workers:
     """Processes with one thread each; a single one is this process.
 
-    Args:
-        count: Number of processes.
-
-    Attributes:
-        peak_rss_mb: Peak memory of each process so far, by its id; empty on Windows.
-        cpu_s: Processor time of all jobs.
+    ``peak_rss_mb`` is the peak memory of each so far, by its id, empty on Windows; ``cpu_s`` the processor time of all
+    jobs.
     """
 
     def __init__(self, count: int) -> None:

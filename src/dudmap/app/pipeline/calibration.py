@@ -114,22 +114,17 @@ VOXEL_SIZE = 0.02
 def calibrate_start(
     sequence: "Sequence",
     config: Config,
-    max_frames: int | None = None,
-    notice: "Callable[[str], None]" = lambda text: None,
-    progress: "Callable[[int, int], None]" = lambda done, total: None,
+    max_frames: int,
+    notice: "Callable[[str], None]",
+    progress: "Callable[[int, int], None]",
 ) -> Calibration | None:
-    """Calibration estimated from the start of a recording; None where none was made.
+    """Calibration estimated from the first frames of a recording; None where none was made, with the reason as a
+    notice.
 
-    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated.
-
-    Args:
-        sequence: The recording.
-        config: All parameters.
-        max_frames: Number of frames that will be processed; None for all.
-        notice: Receives sentences on what is being done, what was found, and what is assumed.
-        progress: Receives the number of frames tracked for it, and of all that will be.
+    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated. ``notice`` receives
+    sentences on what is done and found, ``progress`` the numbers of frames tracked and of all.
     """
-    count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
+    count = min(len(sequence), START_FRAMES, max_frames)
     if config.preset == "thesis" or count < MIN_FRAMES:
         thesis, short = "preset thesis takes the images as they are", f"that takes {MIN_FRAMES} frames"
         notice(f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else short}")
@@ -156,15 +151,8 @@ def calibrate_sequence(
 ) -> Estimate:
     """Track a recording quickly with the calibration as given, and estimate a better one.
 
-    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do.
-
-    Args:
-        sequence: The recording.
-        config: All parameters.
-        given: The calibration to start from.
-        max_frames: Use only so many frames.
-        notice: Receives a sentence on what is being done.
-        progress: Receives the number of frames tracked so far, and of all that will be.
+    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do. For
+    ``notice`` and ``progress`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -211,13 +199,8 @@ def _quick(config: Config, halvings: int) -> Config:
 
 
 class _Excerpt:
-    """Frames of a recording around its keyframes, at an ``INTERVAL``, with images halved some times by 2x2 blocks.
-
-    Attributes:
-        camera: Of its depth images.
-        calibration: Of its colour images.
-        interval: Usual time between neighbours, seconds.
-    """
+    """Frames of a recording around its keyframes, at an ``INTERVAL`` (usually ``interval`` seconds), with images halved
+    some times by 2x2 blocks."""
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL

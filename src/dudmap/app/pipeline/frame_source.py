@@ -135,12 +135,8 @@ def arriving(
     """Frames of a camera, taken and prepared by a thread of their own; those for which the consumer leaves no room
     (``FrameQueue``) are dropped and counted in the next one. The camera is closed at the end.
 
-    Args:
-        camera: The camera.
-        slam: Prepares the frames.
-        masks: External dynamic masks.
-        recorder: Receives all frames, dropped or not.
-        idle: Called while no frame waits; does a few milliseconds of other work and returns True, or has none.
+    The ``recorder`` receives all frames, dropped or not. ``idle`` is called while no frame waits: it does a few
+    milliseconds of other work and returns True, or has none.
 
     Raises:
         CameraError: The camera stopped to deliver frames.

@@ -183,9 +183,8 @@ def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> 
 
 def _planes(frames: "list[Frame]") -> tuple[NDArray[np.float64], float] | None:
     """Distances (N, 5) of the plane of every depth image, metres, in its middle and corners, and the standard deviation
-    of the readings about it; None if an image shows something else.
-
-    In the image of a plane the inverse distance is linear in the pixel's row and column.
+    of the readings about it; None if an image shows something else. In the image of a plane the inverse distance is
+    linear in row and column.
     """
     distances, sigmas = [], []
     places = np.array([[0, 0, 1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, 1]], np.float64)

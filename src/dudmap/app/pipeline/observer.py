@@ -120,13 +120,7 @@ class EventLog(RunObserver):
 
 
 def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, Any]] = ()) -> InternalError:
-    """Write ``crash-<date>.txt`` and return the error that says so in one sentence.
-
-    Args:
-        error: What was raised.
-        folder: Where to write it.
-        events: The last events of the run, as ``EventLog`` keeps them.
-    """
+    """Write ``crash-<date>.txt`` into a folder, with the last events of the run, and return the error that says so."""
     path = folder / f"crash-{time.strftime('%Y%m%d-%H%M%S')}.txt"
     what = f"{type(error).__name__}: {error}"
     try:

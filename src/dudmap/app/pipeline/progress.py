@@ -40,13 +40,10 @@ NOT_FUSED = {
 
 
 class RunProgress:
-    """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
+    """Progress bar on stderr, if that is a terminal, with frame number, frames per second, dynamic share and state.
 
-    Losses of tracking and unreadable frames are reported, once per gap, even without the bar.
-
-    Args:
-        total: Number of frames, None if it is not known.
-        bar: Show the bar if stderr is a terminal.
+    Losses of tracking and unreadable frames are reported, once per gap, even without the bar. The ``total`` is None if
+    it is not known.
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:

@@ -93,11 +93,7 @@ class RunLock:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Lock a file for this process.
-
-    Raises:
-        OSError: It is locked.
-    """
+    """Lock a file for this process; an ``OSError`` if it is locked."""
     if os.name == "nt":
         import msvcrt
 
@@ -180,11 +176,7 @@ def locked(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _writing_into(out: Path) -> Iterator[None]:
-    """Say that it is the run folder that cannot be written.
-
-    Raises:
-        DudmapError: Instead of any error of the operating system.
-    """
+    """Turn any error of the operating system into one that says that the run folder cannot be written."""
     try:
         yield
     except OSError as error:

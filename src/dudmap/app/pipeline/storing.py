@@ -131,11 +131,7 @@ class RunStore:
         self._out, self._every, self._notice = out, every, notice
 
     def order(self, sequence: "Sequence", options: RunOptions) -> None:
-        """Store what the run is, before anything that takes time.
-
-        Raises:
-            DudmapError: It cannot be written.
-        """
+        """Store what the run is, before anything that takes time."""
         about = {"options": options.model_dump(mode="json"), "recording": recording_fingerprint(sequence)}
         about |= {"code": code_fingerprint(), "versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
         try:
@@ -199,11 +195,7 @@ def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
 
 
 def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
-    """Check that a recording is the one that a stored run is of.
-
-    Raises:
-        StateError: It is not.
-    """
+    """Refuse a recording that is not the one that a stored run is of."""
     same = recording_fingerprint(sequence) == stored.recording
     if not same or (stored.frame and frame_fingerprint(sequence, stored.next - 1) != stored.frame):
         raise StateError(
@@ -213,12 +205,7 @@ def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
 
 
 def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") -> RunState:
-    """Where a stored run stands.
-
-    Args:
-        reader: Its database.
-        store: Goes on storing there.
-        slam, other: New systems of the same camera and configuration, one for each pass.
+    """Where a stored run stands, made of two new systems of the same camera and configuration, one for each pass.
 
     Raises:
         StateError: The database is damaged.

@@ -141,13 +141,8 @@ def restore_map(
     voxels: NDArray[np.int32],
     read_region: Callable[[Region], BlockRecords],
 ) -> None:
-    """Fill a map, whose other attributes are set.
-
-    Args:
-        volume: The map.
-        index: Its part of the tree.
-        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) of all its rows in the database, by slot.
-        read_region: Reads a region from there that has left the memory.
+    """Fill a map, whose other attributes are set, from its index and all its rows in the database, by slot: slots (n,),
+    coordinates (n, 3) and voxels (n, VOXELS). ``read_region`` reads a region that has left the memory.
 
     Raises:
         StateError: The rows do not fit the index.
@@ -169,11 +164,7 @@ def restore_map(
 
 
 def _check_index(index: dict[str, Any]) -> NDArray[np.int64]:
-    """Check that the parts of an index fit each other; slots (n,) that own voxels.
-
-    Raises:
-        StateError: They do not.
-    """
+    """Slots (n,) that own voxels; a ``StateError`` if the parts of an index do not fit each other."""
     n, m = len(index["coords"]), len(index["entry_of"])
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
     owned = np.flatnonzero(index["entry_of"] >= 0)
@@ -204,11 +195,7 @@ def _restore_blocks(blocks: VoxelBlocks, index: dict[str, Any], *, paged: bool) 
 
 
 def _restore_levels(volume: TsdfVolume, indices: list[dict[str, Any]]) -> None:
-    """Fill the finer levels of a map whose coarsest one is complete.
-
-    Raises:
-        StateError: A level does not fit its index or the next coarser one.
-    """
+    """Fill the finer levels of a map whose coarsest one is complete; a ``StateError`` if one does not fit."""
     parents = volume.blocks
     for level, index in zip(volume.levels, indices, strict=True):
         _check_index(index)

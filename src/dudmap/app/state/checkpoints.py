@@ -69,12 +69,10 @@ class Checkpoints:
         self._files.append(path)
 
     def take(self, state: object, meta: dict[str, Any], *, wait: bool = False) -> None:
-        """Take a snapshot and have it written; without effect while something is computed in the background.
+        """Take a snapshot of a state and have it written, with values that describe the run.
 
-        Args:
-            state: What is stored.
-            meta: Values that describe the run.
-            wait: Wait for what is computed in the background, and until the snapshot is written.
+        It has no effect while something is computed in the background; ``wait`` waits for that, and until it is
+        written.
         """
         if wait and self._running is not None:
             self._running.exception()  # waits

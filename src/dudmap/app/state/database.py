@@ -336,11 +336,7 @@ def _own_tables() -> list[tuple[str, ...]]:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a file that is much larger than what of it is on the disk.
-
-    Raises:
-        StateError: It is.
-    """
+    """Refuse a file that is much larger than what of it is on the disk."""
     status = path.stat()
     stored = 512 * getattr(status, "st_blocks", status.st_size)
     if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):

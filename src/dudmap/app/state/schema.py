@@ -111,11 +111,7 @@ def name_of(cls: type) -> str:
 
 
 def class_of(name: object) -> type:
-    """The class of a name.
-
-    Raises:
-        ValueError: It is none whose objects are stored.
-    """
+    """The class of a name; a ``ValueError`` if it is none whose objects are stored."""
     module = _table().get(name) if isinstance(name, str) else None
     if module is None:
         raise ValueError(f"found a {name!r}, which this version does not know")
@@ -165,12 +161,7 @@ def _hints(cls: type) -> Mapping[str, Any]:
 
 
 def check_attributes(cls: type, content: object, like: Mapping[str, Any]) -> None:
-    """Check the names of the attributes of an object.
-
-    Args:
-        cls: Its class.
-        content: Its attributes as stored.
-        like: Those of a new object, if there is one.
+    """Check that an object of a class has the attributes that it needs, and no others; ``like`` are those of a new one.
 
     Raises:
         ValueError: There is one too many, or one is missing.

@@ -68,12 +68,9 @@ def images_fingerprint(frame: "Frame | Exception") -> str:
 
 
 def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) -> Snapshot:
-    """The state of a value, without what the database holds already.
+    """The state of a value, such as a system, without what the database, in which it will be written, holds already.
 
-    Args:
-        value: A system, or a dictionary that holds one.
-        database: Where it will be written.
-        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
+    Without ``wait`` it raises ``NotSettledError`` while something is computed in the background.
 
     Raises:
         StateError: There is something that cannot be stored.
@@ -82,13 +79,10 @@ def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) 
 
 
 def restore(reader: StateReader, current: object, database: StateDatabase | None = None, device: str = "cpu") -> Any:  # noqa: ANN401
-    """The value that was stored last.
+    """The value that was stored last, made of the objects of a new one of the same kind (``TreeReader.restore``).
 
-    Args:
-        reader: The database, which stays open as long as the system lives: it reads stored frames when it needs them.
-        current: A new value of the same kind; see ``TreeReader.restore``.
-        database: Takes note of what it holds already, where the run goes on in the same database.
-        device: Device of the maps that ``current`` lacks.
+    The reader stays open as long as the system lives: it reads stored frames when it needs them. Where the run goes on
+    in the same database, that takes note of what it holds. ``device`` is that of the maps that ``current`` lacks.
 
     Raises:
         StateError: The database is damaged or of another version, or holds no state yet.
@@ -150,11 +144,7 @@ def on_device(config: Config, device: str | None) -> Config:
 
 
 def check_code(meta: dict[str, Any], path: Path) -> None:
-    """Check that a state was written by this version.
-
-    Raises:
-        StateError: It was not.
-    """
+    """Refuse a state that was written by another version."""
     if meta.get("code") != code_fingerprint():
         raise StateError(
             f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "

@@ -61,12 +61,8 @@ class NotSettledError(Exception):
 
 
 class TreeWriter:
-    """Takes a snapshot.
-
-    Args:
-        maps, frames: Know what of the maps and of the stored frames is in the database already.
-        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
-    """
+    """Takes a snapshot, without what ``maps`` and ``frames`` know to be in the database; for ``wait`` see
+    ``take_snapshot``."""
 
     def __init__(self, maps: StoredMaps, frames: "StoredFrames", *, wait: bool) -> None:
         self.snapshot = Snapshot()
@@ -74,12 +70,7 @@ class TreeWriter:
         self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
 
     def take(self, value: object) -> Snapshot:
-        """The snapshot of a value and everything that it refers to.
-
-        Raises:
-            StateError: There is something that cannot be stored.
-            NotSettledError: See ``wait``.
-        """
+        """The snapshot of a value and everything that it refers to."""
         self.snapshot.tree = self._node(value, "state")
         return self.snapshot
 
@@ -177,16 +168,7 @@ class TreeWriter:
 
 
 class TreeReader:
-    """Gives a system the state that a database holds.
-
-    Args:
-        reader: The database.
-        database: Takes note of what it holds already, where the run goes on in the same database.
-        device: Device of the back ends that are made where the given system has none in that place.
-
-    Raises:
-        StateError: The database is damaged, or holds no state yet.
-    """
+    """Gives a system the state that a database holds; for the arguments see ``system.restore``."""
 
     def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None, device: str = "cpu") -> None:
         self._reader, self._database, self._device = reader, database, device
@@ -202,8 +184,7 @@ class TreeReader:
     def restore(self, current: object) -> Any:  # noqa: ANN401
         """The value that was stored last.
 
-        Args:
-            current: A new value of the same kind, whose objects are used, so that they stay connected.
+        The objects of ``current``, a new value of the same kind, are used, so that they stay connected.
 
         Raises:
             StateError: The state is damaged or of another version.

@@ -39,9 +39,6 @@ class MeshFeed:
     Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
     the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh
     from the copy.
-
-    Args:
-        budget_ms: Mean time per frame, milliseconds.
     """
 
     def __init__(self, budget_ms: float = BUDGET_MS) -> None:

@@ -99,14 +99,10 @@ CARDS = {
 
 
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a run folder and return its path.
+    """Write the report of a run folder, by default report.html in it, and return its path.
 
     The page holds the mesh (at most ``TRIANGLES``, the full one stays in mesh.ply) with trajectory, camera and moving
     objects in 3D, the thumbnails, plots, all figures, the configuration, and what was lost and why.
-
-    Args:
-        folder: The run folder.
-        out: The HTML file; None for report.html in the run folder.
 
     Raises:
         DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.

@@ -168,16 +168,11 @@ def save_sheet(
     T_world_camera: NDArray[np.float64],
     true_mask: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the same pose.
+    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the pose of the frame (4,
+    4).
 
-    Args:
-        path: The PNG file.
-        frame: The unprocessed frame.
-        dynamic_mask: (H, W) estimated dynamic mask.
-        residuals: (h, w) signed distance of the readings to the map in metres, NaN where there is none.
-        view: The map rendered from the pose of the frame.
-        T_world_camera: (4, 4) pose of the frame.
-        true_mask: (H, W) true dynamic mask, drawn as an outline.
+    The residuals (h, w) are signed distances in metres, NaN where there is none; a true mask (H, W) is drawn as an
+    outline.
 
     Raises:
         DudmapError: The file cannot be written.
@@ -202,11 +197,7 @@ def save_sheet(
 
 
 def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
-    """Write a PNG file with colour and depth of frames of a recording, one frame a column, six in a row.
-
-    Args:
-        path: The PNG file.
-        frames: Numbers and frames, at least one.
+    """Write a PNG file with colour and depth of numbered frames of a recording, one frame a column, six in a row.
 
     Raises:
         DudmapError: There is no frame, or the file cannot be written.

@@ -286,12 +286,8 @@ def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known wh
 def first_hit(
     origin: NDArray[np.float64], direction: NDArray[np.float64], meshes: Iterable[Mesh]
 ) -> NDArray[np.float64] | None:
-    """Nearest intersection (3,) of a ray with the triangles of some meshes, None if it meets none.
-
-    Args:
-        origin: (3,) metres, frame of the meshes.
-        direction: (3,) of any length.
-        meshes: Those whose bounding box the ray misses cost next to nothing.
+    """Nearest intersection (3,) of a ray with the triangles of some meshes, None if it meets none; those whose bounding
+    box it misses cost next to nothing.
     """
     distances = [distance for mesh in meshes if (distance := _distance(origin, direction, mesh)) is not None]
     return origin + min(distances) * direction if distances else None

@@ -21,15 +21,10 @@ CODECS = {".mp4": "vp09", ".avi": "XVID"}
 
 
 class VideoWriter:
-    """Writes a video, frame by frame; to be used with ``with``.
-
-    Args:
-        path: File whose ending names the format.
-        size: Width and height, pixels.
-        fps: Frames per second.
+    """Writes a video, frame by frame, of a size (width, height); to be used with ``with``.
 
     Raises:
-        ConfigError: The ending is unknown, or this OpenCV cannot write the format.
+        ConfigError: The ending of the path is unknown, or this OpenCV cannot write the format.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
@@ -72,13 +67,7 @@ def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: in
     """Trajectory on an arc about the middle of what the cameras looked at, at their mean distance and height.
 
     The arc lies about the mean place of the cameras, ``sweep_deg`` wide, there and back; from 360 on it is a circle.
-
-    Args:
-        run: The run.
-        up: (3,) unit vector against gravity.
-        sweep_deg: Width of the arc, degrees.
-        frames: Number of poses.
-        fps: Poses per second.
+    ``up`` (3,) is a unit vector against gravity.
     """
     middle = np.median(run.surface.vertices.astype(np.float64), axis=0)
     arm = run.trajectory.Ts_world_camera[:, :3, 3].mean(axis=0) - middle
@@ -124,16 +113,9 @@ def render_run(
     """Write the map as a camera on a trajectory sees it; returns the number of frames.
 
     A file name ending with .png gives one picture, of the first pose, and one with another known ending a video. A name
-    without an ending is a folder, which receives a recording in TUM layout:
-    rgb/, depth/ and their lists, intrinsics.txt and groundtruth.txt.
-
-    Args:
-        run: The run.
-        trajectory: Poses in the world of the run.
-        out: Picture, video or folder.
-        size: Width and height, pixels; None for those of the recording.
-        fps: Of a video.
-        progress: Called with the number of finished frames and of all.
+    without an ending is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists,
+    intrinsics.txt and groundtruth.txt. ``size`` is width and height in pixels, None for those of the recording; ``fps``
+    that of a video. ``progress`` receives the numbers of finished frames and of all.
 
     Raises:
         ConfigError: The ending is unknown.

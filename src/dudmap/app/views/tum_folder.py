@@ -11,13 +11,7 @@ from dudmap.core.geometry.camera import Camera
 
 
 class TumFolder:
-    """Writes a folder of PNG files for every kind of image, and a list of each.
-
-    Args:
-        out: The folder; created if needed.
-        title: First line of the lists.
-        kinds: Names of the folders of images.
-    """
+    """Writes a folder of PNG files for every kind of image, and a list of each whose first line is a title."""
 
     def __init__(self, out: Path, title: str, kinds: Iterable[str]) -> None:
         self._out, self._title = out, title
