@@ -358,3 +358,4 @@ def test_help_of_run_is_grouped():
     groups = re.findall(r"^╭─ (.*?) ─", text, flags=re.MULTILINE)
     assert groups[2:] == ["Input", "Output", "Map", "Calibration", "Live and viewing", "Advanced"]
     assert groups[:2] == ["Arguments", "Options"]  # the latter holds --help alone
+    assert "timings.csv and report.html into the run folder" in text  # wrapped as the terminal is wide

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.app.pipeline.run_folder import locked, prepare_run_folder
-from dudmap.atomic_file import atomic_file, write_bytes, write_text
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
@@ -176,11 +176,11 @@ def merge_fleet(
             if number == 1:
                 tree = world
             else:
-                _write_json(folder / WORLD_FILE, world)
+                write_text(folder / WORLD_FILE, json.dumps(world, indent=1) + "\n")
         times["total_s"] = round(time.perf_counter() - started, 2)
         tree |= {"compared_pairs": len(pairs), "workers": workers, "cpu_s": round(crew.cpu_s, 1)} | times
         tree["peak_rss_mb"] = sorted(crew.peak_rss_mb.values(), reverse=True)
-        _write_json(out / WORLD_FILE, tree)
+        write_text(out / WORLD_FILE, json.dumps(tree, indent=1) + "\n")
     return FleetReport(out, tree, pairs, graph, _sentences(graph, folders))
 
 
@@ -266,8 +266,3 @@ def _sentences(graph: RunGraph, folders: Sequence[Path]) -> list[str]:
         names = ", ".join(f"{folders[join.a].name} and {folders[join.b].name}" for join in graph.rejected)
         out.append(f"{len(graph.rejected)} relative pose(s) contradict others and are not used: {names}")
     return out
-
-
-def _write_json(path: Path, tree: dict[str, Any]) -> None:
-    with atomic_file(path) as file:
-        file.write((json.dumps(tree, indent=1) + "\n").encode())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.geometry.mesh_simplification import clustered
 from dudmap.fleet.workers import Workers
@@ -23,9 +23,8 @@ from dudmap.io.exporting.gltf import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn: a tile then has the axes of the map."""
-T_ZUP_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""The map has the axes of the first camera, x to the right and y down; the tileset is z up."""
+"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn: a tile then has the axes of the map, x to
+the right and y down. The tileset, which is z up, is turned by the same matrix."""
 BITS_PER_LEVEL = 3
 
 
@@ -51,8 +50,7 @@ class Tile:
 
 def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
     """Write the GLB file of a tile, and its mesh for its parent."""
-    with atomic_file(out / TILE_FOLDER / f"{name}.glb") as file:
-        file.write(encoded(mesh, T_GLTF_MAP))
+    write_bytes(out / TILE_FOLDER / f"{name}.glb", encoded(mesh, T_GLTF_MAP))
     mesh.save(work / f"{name}.ply")
     low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     for child in children:  # joined vertices are means and lie inside, but for rounding
@@ -84,11 +82,10 @@ def error_of(height: int, voxel_size: float) -> float:
 def write_tileset(root: Tile, voxel_size: float, out: Path) -> None:
     """Write tileset.json."""
     top = _tile_tree(root, voxel_size)
-    top["transform"] = T_ZUP_MAP.T.reshape(-1).tolist()
+    top["transform"] = T_GLTF_MAP.T.reshape(-1).tolist()
     whole = max(float(np.linalg.norm(root.high - root.low)), 2 * top["geometricError"])
     tree = {"asset": {"version": "1.1", "generator": "dudmap"}, "geometricError": whole, "root": top}
-    with atomic_file(out / TILESET_FILE) as file:
-        file.write((json.dumps(tree, indent=1) + "\n").encode())
+    write_text(out / TILESET_FILE, json.dumps(tree, indent=1) + "\n")
 
 
 def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 from rich.text import Text
 
-from dudmap.app.kernel_cache import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING, compiled_kernels
 from dudmap.app.terminal import plain_console
 
 if TYPE_CHECKING:

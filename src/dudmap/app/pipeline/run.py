@@ -162,7 +162,7 @@ def run(
         slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
         state = RunState(slam, figures, calibration)
         if store is not None:
-            store.begin(state)
+            store.take(state, wait=True)
         return job.carry_out(state, store)
 
 
