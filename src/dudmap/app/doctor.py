@@ -18,6 +18,16 @@ from dudmap.extras import install
 COMPILING = "compiling the kernels (once, about a minute; dudmap warmup does it in advance)"
 """What is said before a first frame where none is compiled."""
 
+PYTHON = ((3, 11), (3, 14))
+"""First version of Python that is supported, and the first that is not."""
+PORT = 8080
+"""Port of the page of --view."""
+FEATURES = ("avx2", "fma")
+"""What processors of Intel and AMD have had since 2013, and the kernels profit from."""
+FREE_BYTES = 2**31
+"""Space below which a folder counts as nearly full: a map and the results of a long run."""
+State = Literal["good", "note", "bad"]
+
 
 def kernel_cache() -> Path:
     """Folder in which Numba keeps the compiled kernels, as far as it can be known without compiling."""
@@ -28,17 +38,6 @@ def kernel_cache() -> Path:
 def compiled_kernels() -> int:
     """Number of kernels in the cache; 0 where there is no cache yet."""
     return sum(1 for _ in kernel_cache().rglob("*.nbi"))
-
-
-PYTHON = ((3, 11), (3, 14))
-"""First version of Python that is supported, and the first that is not."""
-PORT = 8080
-"""Port of the page of --view."""
-FEATURES = ("avx2", "fma")
-"""What processors of Intel and AMD have had since 2013, and the kernels profit from."""
-FREE_BYTES = 2**31
-"""Space below which a folder counts as nearly full: a map and the results of a long run."""
-State = Literal["good", "note", "bad"]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.inputs import MapHeader, open_map, reached_blocks
-from dudmap.fleet.map_fusion import FusedRange, RangeFusion, ReachedBlocks
+from dudmap.fleet.map_fusion import FusedRange, ReachedBlocks, fused_blocks
 from dudmap.fleet.tiles import Tile, write_tile
 from dudmap.fleet.workers import Workers
 
@@ -87,13 +87,14 @@ def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tupl
     empty = np.setdiff1d(_union([one.empty for one in inside]), near)
     touching = np.setdiff1d(np.unique(_with_neighbours(near, 0)), near)
     halo = np.intersect1d(touching[(touching < low) | (touching >= high)], _union([one.near for one in reached]))
-    fusion = RangeFusion(np.union1d(near, halo), empty, empty_map)
     wanted = _union([near, halo, empty])
-    for run, one in zip(cells.runs, reached, strict=True):
-        part = ReachedBlocks(np.intersect1d(one.near, wanted), np.intersect1d(one.empty, wanted))
-        if len(part.near) or len(part.empty):
-            fusion.add(open_map(run.folder), run.T_world_run, part)
-    fused = fusion.fused()
+    parts = [ReachedBlocks(*(np.intersect1d(codes, wanted) for codes in (one.near, one.empty))) for one in reached]
+    maps = (
+        (open_map(run.folder), run.T_world_run, part)
+        for run, part in zip(cells.runs, parts, strict=True)
+        if len(part.near) or len(part.empty)
+    )
+    fused = fused_blocks(np.union1d(near, halo), empty, empty_map, maps)
     own = fused.chosen((fused.codes >= low) & (fused.codes < high))
     name = f"{MAP_FOLDER}/{cells.first:013x}.npz"
     own.volume(empty_map).save(out / name)

@@ -26,6 +26,11 @@ TRAJECTORY_FILE = "trajectory.txt"
 MAX_RUNS = 8000
 """Largest number of runs: the sums of the fusion have 32 bits (``BlockSums``)."""
 
+OPEN_MAPS = 2
+"""Whole maps in memory: the two of a pair."""
+SMALL_PARTS = 32
+"""Runs whose keyframes (some MB), surface points (1 MB) or lists of blocks (some MB) are in memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class MapHeader:
@@ -97,12 +102,6 @@ def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
                 "volume.voxel_size"
             )
     return headers[0]
-
-
-OPEN_MAPS = 2
-"""Whole maps in memory: the two of a pair."""
-SMALL_PARTS = 32
-"""Runs whose keyframes (some MB), surface points (1 MB) or lists of blocks (some MB) are in memory."""
 
 
 @lru_cache(maxsize=OPEN_MAPS)

@@ -6,7 +6,7 @@ the maps give the same voxels. A range is all blocks whose Morton codes lie betw
 the whole result need to be in memory.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,6 +19,19 @@ from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
+
+VOXELS = BLOCK**3
+MAX_COUNT = 255
+"""Largest weight of a voxel and number of observations of emptiness of a block."""
+MAX_STEPS = 32767
+"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
+_LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
+PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Points (27, 3) of a block, in voxels."""
+RANGE_BLOCKS = 4096
+"""Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
+BATCH = 512
+"""Blocks of a map that are sampled at a time: about 50 MB of samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +79,6 @@ def joined(parts: Sequence[FusedRange]) -> FusedRange:
     """Blocks of several ranges, which have none in common."""
     names = FusedRange.__dataclass_fields__
     return FusedRange(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-VOXELS = BLOCK**3
-MAX_COUNT = 255
-"""Largest weight of a voxel and number of observations of emptiness of a block."""
-
-MAX_STEPS = 32767
-"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +155,6 @@ def empty_counts(
         return np.where(entries >= 0, volume.blocks.free_count[np.maximum(entries, 0)], 0).astype(np.int64)
     rows, states = _samples(volume, (coords[:, None].astype(np.float64) * BLOCK + PROBES).reshape(-1, 3), T_volume_grid)
     return _least_emptiness(volume, rows.reshape(len(coords), -1, COLUMNS), states.reshape(len(coords), -1))
-
-
-_LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
-PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-"""Points (27, 3) of a block, in voxels."""
 
 
 def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
@@ -243,12 +243,6 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
     return np.where(weight > 0, (2 * total + divisor) // (2 * divisor), 0)
 
 
-RANGE_BLOCKS = 4096
-"""Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
-BATCH = 512
-"""Blocks of a map that are sampled at a time: about 50 MB of samples."""
-
-
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
     """Blocks of the result that a map can contribute to.
@@ -288,39 +282,36 @@ class ReachedBlocks:
         return ReachedBlocks(*(part[slice(*np.searchsorted(part, [low, high]))] for part in (self.near, self.empty)))
 
 
-class RangeFusion:
-    """Sums over maps in some blocks, by Morton codes; any order of the maps gives the same result.
+def fused_blocks(
+    near: NDArray[np.int64],
+    empty: NDArray[np.int64],
+    like: TsdfVolume,
+    maps: Iterable[tuple[TsdfVolume, NDArray[np.float64], ReachedBlocks]],
+) -> FusedRange:
+    """Fusion of maps, one after the other in any order, in some blocks by their Morton codes.
 
     Voxels of at least one map reach into the blocks ``near`` (n,); the other blocks ``empty`` (m,) are empty in at
-    least one. The result has camera and parameters of the map ``like``.
+    least one. The result has camera and parameters of the map ``like``. Each of the ``maps`` comes with its pose
+    (4, 4), and enters by trilinear interpolation unless the voxels are the same.
     """
-
-    def __init__(self, near: NDArray[np.int64], empty: NDArray[np.int64], like: TsdfVolume) -> None:
-        self._near, self._empty, self._like = near, empty, like
-        self._sums = BlockSums.zeros(morton.decode(near))
-        self._free = np.zeros(len(empty), np.int64)
-
-    def add(self, volume: TsdfVolume, T_world_volume: NDArray[np.float64], reached: ReachedBlocks) -> None:
-        """Add a map at a pose (4, 4), by trilinear interpolation unless the voxels are the same."""
-        motion = _grid_motion(volume, self._like, T_world_volume)
-        rows = np.flatnonzero(np.isin(self._near, np.union1d(reached.near, reached.empty), assume_unique=True))
+    sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
+    for volume, T, reached in maps:
+        same = np.array_equal(T, np.eye(4)) and volume.sdf_unit == like.sdf_unit
+        motion = None if same else se3.inverse(T)
+        rows = np.flatnonzero(np.isin(near, np.union1d(reached.near, reached.empty), assume_unique=True))
         for part in _batches(rows):
-            self._sums.add(part, block_sums(volume, self._sums.coords[part], motion, self._like.sdf_unit))
-        rows = np.flatnonzero(np.isin(self._empty, reached.empty, assume_unique=True))
+            sums.add(part, block_sums(volume, sums.coords[part], motion, like.sdf_unit))
+        rows = np.flatnonzero(np.isin(empty, reached.empty, assume_unique=True))
         for part in _batches(rows):
-            self._free[part] += empty_counts(volume, morton.decode(self._empty[part]), motion)
-
-    def fused(self) -> FusedRange:
-        """Divide the sums."""
-        like = self._like
-        free_steps = round(like.truncation / like.sdf_unit)
-        parts = [
-            fused(self._sums.rows(part), free_steps, like.config.carve_rate, like.config.free_after)
-            for part in _batches(np.arange(len(self._near)))
-        ]
-        none, free = np.zeros((0, VOXELS), np.int32), np.minimum(self._free, MAX_COUNT).astype(np.uint8)
-        out = joined([*parts, FusedRange(self._empty, np.zeros(len(self._empty), bool), free, none, none)])
-        return out.chosen(out.has_voxels | (out.free_count > 0))
+            free[part] += empty_counts(volume, morton.decode(empty[part]), motion)
+    free_steps = round(like.truncation / like.sdf_unit)
+    parts = [
+        fused(sums.rows(part), free_steps, like.config.carve_rate, like.config.free_after)
+        for part in _batches(np.arange(len(near)))
+    ]
+    none, counts = np.zeros((0, VOXELS), np.int32), np.minimum(free, MAX_COUNT).astype(np.uint8)
+    out = joined([*parts, FusedRange(empty, np.zeros(len(empty), bool), counts, none, none)])
+    return out.chosen(out.has_voxels | (out.free_count > 0))
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
@@ -338,20 +329,9 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
         inside = [one.within(low, high) for one in reached]
         here = near[slice(*np.searchsorted(near, [low, high]))]
         empty = np.setdiff1d(np.concatenate([one.empty for one in inside]), here)
-        fusion = RangeFusion(here, empty, volumes[0])
-        for volume, T, one in zip(volumes, Ts_world_volume, inside, strict=True):
-            fusion.add(volume, T, one)
-        parts.append(fusion.fused())
+        parts.append(fused_blocks(here, empty, volumes[0], zip(volumes, Ts_world_volume, inside, strict=True)))
     return joined(parts).volume(volumes[0])
 
 
 def _batches(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     return [rows[start : start + BATCH] for start in range(0, len(rows), BATCH)]
-
-
-def _grid_motion(
-    volume: TsdfVolume, like: TsdfVolume, T_world_volume: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """World of the result to that of a map (4, 4); None where the voxels are the same."""
-    same = np.array_equal(T_world_volume, np.eye(4)) and volume.sdf_unit == like.sdf_unit
-    return None if same else se3.inverse(T_world_volume)

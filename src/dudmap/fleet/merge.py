@@ -35,6 +35,14 @@ from dudmap.own_folder import remove_files
 
 MERGE_FILE = "merge.json"
 
+WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
+WORK_FOLDER = ".work"
+WRITTEN = {
+    "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
+    MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
+}  # fmt: skip
+"""Names of all files of a world by sub-folder, as regular expressions. They are removed before the next merge."""
+
 
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
     """Join the maps of two run folders into a new run folder, in the world frame of the first.
@@ -102,15 +110,6 @@ def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]
             found = Trajectory.load(folder / source)
             Trajectory(found.timestamps, T @ found.Ts_world_camera).save(out / name)
     return names
-
-
-WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
-WORK_FOLDER = ".work"
-WRITTEN = {
-    "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
-    MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
-}  # fmt: skip
-"""Names of all files of a world by sub-folder, as regular expressions. They are removed before the next merge."""
 
 
 @dataclass(frozen=True, eq=False)

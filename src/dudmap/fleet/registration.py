@@ -26,6 +26,17 @@ from dudmap.fleet.workers import Workers
 ALL_PAIRS = PARTNERS
 """Number of runs up to which all pairs are compared: the index would leave out next to none."""
 
+Guesses = dict[tuple[int, int], NDArray[np.float64]]
+"""Relative pose at which a pair was compared because the graph had brought it together."""
+ROUNDS = 4
+"""Rounds at most; the third and fourth are small."""
+MIN_PREDICTED = 0.3
+"""Share of the smaller map that must lie in the other at the poses of the graph for a pair to be compared."""
+CELL = 0.3
+"""Edge of the cells whose sharing is counted, metres: many times the error of a pose."""
+SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
+"""A pair that disagreed at one relative pose says nothing on another that differs by more than this (m, deg)."""
+
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPair:
@@ -115,16 +126,6 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
 
 
 Pairs = dict[tuple[int, int], RegisteredPair]
-Guesses = dict[tuple[int, int], NDArray[np.float64]]
-"""Relative pose at which a pair was compared because the graph had brought it together."""
-ROUNDS = 4
-"""Rounds at most; the third and fourth are small."""
-MIN_PREDICTED = 0.3
-"""Share of the smaller map that must lie in the other at the poses of the graph for a pair to be compared."""
-CELL = 0.3
-"""Edge of the cells whose sharing is counted, metres: many times the error of a pose."""
-SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
-"""A pair that disagreed at one relative pose says nothing on another that differs by more than this (m, deg)."""
 
 
 def registered_runs(

@@ -21,6 +21,18 @@ from dudmap.extras import extra
 
 Pair = tuple[int, int]
 
+SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
+"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, deg), per axis: drift
+within the runs. The surfaces themselves determine it more exactly."""
+HALF = 0.5
+"""Overlap for which these hold. Joins of rendered runs with more than half of the smaller map in common are off by
+4.4 mm (root mean square), with 35 to 50 % by 4.9, with 25 to 35 % by 11.8, and with less by 17 mm."""
+CHI_SQUARE = 22.46
+"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, and
+of a relative pose, in standard deviations."""
+HUBER = 1.345
+"""Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
+
 
 def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
     """Edges that separate at least as many pairs ``apart`` as they are; of all minimum cuts the one with most pairs per
@@ -61,20 +73,6 @@ def _matrix(ends: np.ndarray, count: int) -> csr_array:
 def _labels(ends: np.ndarray, count: int) -> np.ndarray:
     """Number of the component of each node."""
     return connected_components(_matrix(ends, count), directed=False)[1]
-
-
-SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
-"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, deg), per axis: drift
-within the runs. The surfaces themselves determine it more exactly."""
-HALF = 0.5
-"""Overlap for which these hold. Joins of rendered runs with more than half of the smaller map in common are off by
-4.4 mm (root mean square), with 35 to 50 % by 4.9, with 25 to 35 % by 11.8, and with less by 17 mm."""
-CHI_SQUARE = 22.46
-"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, and
-of a relative pose, in standard deviations."""
-
-HUBER = 1.345
-"""Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
 
 
 def drift_covariance(

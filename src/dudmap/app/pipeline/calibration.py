@@ -51,6 +51,21 @@ UNITS = {
 ASSUMED = "assumed as given, not tested"
 """What is said of a colour camera that no image was asked about."""
 
+START_FRAMES, MIN_FRAMES = 300, 90
+"""Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
+estimator compares pairs of keyframes from both halves of the time."""
+WIDTH, INTERVAL = 320, 1 / 30
+"""Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
+at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
+noise of the poses and more of the camera's shaking enter, the longer they are."""
+SPACING, SHORT = 0.2, 5.0
+"""Time between two keyframes, seconds, in recordings longer than ``SHORT``; the velocity of one needs the frames just
+before and after it, and the others are not read. From a shorter recording every frame is taken."""
+GAP = 2.5
+"""Largest time between the neighbours of a keyframe, usual intervals: frames were left out where there is more."""
+VOXEL_SIZE = 0.02
+"""Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
+
 
 def kind_of(parameter: str) -> str:
     """The kind of a parameter, a key of ``UNITS``: all axes of a translation are one kind."""
@@ -92,23 +107,6 @@ def _sigma(calibration: Calibration, group: str) -> str:
         value = f"{factor * sigma:.2g} {unit}".strip() if np.isfinite(sigma) else "unknown"
         said.append(f"{kind.replace('log_focal', 'focal length')} {value}")
     return ", ".join(said)
-
-
-START_FRAMES, MIN_FRAMES = 300, 90
-"""Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
-estimator compares pairs of keyframes from both halves of the time."""
-
-WIDTH, INTERVAL = 320, 1 / 30
-"""Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
-at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
-noise of the poses and more of the camera's shaking enter, the longer they are."""
-SPACING, SHORT = 0.2, 5.0
-"""Time between two keyframes, seconds, in recordings longer than ``SHORT``; the velocity of one needs the frames just
-before and after it, and the others are not read. From a shorter recording every frame is taken."""
-GAP = 2.5
-"""Largest time between the neighbours of a keyframe, usual intervals: frames were left out where there is more."""
-VOXEL_SIZE = 0.02
-"""Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
 
 
 def calibrate_start(

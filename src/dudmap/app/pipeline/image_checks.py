@@ -33,6 +33,27 @@ that was 20 % too short on purpose was found 25 % too short."""
 DISTANCES = 4000
 """Random pairs of points whose distances are compared."""
 
+WIDTH = 160
+"""Width of the images whose edges are compared, pixels."""
+STEP, STEEPEST = 0.08, 4.0
+"""Smallest depth edge, as a share of the depth, and largest colour edge, as a multiple of the mean gradient."""
+NEIGHBOURHOOD = 41
+"""Width of the neighbourhood whose mean is taken off both edge images, pixels, so that only places count."""
+TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
+"""Ways in which one of the two images may be turned: steps through its rows and columns."""
+GAIN, SIGNIFICANT = 0.04, 4.0
+"""Smallest gain in the correlation of depth and colour edges by which a turn is believed, and how many standard errors
+over the frames it must exceed zero by."""
+FEWEST = 4
+"""Frames that a judgement needs."""
+FLAT = 0.01
+"""Largest deviation from one plane, standard deviation as a share of the depth, of a depth image without relief."""
+STILL = 0.2
+"""Largest spread over the frames of the distance of a plane that does not move, in standard deviations of a reading:
+the planes of moving cameras differ by more, and those of thousands of independent readings by less."""
+CHANGED = 0.05
+"""Mean difference of intensities, as a share of their mean, from which images differ by more than exposure."""
+
 
 def focal_error(sequence: "Sequence") -> float | None:
     """Given focal length over the one that keeps distances between the same points in two frames; None if unknown.
@@ -81,28 +102,6 @@ def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float6
         return first[:0], second[:0]
     _, _, fits = cv2.estimateAffine3D(first, second, ransacThreshold=NEAR * float(np.median(second[:, 2])))
     return first[fits[:, 0] > 0], second[fits[:, 0] > 0]
-
-
-WIDTH = 160
-"""Width of the images whose edges are compared, pixels."""
-STEP, STEEPEST = 0.08, 4.0
-"""Smallest depth edge, as a share of the depth, and largest colour edge, as a multiple of the mean gradient."""
-NEIGHBOURHOOD = 41
-"""Width of the neighbourhood whose mean is taken off both edge images, pixels, so that only places count."""
-TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
-"""Ways in which one of the two images may be turned: steps through its rows and columns."""
-GAIN, SIGNIFICANT = 0.04, 4.0
-"""Smallest gain in the correlation of depth and colour edges by which a turn is believed, and how many standard errors
-over the frames it must exceed zero by."""
-FEWEST = 4
-"""Frames that a judgement needs."""
-FLAT = 0.01
-"""Largest deviation from one plane, standard deviation as a share of the depth, of a depth image without relief."""
-STILL = 0.2
-"""Largest spread over the frames of the distance of a plane that does not move, in standard deviations of a reading:
-the planes of moving cameras differ by more, and those of thousands of independent readings by less."""
-CHANGED = 0.05
-"""Mean difference of intensities, as a share of their mean, from which images differ by more than exposure."""
 
 
 def image_warnings(frames: "list[Frame]") -> list[str]:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
 
+RECENT = 50
+"""Last events that are kept in memory: of a second or two, most of them frames."""
+
 
 class RunObserver:
     """Observer of a run; this one does nothing.
@@ -41,10 +44,6 @@ class RunObserver:
 
     def finish(self, out: Path) -> None:
         """The run is over, also by an error or an interrupt, and its run folder is written."""
-
-
-RECENT = 50
-"""Last events that are kept in memory: of a second or two, most of them frames."""
 
 
 class EventLog(RunObserver):

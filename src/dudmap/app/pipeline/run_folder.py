@@ -38,6 +38,24 @@ LOCK = ".lock"
 LOCKED_BYTE = 1 << 20
 """Place of the locked byte on Windows, behind the text, which others must be able to read."""
 
+FILES = (
+    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
+    "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
+    "merge.json", "report.html",
+)  # fmt: skip
+SCORES = (
+    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
+    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+)  # fmt: skip
+"""Files of `dudmap evaluate` in a run folder."""
+WRITTEN = {
+    "": "|".join((
+        *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
+    )),
+    "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
+}  # fmt: skip
+"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
+
 
 class RunLock:
     """Holds the lock of a folder while it is open; the operating system gives it up when the process ends, however.
@@ -113,25 +131,6 @@ def _described(holder: str) -> str:
         return f"process {int(about['pid'])} on {about['host']} since {about['since']}"
     except (ValueError, KeyError, TypeError):
         return "another process"
-
-
-FILES = (
-    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
-    "merge.json", "report.html",
-)  # fmt: skip
-SCORES = (
-    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
-    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
-)  # fmt: skip
-"""Files of `dudmap evaluate` in a run folder."""
-WRITTEN = {
-    "": "|".join((
-        *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
-    )),
-    "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
-}  # fmt: skip
-"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,28 @@ from dudmap.core.geometry.mesh_simplification import simplified
 from dudmap.errors import DudmapError, printable
 from dudmap.input_files import damaged
 
+STEPS = 65535
+"""Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
+REPORT = "report.html"
+TRIANGLES = 200_000
+"""Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
+POSES = 5000
+"""Poses in the page; those of a longer run are thinned evenly."""
+POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
+"""Content security policy: the page's own scripts by their hashes, its styles and pictures, and nothing else."""
+LISTED = 200
+"""Lost or unreadable frames that are listed one by one."""
+CARDS = {
+    "frames": ("frames", 1, "{:.0f}"),
+    "lost": ("lost", 1, "{:.0f}"),
+    "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
+    "dynamic_share_mean": ("of the readings move", 100, "{:.1f} %"),
+    "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
+    "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
+    "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
+}
+"""Key of metrics.json to label, factor and format of the figures at the top of the page."""
+
 
 class Html(str):
     """Text that is HTML already: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
@@ -52,10 +74,6 @@ def script_source(script: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
-STEPS = 65535
-"""Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
-
-
 def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
     """Description for the page, and the data as base64 text of a gzip stream.
 
@@ -75,27 +93,6 @@ def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
         "high": high.round(6).tolist(),
     }
     return about, base64.b64encode(data).decode("ascii")
-
-
-REPORT = "report.html"
-TRIANGLES = 200_000
-"""Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
-POSES = 5000
-"""Poses in the page; those of a longer run are thinned evenly."""
-POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
-"""Content security policy: the page's own scripts by their hashes, its styles and pictures, and nothing else."""
-LISTED = 200
-"""Lost or unreadable frames that are listed one by one."""
-CARDS = {
-    "frames": ("frames", 1, "{:.0f}"),
-    "lost": ("lost", 1, "{:.0f}"),
-    "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
-    "dynamic_share_mean": ("of the readings move", 100, "{:.1f} %"),
-    "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
-    "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
-    "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
-}
-"""Key of metrics.json to label, factor and format of the figures at the top of the page."""
 
 
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:

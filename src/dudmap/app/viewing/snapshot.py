@@ -28,6 +28,11 @@ KINDS = ("color", "depth", "mask", "residuals")
 """The images of a frame."""
 _NO_READING = np.array([40, 40, 40], dtype=np.uint8)
 
+LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
+"""Unit vector towards the light of the shaded view, camera frame."""
+TITLE = 28
+"""Height of the text above a picture, pixels."""
+
 
 @dataclass(frozen=True, eq=False)
 class MoverBox:
@@ -151,12 +156,6 @@ def jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:
 def _reduced(image: NDArray, width: int) -> NDArray:
     step = max(1, -(-image.shape[1] // width))
     return image[::step, ::step].copy()
-
-
-LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
-"""Unit vector towards the light of the shaded view, camera frame."""
-TITLE = 28
-"""Height of the text above a picture, pixels."""
 
 
 def save_sheet(

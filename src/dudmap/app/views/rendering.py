@@ -19,6 +19,11 @@ from dudmap.io.exporting.run_content import RunContent
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
 """Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
 
+PICTURE = ".png"
+"""Ending of a single picture."""
+EMPTY = 32
+"""Grey value of pixels that show no surface."""
+
 
 class VideoWriter:
     """Writes a video, frame by frame, of a size (width, height); to be used with ``with``.
@@ -55,12 +60,6 @@ class VideoWriter:
     ) -> None:
         self._writer.release()
         self._place.__exit__(kind, error, trace)
-
-
-PICTURE = ".png"
-"""Ending of a single picture."""
-EMPTY = 32
-"""Grey value of pixels that show no surface."""
 
 
 def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float) -> Trajectory:
