@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from dudmap.atomic_file import write_bytes
-from dudmap.errors import DudmapError, InternalError
+from dudmap.atomic_file import write_bytes, writing
+from dudmap.errors import InternalError
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.frame_source import FrameRead
@@ -67,10 +67,8 @@ class EventLog(RunObserver):
         self.out: Path | None = None
         self._file: TextIO | None = None
         if path is not None:
-            try:
+            with writing(f"the log {path}"):
                 self._file = path.open("w", encoding="utf-8", buffering=1)
-            except OSError as error:
-                raise DudmapError(f"cannot write the log {path}: {error.strerror}; name another file") from error
         self._slam: Slam | None = None
         self._state = "tracked"
 

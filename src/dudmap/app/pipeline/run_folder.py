@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
-from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text, writing
 from dudmap.config import Config
 from dudmap.core.geometry.mesh_pieces import save_pieces
 from dudmap.core.geometry.trajectory import Trajectory
@@ -164,22 +164,13 @@ def locked(out: Path) -> Iterator[None]:
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
     """
-    with _writing_into(out):
+    with writing(f"into the run folder {out}"):
         out.mkdir(parents=True, exist_ok=True)
         lock = RunLock(out)
     with lock:
-        with _writing_into(out):
+        with writing(f"into the run folder {out}"):
             remove_files(out, dict.fromkeys(WRITTEN, UNFINISHED))
         yield
-
-
-@contextmanager
-def _writing_into(out: Path) -> Iterator[None]:
-    """Turn any error of the operating system into one that says that the run folder cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
@@ -194,7 +185,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
         )
     if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
         raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
-    with _writing_into(out):
+    with writing(f"into the run folder {out}"):
         remove_files(out, WRITTEN)
         if save_masks:
             make_folder(out / "masks")

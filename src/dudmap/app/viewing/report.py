@@ -18,7 +18,7 @@ from dudmap import __version__
 from dudmap.app.viewing.plots import plots
 from dudmap.app.viewing.run_files import RunFiles
 from dudmap.app.viewing.thumbnails import Thumbnails
-from dudmap.atomic_file import write_text
+from dudmap.atomic_file import write_text, writing
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_simplification import simplified
@@ -108,10 +108,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     run = RunFiles.load(folder)
     with damaged(DudmapError, f"the run folder {folder}"):
         page = report_page(run)
-    try:
+    with writing(f"the report {path}"):
         write_text(path, page)
-    except OSError as error:
-        raise DudmapError(f"cannot write the report {path}: {error.strerror or error}") from error
     return path
 
 
