@@ -23,12 +23,10 @@ from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.evaluation.surface import Surface
 from dudmap.fleet import fusion
-from dudmap.fleet.fusion import PlacedRun, fuse_range, planned_ranges
-from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.fusion import T_GLTF_MAP, PlacedRun, fuse_range, planned_ranges, write_tile, write_tileset, write_tree
 from dudmap.fleet.map_fusion import FusedRange, fuse_maps, joined
 from dudmap.fleet.merge import merge_fleet
-from dudmap.fleet.tiles import T_GLTF_MAP, write_tile, write_tileset, write_tree
-from dudmap.fleet.workers import Workers
+from dudmap.fleet.workers import MapHeader, Workers, check_runs
 from rendered_places import record, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)

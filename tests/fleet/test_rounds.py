@@ -8,9 +8,8 @@ import pytest
 from dudmap.core.geometry import se3
 from dudmap.fleet import registration
 from dudmap.fleet.agreement import Agreement
-from dudmap.fleet.map_merging import NOT_RECOGNISED, MapPair
+from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair
 from dudmap.fleet.registration import RegisteredPair, predicted_overlap, registered_runs
-from dudmap.fleet.relative_pose import Hypothesis
 from dudmap.fleet.sdf_alignment import SdfAlignment
 from dudmap.fleet.workers import Workers
 

@@ -181,7 +181,7 @@ def write_into_run_folder(path):
     """What a run does with a folder that exists, and what going on with a run does."""
     from dudmap.app.pipeline.run_folder import locked, prepare_run_folder, save_mask
     from dudmap.app.pipeline.storing import stored_options
-    from dudmap.app.viewing.thumbnails import Thumbnails
+    from dudmap.app.viewing.report import Thumbnails
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DudmapError
 

@@ -62,7 +62,7 @@ def test_a_tree_is_kept_and_runs_without_joins_stay_alone(world):
 
 def test_runs_of_one_place_are_proposed():
     pytest.importorskip("faiss")
-    from dudmap.fleet.place_index import most_similar, similarity
+    from dudmap.fleet.registration import most_similar, similarity
 
     rng = np.random.default_rng(0)
     views = rng.normal(size=(40, 64)).astype(np.float32)  # run k sees the views k and k + 1 of a long corridor

@@ -10,7 +10,7 @@ from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
 from dudmap.app.pipeline.run_folder import LOCK, WRITTEN, RunLock
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.viewing.thumbnails import Thumbnails
+from dudmap.app.viewing.report import Thumbnails
 from dudmap.atomic_file import atomic_file, atomic_path, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError

@@ -12,8 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.app.pipeline.run import run
-from dudmap.app.viewing.report import ReportObserver, write_report
-from dudmap.app.viewing.thumbnails import NUMBER, Thumbnails
+from dudmap.app.viewing.report import NUMBER, ReportObserver, Thumbnails, write_report
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import DudmapError

@@ -21,15 +21,22 @@ from dudmap.core.map import morton
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DatasetError, DudmapError, MapError
 from dudmap.extras import need
-from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, fuse_range, planned_ranges
-from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.fusion import (
+    MAP_FOLDER,
+    TILE_FOLDER,
+    TILESET_FILE,
+    PlacedRun,
+    fuse_range,
+    planned_ranges,
+    write_tileset,
+    write_tree,
+)
 from dudmap.fleet.map_fusion import MAX_COUNT, VOXELS, FusedRange
 from dudmap.fleet.map_merging import compare_maps, merged_map
 from dudmap.fleet.map_samples import sample_map
 from dudmap.fleet.registration import RegisteredPair, registered_runs
 from dudmap.fleet.run_graph import RunGraph
-from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
-from dudmap.fleet.workers import Workers
+from dudmap.fleet.workers import MapHeader, Workers, check_runs
 from dudmap.input_files import damaged, read_bytes, read_json
 from dudmap.own_folder import remove_files
 

@@ -1,11 +1,18 @@
 """Relative poses of runs, in rounds: similar runs first, then those that the poses found so far bring together.
 
 A pair is compared by features, surfaces and checks, from candidates by place recognition or from the poses of all.
+
+Places are recognised by VLAD (Jegou et al. 2010): the differences of a keyframe's features to their nearest visual
+words, summed by word, each sum normalised (Arandjelovic and Zisserman 2013) and the whole brought to unit length. The
+words are the centres of k-means over features of all runs. The principal components of all descriptors are scaled
+towards equal variance, which lowers the weight of what many places have in common, such as doors and wallpaper
+(whitening, Jegou and Chum 2012). All are compared with all: 10,000 keyframes of 1,000 short runs in seconds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +21,31 @@ from scipy.sparse import csr_array
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map import morton
+from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.saved_map import MAP_FILE
-from dudmap.fleet.inputs import MapHeader, keyframes_of, surface_of
-from dudmap.fleet.map_merging import NOT_RECOGNISED, MapPair, decided
+from dudmap.extras import extra
+from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair, decided, relative_poses
 from dudmap.fleet.map_samples import transformed
-from dudmap.fleet.place_index import PARTNERS, TRAINING, described, learnt_words, most_similar, similarity
-from dudmap.fleet.relative_pose import Hypothesis, relative_poses
 from dudmap.fleet.run_graph import Join, RunGraph, drift_covariance, solve
-from dudmap.fleet.workers import Workers
+from dudmap.fleet.workers import MapHeader, Workers, keyframes_of, surface_of
+
+WORDS = 16
+"""Visual words: a descriptor then has 2048 numbers, 8 KB."""
+TRAINING = 50_000
+"""Features that the words are learnt from, at most; 3000 for each word."""
+COMPONENTS, WHITENING = 256, 0.25
+"""Principal components that are kept, and the power of their variances by which they are divided; 0.5 would also raise
+those that are noise."""
+LEAST_VARIANCE = 1e-6
+"""Added to each variance, so that copies of one run do not divide by zero; the variances of all components sum to 1 at
+most."""
+NEIGHBOURS, LEAST_VOTE = 20, 1e-4
+"""Runs that a keyframe votes for, more if they are equally similar, and its vote for the last of them."""
+PARTNERS = 8
+"""Runs that each run is compared with; several, since look-alikes compete with the neighbours of a run."""
 
 ALL_PAIRS = PARTNERS
 """Number of runs up to which all pairs are compared: the index would leave out next to none."""
-
 Guesses = dict[tuple[int, int], NDArray[np.float64]]
 """Relative pose at which a pair was compared because the graph had brought it together."""
 ROUNDS = 4
@@ -36,6 +56,76 @@ CELL = 0.3
 """Edge of the cells whose sharing is counted, metres: many times the error of a pose."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
 """A pair that disagreed at one relative pose says nothing on another that differs by more than this (m, deg)."""
+
+
+def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Visual words (WORDS, 128) of features (n, 128); the same for the same features.
+
+    Raises:
+        MissingExtraError: faiss is not installed.
+    """
+    kmeans = _faiss().Kmeans(
+        features.shape[1], min(WORDS, len(features)), niter=20, seed=1, min_points_per_centroid=1,
+        max_points_per_centroid=TRAINING,
+    )  # fmt: skip
+    kmeans.train(np.ascontiguousarray(features, np.float32))
+    return kmeans.centroids
+
+
+def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """VLAD descriptors (keyframes, words * 128), unit length."""
+    out = np.zeros((len(keyframes), *words.shape), np.float32)
+    for number, keyframe in enumerate(keyframes):
+        features = keyframe.features.descriptors
+        word = np.argmax(features @ words.T - np.square(words).sum(axis=1) / 2, axis=1)  # the nearest
+        np.add.at(out[number], word, features - words[word])
+    out /= np.maximum(np.linalg.norm(out, axis=2, keepdims=True), 1e-9)
+    flat = out.reshape(len(keyframes), -1)
+    return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+
+
+def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """How similar the places of each two runs are (n, n), symmetric, 0 on the diagonal, from descriptors (k, d) of
+    each.
+
+    Every keyframe votes for the runs with the most similar keyframes, as far as they exceed the last of these runs.
+    """
+    everything = _whitened(np.concatenate(runs))
+    sizes = np.array([len(run) for run in runs], np.int64)
+    ends, held = np.cumsum(sizes), np.flatnonzero(sizes)
+    starts = (ends - sizes)[held]
+    votes = np.zeros((len(runs), len(runs)), np.float32)
+    for a, start in zip(held, starts, strict=True):
+        best = np.maximum.reduceat(everything[start : ends[a]] @ everything.T, starts, axis=1)
+        best[:, held == a] = -1
+        last = min(NEIGHBOURS, len(held)) - 1
+        limit = -np.sort(-best, axis=1)[:, last : last + 1]
+        votes[a, held] = np.where(best >= limit, best - limit + LEAST_VOTE, 0).sum(axis=0)
+    np.fill_diagonal(votes, 0)
+    return votes + votes.T
+
+
+def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b: each run with those that have the most votes (n, n) in its row, at most so many."""
+    best = np.argsort(-votes, axis=1, kind="stable")[:, :partners]
+    pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(best) for b in row if votes[a, b] > 0}
+    return sorted(pairs)
+
+
+def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), scaled, unit length."""
+    count, size = descriptors.shape
+    pca = _faiss().PCAMatrix(size, max(1, min(COMPONENTS, count // 2, size)), -WHITENING)
+    pca.epsilon = LEAST_VARIANCE
+    pca.train(np.ascontiguousarray(descriptors))
+    out = pca.apply(np.ascontiguousarray(descriptors))
+    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+
+
+def _faiss() -> Any:  # noqa: ANN401
+    with extra("fleet", "the merging of more than two runs"):
+        import faiss
+    return faiss
 
 
 @dataclass(frozen=True, eq=False)

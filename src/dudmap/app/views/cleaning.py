@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.views.background import BackgroundRenderer, continued
-from dudmap.app.views.tum_folder import TumFolder, camera_lines, depth_units
+from dudmap.app.views.rendering import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.exporting.run_content import RunContent
