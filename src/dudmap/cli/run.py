@@ -89,7 +89,6 @@ def run(
     """
     from dudmap.app.pipeline.inspection import inspect
     from dudmap.app.pipeline.resume import resume as resume_run
-    from dudmap.app.pipeline.resume import wants_report
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.pipeline.storing import Storing
     from dudmap.core.geometry.calibration import Calibration
@@ -99,7 +98,7 @@ def run(
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
-        with observers(report=wants_report(resume), page=page, rerun=rerun, log=log) as watching:
+        with observers(report=False, page=page, rerun=rerun, log=log) as watching:
             done = resume_run(resume, device=device, progress=not quiet, observers=watching)
             print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
         return

@@ -11,8 +11,9 @@ from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
-from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
+from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing
 from dudmap.app.state.database import StateReader
+from dudmap.app.state.system import restore
 from dudmap.app.terminal import counted
 from dudmap.config import Config
 from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
@@ -189,7 +190,8 @@ class Job:
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
-        return restored(reader, store, self.system(), self.system())
+        current = RunState(self.system(), RunRecord(), first_slam=self.system(), first_record=RunRecord())
+        return restore(reader, current, store.database, current.slam.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""

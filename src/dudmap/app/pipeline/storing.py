@@ -22,7 +22,6 @@ from dudmap.app.state.system import (
     frame_fingerprint,
     images_fingerprint,
     recording_fingerprint,
-    restore,
     take_snapshot,
 )
 from dudmap.app.state.tree import NotSettledError, Snapshot
@@ -289,16 +288,6 @@ def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
             f"the recording {sequence.name} is not as it was when the run in {out} began; bring the old one back, or "
             "begin anew with dudmap run"
         )
-
-
-def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") -> RunState:
-    """Where a stored run stands, made of two new systems of the same camera and configuration, one for each pass.
-
-    Raises:
-        StateError: The database is damaged.
-    """
-    current = RunState(slam, RunRecord(), first_slam=other, first_record=RunRecord())
-    return restore(reader, current, store.database, slam.device)
 
 
 def _why_nothing(out: Path) -> str:

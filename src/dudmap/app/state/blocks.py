@@ -65,12 +65,13 @@ class StoredMaps:
 
     def __init__(self) -> None:
         self.by_id: dict[int, StoredMap] = {}
-        self._promised: dict[int, int] = {}  # numbers of maps that are not in the database yet
+        self._next = 0  # number of the next map that the database lacks
 
     def snapshot(self, volume: TsdfVolume) -> tuple[dict[str, Any], MapSnapshot]:
         """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state."""
         stored, blocks = self.by_id.get(volume.map_id), volume.blocks
-        number = self._free_number(volume.map_id) if stored is None else stored.number
+        number = self._next if stored is None else stored.number
+        self._next = max(self._next, number + 1)
         slots = volume.active_slots if stored is None else volume.written_since(stored.frame)[0]
         used = blocks.entry_of[slots] >= 0
         slots, released = slots[used], slots[~used]
@@ -90,19 +91,12 @@ class StoredMaps:
     def commit(self, maps: list[MapSnapshot]) -> None:
         """The blocks of these maps are in the database, and no other maps."""
         self.by_id = {changed.map_id: StoredMap(changed.number, changed.frame, changed.away) for changed in maps}
-        self._promised = {}
 
     def add(self, volume: TsdfVolume, number: int) -> None:
         """A map has been read from the database."""
         regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
         self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, regions)
-
-    def _free_number(self, map_id: int) -> int:
-        """Number for a map that is not in the database; the same until the next ``commit``."""
-        if map_id not in self._promised:
-            used = {stored.number for stored in self.by_id.values()} | set(self._promised.values())
-            self._promised[map_id] = next(number for number in range(len(used) + 1) if number not in used)
-        return self._promised[map_id]
+        self._next = max(self._next, number + 1)
 
 
 def _index(volume: TsdfVolume) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import DatasetError, StateError
-from dudmap.input_files import DAMAGE
+from dudmap.input_files import DAMAGE, parse_json
 
 if TYPE_CHECKING:
     from dudmap.app.state.blocks import FrameSnapshot, StoredFrames
@@ -41,16 +41,14 @@ class Snapshot:
     """The state of a system at one moment, which no later change reaches.
 
     Attributes:
-        tree: The tree; ``arrays`` and ``records`` are referred to by number.
-        arrays: Copies, except of what never changes.
-        records: Lists of plain values.
+        tree: The tree; ``arrays`` are referred to by number.
+        arrays: Copies, except of what never changes; or lists of plain values.
         constant: Numbers of the arrays that never change.
         maps, frames: What changed in the maps and stored frames since the last checkpoint.
     """
 
     tree: Node = None
-    arrays: list[NDArray] = field(default_factory=list)
-    records: list[list[Any]] = field(default_factory=list)
+    arrays: list[NDArray | list[Any]] = field(default_factory=list)
     constant: set[int] = field(default_factory=set)
     maps: list[MapSnapshot] = field(default_factory=list)
     frames: "list[FrameSnapshot]" = field(default_factory=list)
@@ -104,9 +102,8 @@ class TreeWriter:
         if isinstance(value, dict):
             keys, content = list(value), list(value.values())
             return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
-        if isinstance(value, set | frozenset):
-            kind = "frozenset" if isinstance(value, frozenset) else "set"
-            return {kind: self._items(sorted(value), place), "id": number}
+        if isinstance(value, set):
+            return {"set": self._items(sorted(value), place), "id": number}
         return self._object(value, place, number)
 
     def _items(self, items: list[Any], place: str) -> Node:
@@ -142,8 +139,7 @@ class TreeWriter:
         for name, attribute in schema.attributes(value).items():
             where = f"{place}.{name}"
             if name in records:
-                self.snapshot.records.append(list(attribute))
-                content[name] = {"records": len(self.snapshot.records) - 1}
+                content[name] = {"records": self._add(list(attribute))}
             elif name in evaluated:
                 content[name] = {"call": self._node(attribute(), where)}
             else:
@@ -157,7 +153,7 @@ class TreeWriter:
             self.snapshot.constant.add(len(self.snapshot.arrays))
         return self._add(array if constant else array.copy(order="K"))
 
-    def _add(self, array: NDArray) -> int:
+    def _add(self, array: NDArray | list[Any]) -> int:
         self.snapshot.arrays.append(array)
         return len(self.snapshot.arrays) - 1
 
@@ -175,7 +171,7 @@ class TreeReader:
         stored = reader.state()
         if stored is None:
             raise StateError(f"{reader.path} holds no checkpoint yet")
-        self._tree, self._arrays, self._records = stored
+        self._tree, self._arrays = stored
         self._made: dict[int, Any] = {}
         self._at: list[str] = []  # where the tree is being read, which an error names
         self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
@@ -214,7 +210,8 @@ class TreeReader:
                     raise ValueError(f"found a {kind} of {type(value).__name__}; expected a number")
                 return kind.type(value)
             case {"records": number}:
-                return self._records[number]
+                lines = self._arrays[number].tobytes().decode().splitlines()
+                return [parse_json(line, exact=True) for line in lines]
             case {"call": result}:
                 made = self._value(result)
                 return lambda: made
@@ -237,8 +234,6 @@ class TreeReader:
                 value = self._tuple(self._items(items), node.get("class"))
             case {"set": items}:
                 value = set(self._items(items))
-            case {"frozenset": items}:
-                value = frozenset(self._items(items))
             case {"list": items, "id": number}:  # this and the next may be part of their own content
                 value = self._made[number] = []
                 value += self._items(items, current)
@@ -309,7 +304,7 @@ class TreeReader:
         content = node["attributes"]
         like = self._new.setdefault(cls, schema.attributes(current)) if usable else self._new.get(cls, {})
         schema.check_attributes(cls, content, like)
-        for name, default in {} if usable else _defaults(cls).items():
+        for name, default in {} if usable else schema.defaults(cls).items():
             object.__setattr__(value, name, default)
         for name, attribute in content.items():
             self._at.append(f".{name}")
@@ -338,18 +333,6 @@ class TreeReader:
         store.continue_from(lambda serial: reader.frame(number, serial))
         if self._database is not None:
             self._database.frames.add(store, number)
-
-
-def _defaults(cls: type) -> dict[str, Any]:
-    """Values of the attributes that are not stored, of an object that is made without its constructor."""
-    made: dict[str, dict[str, Any]] = {
-        "BlockPager": {"_store": None, "_executor": None},
-        "FrameStore": {"registered": None, "_file": None, "_first_own": 0, "_encoder": None, "_pending": deque()},
-        "LoopCloser": {"_executor": None},
-        "RunRecord": {"_since": (0.0, 0.0)},
-        "Observation": {"_halvings": [], "_recorded_halvings": []},
-    }  # fmt: skip
-    return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
 
 
 def _class_name(value: object, place: str) -> str:
