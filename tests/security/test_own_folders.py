@@ -8,7 +8,7 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
-from dudmap.app.pipeline.run_folder import LOCK, WRITTEN, RunLock
+from dudmap.app.pipeline.run_folder import LOCK, WRITTEN, run_lock
 from dudmap.app.state.database import StateDatabase
 from dudmap.app.viewing.report import Thumbnails
 from dudmap.atomic_file import atomic_file, atomic_path, write_bytes, write_text
@@ -65,7 +65,8 @@ def test_a_lock_that_is_no_file_of_its_own(kind, elsewhere, tmp_path):
     else:
         lock.mkdir()
     with pytest.raises(OSError, match="no plain file") as error:
-        RunLock(tmp_path)
+        with run_lock(tmp_path):
+            pass
     assert error.value.filename == str(lock)
 
 

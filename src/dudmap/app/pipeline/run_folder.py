@@ -5,12 +5,11 @@ import os
 import re
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,57 +56,41 @@ WRITTEN = {
 """Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
 
 
-class RunLock:
-    """Holds the lock of a folder while it is open; the operating system gives it up when the process ends, however.
-
-    Args:
-        folder: The run folder, which exists.
+@contextmanager
+def run_lock(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run folder, which exists; the operating system gives it up when the process ends, however.
 
     Raises:
         DudmapError: Another process, or another run of this one, holds the lock; the sentence says which.
         OSError: The file cannot be written, or is a link or anything but a plain file.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = OwnFolder(folder, linked=True)
-        try:
-            self._file = self._locked(folder)
-        except BaseException:
-            self._folder.close()
-            raise
+    with OwnFolder(folder, linked=True) as own, _locked_file(own) as file:
         about = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(" ", "seconds")}
-        self._file.truncate(0)
-        self._file.write(json.dumps(about).encode())
-        self._file.flush()
+        file.truncate(0)
+        file.write(json.dumps(about).encode())
+        file.flush()
+        try:
+            yield
+        finally:
+            if os.name == "posix":
+                own.remove(LOCK)
 
-    def _locked(self, folder: Path) -> IO[bytes]:
-        while True:
-            file = os.fdopen(self._folder.open(LOCK, os.O_RDWR | os.O_CREAT), "r+b")
-            try:
-                _lock(file)
-            except OSError:
-                holder = file.read(1000).decode(errors="replace")
-                file.close()
-                raise DudmapError(
-                    f"{folder} is in use by {_described(holder)}; wait for it, end it, or name another folder"
-                ) from None
-            there = self._folder.status(LOCK)
-            if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
-                return file
-            file.close()  # whoever held it has removed this file in between
 
-    def close(self) -> None:
-        """Give the lock up and remove its file."""
-        if os.name == "posix":
-            self._folder.remove(LOCK)
-        self._file.close()
-        self._folder.close()
-
-    def __enter__(self) -> "RunLock":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
+def _locked_file(folder: OwnFolder) -> IO[bytes]:
+    while True:
+        file = os.fdopen(folder.open(LOCK, os.O_RDWR | os.O_CREAT), "r+b")
+        try:
+            _lock(file)
+        except OSError:
+            holder = file.read(1000).decode(errors="replace")
+            file.close()
+            raise DudmapError(
+                f"{folder.path} is in use by {_described(holder)}; wait for it, end it, or name another folder"
+            ) from None
+        there = folder.status(LOCK)
+        if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
+            return file
+        file.close()  # whoever held it has removed this file in between
 
 
 def _lock(file: IO[bytes]) -> None:
@@ -164,11 +147,10 @@ def locked(out: Path) -> Iterator[None]:
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
     """
-    with writing(f"into the run folder {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-        lock = RunLock(out)
-    with lock:
+    with ExitStack() as held:
         with writing(f"into the run folder {out}"):
+            out.mkdir(parents=True, exist_ok=True)
+            held.enter_context(run_lock(out))
             remove_files(out, dict.fromkeys(WRITTEN, UNFINISHED))
         yield
 
