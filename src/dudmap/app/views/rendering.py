@@ -1,9 +1,8 @@
 """Artificial views (thesis section 4.5.3): the map seen along a trajectory, as picture, video or recording."""
 
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -35,8 +34,6 @@ class TumFolder:
     def add(self, kind: str, timestamp: float, image: NDArray) -> str:
         """Write an image: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool as 255 and 0; returns its line of the
         list."""
-        import cv2
-
         pixels = image[..., ::-1] if image.ndim == 3 else image.astype(np.uint8) * 255 if image.dtype == bool else image
         line = f"{timestamp:.6f} {kind}/{timestamp:.6f}.png"
         write_bytes(self._out / line.split()[1], cv2.imencode(".png", pixels)[1].tobytes(), sync=False)
@@ -65,41 +62,27 @@ def depth_units(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint16
     return np.where(units > 65535, 0, units).astype(np.uint16)
 
 
-class VideoWriter:
-    """Writes a video, frame by frame, of a size (width, height); to be used with ``with``.
+@contextmanager
+def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Write a video of a size (width, height); gives a function that adds an image (H, W, 3) in RGB order.
 
     Raises:
         ConfigError: The ending of the path is unknown, or this OpenCV cannot write the format.
     """
-
-    def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
-        import cv2
-
-        codec = CODECS.get(path.suffix.lower())
-        if codec is None:
-            known = ", ".join(CODECS)
-            raise ConfigError(f"cannot write {path.name!r}; the ending must be one of {known}, or .png for a picture")
-        if str(path) != printable(path):  # OpenCV ends the process at a name that is no UTF-8
-            raise ConfigError(f"cannot write a video as {path}; expected a name of printable characters")
-        self._place = ExitStack()
-        temporary = self._place.enter_context(atomic_path(path))
-        self._writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)
-        if not self._writer.isOpened():
-            temporary.unlink(missing_ok=True)
+    codec = CODECS.get(path.suffix.lower())
+    if codec is None:
+        known = ", ".join(CODECS)
+        raise ConfigError(f"cannot write {path.name!r}; the ending must be one of {known}, or .png for a picture")
+    if str(path) != printable(path):  # OpenCV ends the process at a name that is no UTF-8
+        raise ConfigError(f"cannot write a video as {path}; expected a name of printable characters")
+    with atomic_path(path) as temporary:
+        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)
+        if not writer.isOpened():
             raise ConfigError(f"this build of OpenCV cannot write {path} (codec {codec}); name a folder for images")
-
-    def write(self, color: NDArray[np.uint8]) -> None:
-        """Add an image (H, W, 3) in RGB order."""
-        self._writer.write(np.ascontiguousarray(color[..., ::-1]))
-
-    def __enter__(self) -> "VideoWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.release()
-        self._place.__exit__(kind, error, trace)
+        try:
+            yield lambda color: writer.write(np.ascontiguousarray(color[..., ::-1]))
+        finally:
+            writer.release()
 
 
 def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float) -> Trajectory:
@@ -168,9 +151,9 @@ def render_run(
         write_bytes(out, cv2.imencode(PICTURE, color[..., ::-1])[1].tobytes())
         return 1
     if out.suffix and not out.is_dir():
-        with VideoWriter(out, (camera.width, camera.height), fps) as video:
+        with video_file(out, (camera.width, camera.height), fps) as add:
             for number, T in enumerate(trajectory.Ts_world_camera, start=1):
-                video.write(_view(run, T, camera)[0])
+                add(_view(run, T, camera)[0])
                 if progress is not None:
                     progress(number, len(trajectory))
         return len(trajectory)
