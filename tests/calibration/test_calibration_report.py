@@ -47,5 +47,5 @@ def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
             return 5
 
     said = []
-    assert calibrate_start(Short(), Config(), notice=said.append) is None
+    assert calibrate_start(Short(), Config(), len(Short()), said.append, lambda done, total: None) is None
     assert said == ["colour camera: assumed as given, not tested: that takes 90 frames"]
