@@ -179,9 +179,10 @@ def open_masks(folder: str | Path | None, sequence: "Sequence | LiveCamera") -> 
     """The external masks of a run, if there are any."""
     if folder is None:
         return None
-    if not hasattr(sequence, "timestamps"):
+    times = getattr(sequence, "timestamps", None)
+    if times is None:
         raise ConfigError("masks belong to the frames of a recording; a camera has none")
-    return MaskFolder(folder, sequence.timestamps, sequence.camera)
+    return MaskFolder(folder, times, sequence.camera)
 
 
 def _with_masks(

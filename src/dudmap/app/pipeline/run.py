@@ -154,7 +154,7 @@ def run(
             store.order(sequence, options)
         if progress:
             display.announce_compilation()
-        if calibrate and not isinstance(sequence, LiveCamera):
+        if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
                 calibration = calibrate_start(sequence, config, count, notice, counting)
         elif calibration is None and not live:

@@ -67,7 +67,8 @@ class RunFiles(RunContent):
     def config(self) -> str:
         """Text of config.toml, empty if there is none."""
         path = self.folder / "config.toml"
-        return read_text(path) if path.is_file() else ""
+        with damaged(DatasetError, path):
+            return read_text(path) if path.is_file() else ""
 
     @cached_property
     def frames(self) -> list[dict[str, str]]:
@@ -75,7 +76,8 @@ class RunFiles(RunContent):
         path = self.folder / "timings.csv"
         if not path.is_file():
             return []
-        rows = list(csv.DictReader(read_text(path).splitlines()))
+        with damaged(DatasetError, path):
+            rows = list(csv.DictReader(read_text(path).splitlines()))
         numbers = [name for name in (rows[0] if rows else ()) if name not in ("state", "fused")]
         for number, row in enumerate(rows, start=2):
             try:
@@ -110,11 +112,12 @@ class RunFiles(RunContent):
     def thumbnails(self) -> dict[str, dict[str, bytes]]:
         """JPEG files by kind of image, by the timestamp of the frame as text."""
         out: dict[str, dict[str, bytes]] = {}
-        for path in (self.folder / FOLDER).glob("*.jpg"):
-            stamp, _, kind = path.stem.rpartition(".")
-            if kind in KINDS:
-                out.setdefault(stamp, {})[kind] = read_bytes(path, LARGEST_THUMBNAIL)
-        return dict(sorted(out.items(), key=lambda item: float(item[0])))
+        with damaged(DatasetError, self.folder / FOLDER):
+            for path in (self.folder / FOLDER).glob("*.jpg"):
+                stamp, _, kind = path.stem.rpartition(".")
+                if kind in KINDS:
+                    out.setdefault(stamp, {})[kind] = read_bytes(path, LARGEST_THUMBNAIL)
+            return dict(sorted(out.items(), key=lambda item: float(item[0])))
 
     def figures(self) -> list[FrameFigures]:
         """Pose, moving objects and figures of every processed frame; the residual of single frames is not stored."""
