@@ -53,7 +53,7 @@ package: .venv/developed
 		bin/python -c 'import dudmap; [getattr(dudmap, name) for name in dudmap.__all__]'
 
 processors: .venv/developed
-	$(BIN)/python benchmarks/processors.py
+	$(BIN)/python tests/processors.py
 
 # hostile files for all loaders: make fuzz SECONDS=60 LOADERS="bag,map", see docs/reliability.md
 SECONDS ?= 60
@@ -64,7 +64,7 @@ fuzz: .venv/developed
 # 20,000 frames, 22 minutes at 15 Hz, see docs/reliability.md: make soak FRAMES=20000
 FRAMES ?= 20000
 soak: .venv/developed
-	$(BIN)/python benchmarks/soak.py --frames $(FRAMES)
+	$(BIN)/dudmap benchmark soak --max-frames $(FRAMES)
 
 # the same as fuzz for one loader, guided by coverage: make fuzz-guided LOADER=sens
 LOADER ?= sens

@@ -1,4 +1,4 @@
-"""The Chromium that the tests and benchmarks/viewing.py drive."""
+"""The Chromium that the tests drive."""
 
 import os
 import shutil

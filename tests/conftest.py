@@ -1,4 +1,4 @@
-"""Settings of the test processes (pytest-xdist's workers; OpenCV's for benchmarks/processors.py), shared fixtures."""
+"""Settings of the test processes (pytest-xdist's workers; OpenCV's for tests/processors.py), shared fixtures."""
 
 import os
 import shutil

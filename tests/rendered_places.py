@@ -1,5 +1,4 @@
-"""Maps of rendered places from their true poses: what a perfect run would save. Used by the tests and by
-benchmarks/merging.py."""
+"""Maps of rendered places from their true poses: what a perfect run would save."""
 
 from dataclasses import dataclass, replace
 

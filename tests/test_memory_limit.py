@@ -13,7 +13,7 @@ from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-from dudmap.lab.synthetic.ring_corridor import ring_corridor
+from ring_corridor import ring_corridor
 from triangles import triangles
 
 FRAMES = 80

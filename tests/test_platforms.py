@@ -14,7 +14,7 @@ import pytest
 from dudmap.app.pipeline import environment
 from dudmap.app.viewing.page_access import port_problem
 from dudmap.core.backends import threads
-from dudmap.lab.study.executor import LocalExecutor, usable_cores
+from dudmap.lab.study.worker import LocalExecutor, usable_cores
 
 SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py"))
 POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
@@ -77,7 +77,7 @@ def test_closing_workers_that_are_gone_is_no_error(monkeypatch):
 
     monkeypatch.setattr(os, "kill", kill)
     executor = LocalExecutor(1)
-    executor._pids.add(1)
+    executor._pids[None] = 1
     executor.close()
 
 

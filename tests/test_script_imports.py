@@ -1,5 +1,4 @@
-"""Benchmarks, examples and the scripts of the documentation, which no other quick test runs, import only names that
-exist."""
+"""Examples and the scripts of the documentation, which no other quick test runs, import only names that exist."""
 
 import ast
 from pathlib import Path
@@ -7,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SCRIPTS = sorted(path for folder in ("benchmarks", "docs", "examples") for path in (ROOT / folder).glob("*.py"))
+SCRIPTS = sorted(path for folder in ("docs", "examples") for path in (ROOT / folder).glob("*.py"))
 
 
 def module_names(module):

@@ -14,12 +14,10 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
-from dudmap.lab.benchmark.published import published
-from dudmap.lab.benchmark.suites import SUITES, find_suite
-from dudmap.lab.benchmark.systems import systems
-from dudmap.lab.benchmark.table import markdown
+from dudmap.lab.benchmark.limits import cells_table, limits_table
+from dudmap.lab.benchmark.measure import markdown
+from dudmap.lab.benchmark.report import published
+from dudmap.lab.benchmark.suites import ABLATION, SUITES, Entry, find_suite, systems
 from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
 
@@ -51,7 +49,8 @@ def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
         assert len(set(suite.names())) == count
     assert len(find_suite("synthetic", None).entries) >= 15
     assert len(find_suite("synthetic", None, quick=True).entries) == 3
-    assert set(SUITES) == {*counts, "synthetic", "local"}
+    assert len(find_suite("ablation", None).entries) == 5
+    assert set(SUITES) == {*counts, "synthetic", "ablation", "local"}
 
 
 def test_recordings_are_found_one_folder_down(data):
@@ -103,6 +102,7 @@ def test_systems_are_configurations(tmp_path):
     assert found["threshold"].dynamics.method == "threshold"
     assert not found["em"].dynamics.free_space
     assert found["thesis"].preset == "thesis"
+    assert len({str(config) for config in systems(ABLATION).values()}) == 13  # two-passes has the default configuration
     (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.05\n")
     assert systems(str(tmp_path / "mine.toml"))["mine"].tracker.huber == 0.05
     for text in ("", "dudmapp", "none,none"):
@@ -176,7 +176,7 @@ def test_a_process_that_dies_or_fails_is_an_error_of_its_row(capfd):
 # -- the limit of dynamics --------------------------------------------------------------------------------------------
 
 
-SWEEP = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.1, 0.3, 0.5))
+SWEEP = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.1, 0.3, 0.5))
 
 
 def made_up(system, x, coverage, ate):
@@ -210,16 +210,6 @@ def test_the_table_of_cells_marks_what_is_coped_with(rows):
     assert len(lines) == 3 + len(SWEEP.xs) * len(SWEEP.coverages)
 
 
-def test_heat_maps_show_every_cell(rows, tmp_path):
-    import cv2
-
-    grid = values(rows, SWEEP, "dudmap", "ate_rmse_m")
-    np.testing.assert_allclose(grid, [[0.005, 0.005], [0.03, 0.006], [0.01, 0.01]])
-    assert np.isnan(values(rows, SWEEP, "none", "ate_rmse_m")).all()
-    save_heat_maps(rows, SWEEP, ["dudmap", "none"], tmp_path / "limits.png")
-    assert cv2.imread(str(tmp_path / "limits.png")).std() > 10
-
-
 def test_the_grids_hold_what_is_asked_for():
     cells = limits.grid_cells(limits.SWEEPS, 120)
     assert len(set(cells)) == len(cells)
@@ -235,7 +225,7 @@ def test_the_grids_hold_what_is_asked_for():
 
 @pytest.mark.slow
 def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
-    sweep = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.0,))
+    sweep = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.0,))
     cells = limits.grid_cells((sweep,), 6)
     wanted = systems("none")
     first = limits.measure_cells(cells, wanted, tmp_path, 1)
@@ -243,9 +233,9 @@ def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
     assert first[0]["copes"]
     assert first[0]["ate_rmse_m"] == first[1]["ate_rmse_m"]
     assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(limits, "in_own_process", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(measure, "in_own_process", lambda *_: pytest.fail("measured again"))
     assert limits.measure_cells(cells, wanted, tmp_path, 1) == first
-    monkeypatch.setattr(limits, "in_own_process", lambda *_: {"error": "the process died"})
+    monkeypatch.setattr(measure, "in_own_process", lambda *_: {"error": "the process died"})
     other = limits.measure_cells(cells, systems("em"), tmp_path, 2)
     assert [row["error"] for row in other] == ["the process died"] * 2
 

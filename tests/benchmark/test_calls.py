@@ -2,15 +2,15 @@
 
 from dudmap import Config, synthetic
 from dudmap.core.geometry.camera import Camera
-from dudmap.lab.benchmark.calls import WARM_UP, count_calls, summary
+from dudmap.lab.benchmark.roofline import COUNTED_FROM, count_calls, summary
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SMALL = Config().override(["volume.voxel_size=0.04", "preprocess.depth_max=4"])
 
 
 def test_the_calls_of_each_frame_are_counted():
-    sequence = synthetic.sequence(frames=WARM_UP + 3, camera=CAMERA, movers=())
-    counts = count_calls(sequence, SMALL, WARM_UP + 2)
+    sequence = synthetic.sequence(frames=COUNTED_FROM + 3, camera=CAMERA, movers=())
+    counts = count_calls(sequence, SMALL, COUNTED_FROM + 2)
     assert len(counts) == 2
     for one in counts:
         assert 5 < one["launches"] < one["calls"]

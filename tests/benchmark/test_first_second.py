@@ -10,7 +10,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.first_second import first_second_table, measure_first_second
+from dudmap.lab.benchmark.bias import first_second_table, measure_first_second
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 FRAMES = 6

@@ -16,15 +16,15 @@ ENTRIES = {entry.name: entry for entry in gate.gate_entries(HERE / "fixtures")}
 
 
 def failures(rows, recorded=RECORDED):
-    return {(check.sequence, check.figure) for check in gate.compare(rows, recorded) if not check.passed}
+    return {(check["sequence"], check["figure"]) for check in gate.compare(rows, recorded) if not check["passed"]}
 
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_accuracy_is_no_worse_than_recorded(name):
     checks = gate.compare(gate.measure_gate([ENTRIES[name]], Config()), RECORDED)
-    assert all(check.passed for check in checks), "\n" + gate.verdict(checks)
+    assert all(check["passed"] for check in checks), "\n" + gate.verdict(checks)
     if name.startswith("room"):
-        measured = {check.figure for check in checks}
+        measured = {check["figure"] for check in checks}
         assert {"lost", "ate_rmse_m", "mask_iou_mean", "mesh_completeness", "ghost_area_m2"} <= measured
 
 

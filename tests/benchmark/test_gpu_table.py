@@ -15,7 +15,7 @@ def test_runs_on_the_cpu_and_says_that_no_gpu_was_measured(monkeypatch):
     monkeypatch.setattr(gpu, "obstacle", lambda: "no NVIDIA driver was found")
     room = sequence(frames=4, camera=DEFAULT_CAMERA.resized(160, 120))
     row = gpu.measure("room 160x120", room, 4, 0.04, "cpu")
-    assert row.frame_ms >= sum(row.stages.values()) > 0
+    assert 1.2 * row.frame_ms >= sum(row.stages.values()) > 0  # medians of four frames do not add up exactly
     assert row.triangles > 1000
     assert row.map_mb > 1
     text = gpu.table([row])

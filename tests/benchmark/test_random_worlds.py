@@ -6,9 +6,9 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.lab.benchmark import random_worlds
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.random_worlds import draw_world, measure_worlds, report, synth_command
+from dudmap.lab.benchmark import measure, random_worlds
+from dudmap.lab.benchmark.random_worlds import DRAWN, draw_world, measure_worlds, report, synth_command
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import names
 
 
@@ -26,12 +26,12 @@ def test_worlds_depend_on_seed_and_number_only():
 def test_worlds_are_varied_and_of_known_parts():
     worlds = [draw_world(11, number) for number in range(300)]
     known = names()
-    assert {world["scene"] for world in worlds} == set(random_worlds.SCENES) <= set(known["scenes"])
+    assert {world["scene"] for world in worlds} == set(DRAWN["scenes"]) <= set(known["scenes"])
     assert {world["camera_path"] for world in worlds} <= set(known["camera_paths"])
     assert {world["sensor"] for world in worlds if "sensor" in world} == set(known["sensors"])
     assert {name for world in worlds for name in world.get("movers", ())} == set(known["movers"])
-    assert set(random_worlds.NOISES) == set(known["noise"]) - {"none"}
-    assert {name for world in worlds for name in world.get("faults", {})} == set(random_worlds.FAULTS)
+    assert set(DRAWN["noises"]) == set(known["noise"]) - {"none"}
+    assert {name for world in worlds for name in world.get("faults", {})} == set(DRAWN["faults"])
     faulty = [world for world in worlds if "faults" in world]
     assert len(faulty) / len(worlds) == pytest.approx(0.6, abs=0.1)
 
@@ -52,7 +52,7 @@ def test_a_world_opens_and_its_command_writes_the_same(number, monkeypatch):
 def test_every_fault_can_be_drawn_and_used():
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        faults = {name: random_worlds._drawn(name, rng) for name in random_worlds.FAULTS}
+        faults = {name: random_worlds._drawn(name, rng) for name in DRAWN["faults"]}
         world = {"scene": "box", "movers": (), "frames": 3, "camera": (64, 48), "faults": faults}
         recording = Entry("all", parameters=world).open()
         assert recording[len(recording) - 1].depth.max() > 0
@@ -81,7 +81,7 @@ def test_interrupted_run_continues(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return {"ate_rmse_m": 0.01, "lost": 0, "frames": 90}
 
-    monkeypatch.setattr(random_worlds, "in_own_process", fake)
+    monkeypatch.setattr(measure, "in_own_process", fake)
     with pytest.raises(KeyboardInterrupt):
         measure_worlds(1, range(4), Config(), tmp_path)
     before = measured.copy()

@@ -1,14 +1,12 @@
 """dudmap benchmark speed: the table, its failures, the passage of new space, and a map that outgrows its table."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark import speed
-from dudmap.lab.benchmark.passage import LAP, passage
+from dudmap.lab.benchmark import roofline, speed
+from dudmap.lab.benchmark.soak import grown, measure_soak
+from dudmap.lab.benchmark.speed import LAP, passage
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
@@ -91,8 +89,8 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     import sys
     from pathlib import Path
 
-    from dudmap.lab.benchmark import interleaved
-    from dudmap.lab.benchmark.entries import Entry
+    from dudmap.lab.benchmark import gpu as interleaved
+    from dudmap.lab.benchmark.suites import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))
     entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (160, 120)})
@@ -110,7 +108,7 @@ def _instead_of(read_text, name, text):
 def test_a_python_without_open3d_is_refused(tmp_path):
     import sys
 
-    from dudmap.lab.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.gpu import find_open3d
 
     with pytest.raises(DudmapError, match="cannot run"):
         find_open3d(tmp_path / "nothing")
@@ -123,13 +121,17 @@ def test_a_python_without_open3d_is_refused(tmp_path):
 
 
 def test_the_roofline_counts_what_the_system_does():
-    """The script outside the package wraps the tracker: it must keep step with it."""
-    place = Path(__file__).parents[2] / "benchmarks" / "roofline.py"
-    spec = importlib.util.spec_from_file_location("roofline", place)
-    roofline = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(roofline)
     measured, slam = roofline.counted(3, 0.04)
     assert measured["iterations"] >= 3
     assert measured["linearised"] >= 3 * 80 * 60
     assert measured["blocks"] > 100
     assert all(bytes_ > 0 and operations > 0 for _, bytes_, operations, _ in roofline.stages(measured, slam))
+
+
+def test_a_short_soak_has_a_row_for_each_tenth():
+    rows = []
+    assert measure_soak(20, (80, 60), 0, rows.append) == rows
+    assert [row["frames"] for row in rows] == list(range(2, 21, 2))
+    assert grown([*rows[:2], rows[1]]) == []
+    worse = {"cpu_ms": 1.2, "memory_mb": 1.2, "error_mm": 50}
+    assert len(grown([*rows[:2], {key: rows[1][key] * factor for key, factor in worse.items()}])) == 3

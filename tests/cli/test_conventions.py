@@ -123,9 +123,8 @@ FAKED = {
         ["benchmark", "limits", "--out", "limits"],
         {
             "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.lab.benchmark.heatmaps.save_heat_maps": lambda *_: None,
-            "dudmap.lab.benchmark.heatmaps.limits_table": lambda *_: "",
-            "dudmap.lab.benchmark.heatmaps.cells_table": lambda *_: "",
+            "dudmap.lab.benchmark.limits.limits_table": lambda *_: "",
+            "dudmap.lab.benchmark.limits.cells_table": lambda *_: "",
         },
     ),
     "benchmark gpu": (
@@ -143,7 +142,15 @@ FAKED = {
         ["benchmark", "speed", "--out", "speed"],
         {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
-    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
+    "benchmark roofline": (
+        ["benchmark", "roofline", "--out", "roofline"],
+        {"dudmap.lab.benchmark.roofline.roofline": lambda *_: ({}, "")},
+    ),
+    "benchmark soak": (
+        ["benchmark", "soak"],
+        {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
+    ),
+    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.roofline.count_calls": lambda *_: []}),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
         {
@@ -154,8 +161,8 @@ FAKED = {
     "benchmark first-second": (
         ["benchmark", "first-second", "--seeds", 1],
         {
-            "dudmap.lab.benchmark.first_second.measure_first_second": lambda *_: [],
-            "dudmap.lab.benchmark.first_second.first_second_table": lambda _: "",
+            "dudmap.lab.benchmark.bias.measure_first_second": lambda *_: [],
+            "dudmap.lab.benchmark.bias.first_second_table": lambda _: "",
             "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
         },
     ),
@@ -175,7 +182,7 @@ FAKED = {
     ),
     "study thesis": (
         ["study", "thesis", "--published", "--out", "published"],
-        {"dudmap.lab.study.thesis.published_report": lambda _: "an outcome"},
+        {"dudmap.lab.study.study.published_report": lambda _: "an outcome"},
     ),
 }
 """Long commands, with their measurements replaced."""

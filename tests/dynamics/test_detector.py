@@ -12,7 +12,7 @@ from dudmap.core.dynamics.mixture import Mixture, fit_mixture
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.systems import systems
+from dudmap.lab.benchmark.suites import systems
 from oracle import half_normal_mixture_em
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)

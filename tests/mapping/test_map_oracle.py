@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import hashing
-from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu import fusion, hashing
 from dudmap.core.backends.cpu.visibility import SETTLED
 from dudmap.core.backends.parameters import SensorNoise
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.integrator import FRONTAL_WEIGHT
 from dudmap.core.map.volume import FREE, TsdfVolume
 from dudmap.core.map.voxel_blocks import MAX_LOAD
 from dudmap.errors import MapError
@@ -42,7 +40,7 @@ def intensity(volume: TsdfVolume) -> np.ndarray:
 
 def reading_weights(depth, camera, sensor):
     noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
-    return CpuBackend().reading_weights(depth, camera.intrinsics, noise, FRONTAL_WEIGHT)
+    return fusion.reading_weights(depth, camera.intrinsics, noise)
 
 
 def allowed(volume: TsdfVolume) -> float:

@@ -13,7 +13,7 @@ from dudmap.app.pipeline.inspection import inspect
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.io.sequences import open_sequence
-from dudmap.lab.benchmark.wrong_input import LARGE, RIGHT, SPOILT, SpoiltSequence
+from dudmap.lab.benchmark.stream_faults import LARGE, RIGHT, SPOILT, SpoiltSequence
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 SAID = {

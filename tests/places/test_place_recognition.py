@@ -16,7 +16,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.slam import Slam
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
-from dudmap.lab.synthetic.ring_corridor import ring_corridor
+from ring_corridor import ring_corridor
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 

@@ -5,8 +5,8 @@ import time
 from pathlib import Path
 
 from dudmap.lab.study.conduct import conduct
-from dudmap.lab.study.executor import LocalExecutor
 from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.worker import LocalExecutor
 
 
 def sleep_row(run, out):

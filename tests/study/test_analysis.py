@@ -5,12 +5,11 @@ import pandas as pd
 import pytest
 
 from dudmap.config import Config
-from dudmap.lab.study.analysis import pareto_front, predict_optimum
-from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, points_of
-from dudmap.lab.study.factors import make_factors
-from dudmap.lab.study.indices import emulated_indices, morris_indices, sobol_indices
-from dudmap.lab.study.judgement import confirm, influence
-from dudmap.lab.study.response_surface import fit_surface, lack_of_fit
+from dudmap.lab.study.analysis import pareto_front
+from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, make_factors, points_of
+from dudmap.lab.study.effects import emulated_indices, morris_indices, sobol_indices
+from dudmap.lab.study.response_surface import carried_by, confirm, fit_surface, lack_of_fit, predict_optimum
+from dudmap.lab.study.responses import Scale
 
 RANGES = {"tracker.huber": {"range": [0.005, 0.025]}, "volume.voxel_size": {"range": [0.01, 0.04], "scale": "log"},
           "tracker.damping": {"range": [0.002, 0.02]}}  # fmt: skip
@@ -27,13 +26,13 @@ def runs_of(factors, options, response, repeats=1, noise=0.0):
         x = [float(factor.coded(point[factor.key])) for factor in factors]
         for repeat in range(repeats):
             y = response(*x) + noise * rng.normal()
-            rows.append({"point": number, "sequence": "a", "replicate": repeat, **point, "ate_rmse_m": y, "ate": y})
+            rows.append({"point": number, "sequence": "a", "replicate": repeat, **point, "ate": y})
     return pd.DataFrame(rows)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in DESIGNS if kind != "full-factorial"])
 def test_designs_stay_in_their_bounds_and_are_counted(kind):
-    factors, options = factors_of(), DesignOptions(kind, samples=8, generators="a b ab" if "frac" in kind else "")
+    factors, options = factors_of(), DesignOptions(kind=kind, samples=8, generators="a b ab" if "frac" in kind else "")
     points = points_of(factors, options)
     assert len(points) == count_of(factors, options)
     coded = np.array([[float(f.coded(point[f.key])) for f in factors] for point in points])
@@ -51,7 +50,7 @@ def test_a_full_factorial_design_has_every_combination_once():
 
 def test_whole_numbers_stay_whole():
     factors = factors_of({"volume.max_weight": {"range": [10, 99]}, "tracker.huber": {"range": [0.005, 0.01]}})
-    points = points_of(factors, DesignOptions("latin-hypercube", samples=5))
+    points = points_of(factors, DesignOptions(kind="latin-hypercube", samples=5))
     assert all(type(point["volume.max_weight"]) is int for point in points)
 
 
@@ -61,7 +60,7 @@ def additive(x, y, z):
 
 def test_sobol_indices_of_an_additive_function():
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("saltelli", samples=256), additive)
+    table = runs_of(factors, DesignOptions(kind="saltelli", samples=256), additive)
     found = sobol_indices(factors, table["ate"].to_numpy()).set_index(["term", "order"])["index"]
     # variances of 3 x, y and 0 z are as 9 : 1 : 0
     assert found["huber", "first"] == pytest.approx(0.9, abs=0.03)
@@ -72,7 +71,7 @@ def test_sobol_indices_of_an_additive_function():
 
 def test_an_emulator_gives_the_same_indices_from_a_latin_hypercube():
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("latin-hypercube", samples=40), additive)
+    table = runs_of(factors, DesignOptions(kind="latin-hypercube", samples=40), additive)
     found, text = emulated_indices(table, factors, "ate")
     assert "100%" in text
     found = found.set_index(["term", "order"])["index"]
@@ -81,7 +80,7 @@ def test_an_emulator_gives_the_same_indices_from_a_latin_hypercube():
 
 def test_an_emulator_of_noise_gives_no_indices():
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("latin-hypercube", samples=40), lambda x, y, z: 0.0, noise=1.0)
+    table = runs_of(factors, DesignOptions(kind="latin-hypercube", samples=40), lambda x, y, z: 0.0, noise=1.0)
     found, text = emulated_indices(table, factors, "ate")
     assert found is None
     assert "mean nothing" in text
@@ -89,7 +88,7 @@ def test_an_emulator_of_noise_gives_no_indices():
 
 def test_morris_ranks_the_factors():
     factors = factors_of()
-    options = DesignOptions("morris", samples=6)
+    options = DesignOptions(kind="morris", samples=6)
     table = runs_of(factors, options, additive)
     coded = np.column_stack([factor.coded(table[factor.key]) for factor in factors])
     found = morris_indices(factors, coded, table["ate"].to_numpy())
@@ -103,11 +102,11 @@ def bowl(x, y, z):
 
 def test_a_quadratic_response_is_found_believed_and_confirmed():
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("central-composite"), bowl, repeats=2, noise=2e-4)
-    found = predict_optimum(table, factors, "ate")
+    table = runs_of(factors, DesignOptions(kind="central-composite"), bowl, repeats=2, noise=2e-4)
+    found = predict_optimum(table, factors, Scale("ate"))
     assert found.reasons == ()
     np.testing.assert_allclose(found.best.coded, [0.3, -0.5, 0], atol=0.1)
-    assert lack_of_fit(found.surface).p > 0.05
+    assert lack_of_fit(found.surface)[1] > 0.05
     truth = bowl(*found.best.coded)
     held = confirm(found.surface, found.best, [truth], [bowl(0, 0, 0)])
     assert held.held
@@ -117,26 +116,32 @@ def test_a_quadratic_response_is_found_believed_and_confirmed():
 def test_a_response_that_is_not_quadratic_lacks_fit():
     factors = factors_of()
     step = lambda x, y, z: float(x > 0.5) + float(y > 0.5) * float(z < -0.5)  # noqa: E731
-    table = runs_of(factors, DesignOptions("central-composite"), step, repeats=2, noise=1e-3)
-    surface = fit_surface(table, factors, "ate")
-    assert lack_of_fit(surface).p < 0.01
+    table = runs_of(factors, DesignOptions(kind="central-composite"), step, repeats=2, noise=1e-3)
+    surface = fit_surface(table, factors, Scale("ate"))
+    assert lack_of_fit(surface)[1] < 0.01
 
 
 def test_a_single_run_that_differs_carries_the_model():
     """Such as the only one that lost frames: without it there is no variance left to explain."""
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("central-composite"), lambda *_: 7.0, repeats=2)
+    table = runs_of(factors, DesignOptions(kind="central-composite"), lambda *_: 7.0, repeats=2)
     table.loc[3, "ate"] = 9.0
-    surface = fit_surface(table, factors, "ate")
-    single = influence(surface)
-    assert (single.value, single.r2_without) == (9, 0)
-    assert single.optimum_without.predicted == pytest.approx(7)
+    words = carried_by(fit_surface(table, factors, Scale("ate")))
+    assert "One value carries the model: 9 mm at huber" in words
+    assert "without it R2 is 0.00, and the optimum 7 mm" in words
 
 
 def test_two_levels_give_no_quadratic_model():
     factors = factors_of()
-    table = runs_of(factors, DesignOptions("fractional-factorial", generators="a b ab"), bowl)
-    assert "three or more levels" in fit_surface(table, factors, "ate")
+    table = runs_of(factors, DesignOptions(kind="fractional-factorial", generators="a b ab"), bowl)
+    assert "three or more levels" in fit_surface(table, factors, Scale("ate"))
+
+
+def test_a_logarithm_is_shown_in_the_unit_of_the_response():
+    scale, table = Scale("ate", log=True), pd.DataFrame({"ate_rmse_m": [0.01, 0.02, float("nan")]})
+    data = scale.usable(table)
+    assert [scale.text(value) for value in data["ate"]] == ["10 mm", "20 mm"]
+    assert scale.heading == "log of ATE RMSE, mm"
 
 
 def test_pareto_front():

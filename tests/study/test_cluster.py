@@ -12,7 +12,7 @@ ray = pytest.importorskip("ray")
 
 from dudmap.errors import ConfigError
 from dudmap.lab.study.conduct import conduct
-from dudmap.lab.study.store import StudyFolder
+from dudmap.lab.study.worker import StudyFolder
 from study.crash_study import sleep_row, tiny_plan
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]

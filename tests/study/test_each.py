@@ -38,9 +38,9 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
     each = pd.read_csv(tmp_path / "each.csv").set_index("recording")
     assert each.loc["near", "huber"] == pytest.approx(0.007, abs=7e-4)
     assert each.loc["far", "huber"] == pytest.approx(0.012, abs=7e-4)
-    assert each.loc["near", "measured"] == pytest.approx(0.1, abs=5e-3)
+    assert each.loc["near", "measured"] == pytest.approx(100, abs=5)
     assert each.loc["trap", "held"] == "no"
-    assert each.loc["trap", "measured"] > 0.5
+    assert each.loc["trap", "measured"] > 500
     report = (tmp_path / "report.md").read_text()
     assert "each recording on its own" in report
     assert "5 of 15 runs tracked less than 90% of the frames" in report
@@ -48,13 +48,12 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
 
 def test_progress_says_time_left_core_hours_and_cost():
     state = Progress(total=100, done=20, begun=10, spent=7200.0, started=0.0, cores=2)
-    assert state.core_hours == pytest.approx(4)
-    assert "4.0 h of about 20.0 h of core time" in str(state)
-    assert "cost" not in str(state)
+    assert "4.0 h of about 20.0 h of core time" in state.describe()
+    assert "cost" not in state.describe()
     assert "cost 0.20 of about 1.00" in state.describe(0.05)
-    assert "left" in str(state)
-    assert "3 s of about 26 s of core time" in str(Progress(total=9, done=1, begun=0, spent=2.836))
-    assert "run 0 of 9, 0 s of about 0 s of core time" in str(Progress(9, 0, 0))
+    assert "left" in state.describe()
+    assert "3 s of about 26 s of core time" in Progress(total=9, done=1, begun=0, spent=2.836).describe()
+    assert "run 0 of 9, 0 s of about 0 s of core time" in Progress(9, 0, 0).describe()
 
 
 def test_a_plackett_burman_design_needs_two_levels():

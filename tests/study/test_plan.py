@@ -6,8 +6,8 @@ from typer.testing import CliRunner
 from dudmap.cli import app
 from dudmap.errors import DudmapError
 from dudmap.lab.study.plan import make_plan
-from dudmap.lab.study.thesis import thesis_plan
-from dudmap.lab.study.tune import check_tune, tune_options
+from dudmap.lab.study.study import thesis_plan
+from dudmap.lab.study.tune import check_tune
 from recordings import write_recording
 
 ROOM = {"scene": "room", "movers": [], "frames": 6, "camera": [160, 120]}
@@ -69,12 +69,12 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"factors": {"volume.max_weight": {"range": [1.5, 9]}}}, "whole numbers"),
         ({"factors": {}}, "no factors"),
         ({"factors": {"tracker.huber": {"range": [0.01, 0.02]}}}, "needs levels, but tracker.huber has a range"),
-        ({"each": 3}, "each is 3; expected true or false"),
-        ({"design": "hexagonal"}, "unknown design 'hexagonal'"),
+        ({"each": 3}, "each of the design is 3; expected true or false"),
+        ({"design": "hexagonal"}, "kind of the design is 'hexagonal'; expected one of full-factorial"),
         ({"design": {"kind": "sobol", "samples": 5}}, "power of two"),
         ({"design": "box-behnken"}, "three factors"),
-        ({"design": {"sample": 5}}, "unknown option 'sample'"),
-        ({"design": {"samples": "many"}}, "expected a int"),
+        ({"design": {"sample": 5}}, "unknown key 'sample' of the design"),
+        ({"design": {"samples": "many"}}, "samples of the design is 'many'"),
         ({"sequences": []}, "no sequences"),
         ({"sequences": [{"path": "nowhere"}]}, "there is no folder"),
         ({"sequences": [{"scene": "moon"}]}, "moon"),
@@ -88,7 +88,7 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"base": ["preset=best"]}, "unknown preset"),
         ({"confirm": -1}, "confirmation runs"),
         ({"calibrate": "yes"}, "true or false"),
-        ({"faktors": {}}, "unknown section 'faktors'"),
+        ({"faktors": {}}, "unknown key 'faktors' of the design"),
         ({"factors": {"volume.min_weight": [3, 200]}, "base": ["volume.max_readings=48"]}, "min_weight"),
     ],
 )  # fmt: skip
@@ -123,14 +123,13 @@ def test_a_recording_without_the_truth_is_refused(tmp_path, response, words):
         ({"judge": [ROOM]}, "has 1 recordings"),
         ({"judge": [{**ROOM, "replicates": 3}]}, "in both sets"),
         ({"judge": [{**ROOM, "replicates": 3, "seed": 9}], "tune": {"trials": 999}}, "more than --max-runs"),
-        ({"tune": {"trails": 3}}, "unknown option 'trails'"),
+        ({"tune": {"trails": 3}}, "unknown key 'trails' of tune"),
         ({"tune": {"early": 1.5}}, "early from 0 to below 1"),
     ],
 )
 def test_mistakes_of_a_search(changed, words):
-    plan = make_plan({**GOOD, **changed})
     with pytest.raises(DudmapError, match=words):
-        check_tune(plan, tune_options(plan.tune))
+        check_tune(make_plan({**GOOD, **changed}))
 
 
 def test_the_command_refuses_in_one_sentence(tmp_path, monkeypatch):

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from dudmap.lab.study.conduct import ATTEMPTS, conduct, table_of
-from dudmap.lab.study.executor import LocalExecutor
-from dudmap.lab.study.store import StudyFolder
+from dudmap.lab.study.conduct import ATTEMPTS, StudyFolder, conduct, table_of
+from dudmap.lab.study.worker import LocalExecutor
 from study.crash_study import die_always, die_once, sleep_row, tiny_plan
 
 SCRIPT = Path(__file__).with_name("crash_study.py")
@@ -140,7 +139,7 @@ def test_a_claimed_run_belongs_to_one_process(tmp_path):
     with store.claim("a") as mine:
         assert mine
         other = (
-            f"from dudmap.lab.study import store\nwith store.StudyFolder({str(tmp_path)!r}).claim('a') as m: print(m)"
+            f"from dudmap.lab.study import worker\nwith worker.StudyFolder({str(tmp_path)!r}).claim('a') as m: print(m)"
         )
         done = subprocess.run(
             [sys.executable, "-c", other], capture_output=True, text=True, check=True, env=dict(os.environ)

@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from dudmap.config import Config
-from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.measure import measure_sequence
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.study.plan import make_plan
 from dudmap.lab.study.study import run_study
 from study.here import Here
@@ -58,8 +58,8 @@ def test_the_report_has_every_response(study):
     out, _ = study
     report = (out / "report.md").read_text(encoding="utf-8")
     for heading in (
-        "ATE RMSE, m",
-        "ms per frame",
+        "ATE RMSE, mm",
+        "time per frame, ms",
         "lost frames",
         "mask IoU",
         "peak memory, MB",

@@ -1,5 +1,5 @@
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -9,13 +9,18 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic import SensorFaults
-from dudmap.lab.synthetic.cameras import CAMERAS
-from dudmap.lab.synthetic.color_camera import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
-from dudmap.lab.synthetic.depth_faults import WAVE_NUMBER, with_flying_pixels, with_multipath
+from dudmap.lab.synthetic.color_camera import (
+    LARGEST_GAIN,
+    TARGET_LEVEL,
+    WAVE_NUMBER,
+    exposure_gains,
+    with_flying_pixels,
+    with_multipath,
+)
 from dudmap.lab.synthetic.faults import LIMITS, parse_faults
 from dudmap.lab.synthetic.folder import write_folder
 from dudmap.lab.synthetic.render import Rendering
-from dudmap.lab.synthetic.sensors import SENSORS, Sensor
+from dudmap.lab.synthetic.sensors import CAMERAS, SENSORS, Sensor
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 UNREGISTERED = SensorFaults(
@@ -139,10 +144,11 @@ def test_truth_is_written_beside_the_recording(tmp_path):
 
 
 def test_faults_by_name():
-    assert parse_faults(["color_delay=0.025", "color_translation=0.025, 0,0"]) == SensorFaults(
-        color_delay=0.025, color_translation=(0.025, 0.0, 0.0)
-    )
-    assert parse_faults(["color_delay=0.01"], UNREGISTERED).color_focal_ratio == 0.95
+    found = parse_faults(["color_delay=0.025", "color_translation=0.025, 0,0"])
+    assert found == {"color_delay": 0.025, "color_translation": (0.025, 0.0, 0.0)}
+    named = synthetic.sequence(sensor="kinect_v2", faults=found, camera=(160, 120), frames=2)
+    assert named.faults == replace(CAMERAS["kinect_v2"].faults, **found)
+    assert named.camera == CAMERAS["kinect_v2"].camera(160, 120)
     assert set(LIMITS) == {field.name for field in fields(SensorFaults)}
 
 
@@ -158,7 +164,7 @@ def test_faults_by_name():
 )
 def test_bad_faults_are_one_sentence(assignment, sentence):
     with pytest.raises(ConfigError) as error:
-        parse_faults([assignment])
+        SensorFaults(**parse_faults([assignment]))
     assert sentence in str(error.value)
 
 

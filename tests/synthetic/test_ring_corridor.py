@@ -7,7 +7,7 @@ from dudmap.config import Config
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-from dudmap.lab.synthetic.ring_corridor import ring_corridor
+from ring_corridor import ring_corridor
 
 LENGTH, BETWEEN = 60, 1.0
 """Of the walk until it is where it began, and between two keyframes, metres."""

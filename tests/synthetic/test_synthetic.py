@@ -345,7 +345,7 @@ def test_folder_opens_again_as_the_same_recording(tmp_path):
     [
         ({"scene": "palace"}, "unknown scene 'palace'; known scenes: room, corridor"),
         ({"movers": ("dog",)}, "unknown mover 'dog'; known movers: person"),
-        ({"noise": "lidar"}, "unknown noise model 'lidar'; known models: kinect, realsense, none"),
+        ({"noise": "lidar"}, "unknown noise model 'lidar'; known noise models: kinect, realsense, none"),
         ({"camera_path": "zigzag"}, "camera path 'zigzag' is neither a trajectory file nor one of handheld"),
         ({"situation": "fog"}, "unknown situation 'fog'; known situations: people_at_start"),
         ({"coverage": 1.5}, "coverage is 1.5"),

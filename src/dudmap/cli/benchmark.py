@@ -1,7 +1,6 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
 import json
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,12 +9,9 @@ import typer
 
 from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
-from dudmap.cli.benchmark_gpu import gpu
+from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, roofline, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
-
-RUNS = Path("runs/benchmark")
-"""Folder of the output folders, unless another one is named."""
 
 app = typer.Typer(
     add_completion=False,
@@ -26,15 +22,16 @@ app = typer.Typer(
 SystemsOption = Annotated[
     str,
     typer.Option(
-        "--systems", help="Comma-separated: dudmap, thesis, threshold, none, em, or paths of .toml configurations."
+        "--systems",
+        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of the suite ablation, the "
+        "default with one part switched off at a time.",
     ),
 ]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
 
 
 def suite_command(
     context: typer.Context,
-    systems: SystemsOption = "dudmap",
+    systems: SystemsOption = "",
     out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the recordings; nothing is downloaded.")] = None,
     jobs: o.JobsOption = 1,
@@ -50,11 +47,12 @@ def suite_command(
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.lab.benchmark.report import named_folders, run_suite
-    from dudmap.lab.benchmark.suites import find_suite
-    from dudmap.lab.benchmark.systems import systems as find_systems
+    from dudmap.lab.benchmark.suites import ABLATION, find_suite
+    from dudmap.lab.benchmark.suites import systems as find_systems
 
     name = str(context.info_name)
-    wanted, others = find_systems(systems), named_folders(score or [])
+    usual = ABLATION if name == "ablation" else "dudmap"
+    wanted, others = find_systems(systems or usual), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or RUNS / name
     text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
@@ -62,7 +60,8 @@ def suite_command(
     _answer(tree, text, out, as_json=as_json)
 
 
-app.command()(gpu)
+for _command in (speed, gpu, roofline, soak):
+    app.command()(_command)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
 
@@ -80,6 +79,7 @@ def _print_outcome(row: dict[str, Any]) -> None:
 def sensors(
     out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
     only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
+    data: Annotated[Path | None, typer.Option(help="Measure the recordings in this folder instead.")] = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     assignments: o.SetOption = None,
@@ -91,10 +91,11 @@ def sensors(
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.color_columns import color_table, measure_columns
-    from dudmap.lab.benchmark.suites import sensor_entries
-    from dudmap.lab.benchmark.table import save
+    from dudmap.lab.benchmark.measure import save
+    from dudmap.lab.benchmark.suites import local_entries, sensor_entries
 
-    entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
+    names = [name for name in only.split(",") if name]
+    entries = sensor_entries(names, quick=quick) if data is None else local_entries(data)
     rows = measure_columns(entries, o.read_config(None, None, assignments), jobs, _print_outcome)
     text = color_table(rows)
     save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
@@ -178,7 +179,7 @@ def first_second(
 ) -> None:
     """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
     from dudmap.lab import synthetic
-    from dudmap.lab.benchmark.first_second import FRAMES, first_second_table, measure_first_second
+    from dudmap.lab.benchmark.bias import FRAMES, first_second_table, measure_first_second
 
     config = o.read_config(None, None, assignments)
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
@@ -204,8 +205,8 @@ def calls(
 ) -> None:
     """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.calls import count_calls, summary
-    from dudmap.lab.benchmark.entries import Entry
+    from dudmap.lab.benchmark.roofline import count_calls, summary
+    from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
     source = room.open() if recording is None else open_sequence(recording)
@@ -262,8 +263,14 @@ def wrong_input(
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
     from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.stream_faults import default_room
-    from dudmap.lab.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
+    from dudmap.lab.benchmark.stream_faults import (
+        LARGE,
+        SPOILT,
+        default_room,
+        fails,
+        measure_wrong_input,
+        spoilt_table,
+    )  # fmt: skip
 
     config, runs = Config(), []
     if recording is not None:
@@ -272,8 +279,8 @@ def wrong_input(
         at_desk = [name for name in SPOILT if name != LARGE]
         runs += measure_wrong_input(default_room(max_frames, width, 0, "desk"), config, at_desk, max_frames)
         runs += measure_wrong_input(default_room(max_frames, width, 0), config, [LARGE], max_frames)
-    failed = [run.name for run in runs if run.fails]
-    answer({"runs": [run._asdict() for run in runs], "failed": failed}, spoilt_table(runs), as_json=as_json)
+    failed = [run["name"] for run in runs if fails(run)]
+    answer({"runs": runs, "failed": failed}, spoilt_table(runs), as_json=as_json)
     if failed:
         say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
         raise typer.Exit(1)
@@ -301,8 +308,8 @@ def gate(
         return
     assert old is not None
     checks = gates.compare(rows, old)
-    failed = sum(not check.passed for check in checks)
-    tree = {"failed": failed, "checks": [asdict(check) | {"passed": check.passed} for check in checks]}
+    failed = sum(not check["passed"] for check in checks)
+    tree = {"failed": failed, "checks": checks}
     answer(tree, gates.verdict(checks), as_json=as_json)
     if failed:
         say(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
@@ -312,22 +319,29 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option(help="Output folder for heat maps and figures.")] = RUNS / "limits",
+    out: Annotated[Path, typer.Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
     """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
-    Writes heat maps (PNG) of ATE, mask IoU, ghost area and share of lost frames, and limits.md, .csv and .json.
-    Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
+    The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements
+    of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
     from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.conditions import FRAMES
-    from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
-    from dudmap.lab.benchmark.limits import QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
-    from dudmap.lab.benchmark.systems import systems as find_systems
-    from dudmap.lab.benchmark.table import save
+    from dudmap.lab.benchmark.limits import (
+        FRAMES,
+        QUICK_FRAMES,
+        QUICK_SWEEPS,
+        SWEEPS,
+        cells_table,
+        grid_cells,
+        limits_table,
+        measure_cells,
+    )
+    from dudmap.lab.benchmark.measure import save
+    from dudmap.lab.benchmark.suites import systems as find_systems
 
     wanted = find_systems(systems)
     sweeps = QUICK_SWEEPS if quick else SWEEPS
@@ -335,54 +349,15 @@ def limits(
     total, finished = len({cell.condition for cell in cells}), 0
     with counted("conditions", quiet=as_json) as progress:
 
-        def done(count: int) -> None:
+        def done(_: object) -> None:
             nonlocal finished
-            finished += count
+            finished += 1
             progress(finished, total)
 
-        rows = measure_cells(cells, wanted, out / "measured", jobs, done)
-    for sweep in sweeps:
-        save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
+        rows = measure_cells(cells, wanted, out, jobs, done)
     text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
     text += limits_table(rows, sweeps, list(wanted))
     text += "\nATE RMSE in mm and share of lost frames; bold where the system copes:\n"
     text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     _answer({"rows": rows}, text, out, as_json=as_json)
-
-
-@app.command()
-def speed(
-    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
-    long: Annotated[
-        bool, typer.Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
-    ] = False,
-    open3d: Annotated[
-        Path | None,
-        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."),
-    ] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="Recording of that comparison; default: a synthetic room.")
-    ] = None,
-    quick: QuickOption = False,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Measure time and memory on this machine, which should be idle otherwise."""
-    from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.interleaved import find_open3d
-    from dudmap.lab.benchmark.speed import markdown, speed_figures
-
-    frames, long_frames = (20, 60) if quick else (300, 2000)
-    figures = speed_figures(
-        frames,
-        long_frames if long else 0,
-        lambda what: say(f"measuring {what}", err=True),
-        find_open3d(open3d),
-        recording,
-    )
-    text = markdown(figures)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "speed.md").write_text(text, encoding="utf-8")
-    content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
-    (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    _answer(content, text, out, as_json=as_json)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dudmap.lab.study.conduct import Progress
-    from dudmap.lab.study.executor import Executor
+    from dudmap.lab.study.worker import Executor
 
 
 app = typer.Typer(
@@ -81,8 +81,7 @@ def thesis(
     as_json: o.JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
-    from dudmap.lab.study.study import run_study
-    from dudmap.lab.study.thesis import published_report, thesis_plan
+    from dudmap.lab.study.study import published_report, run_study, thesis_plan
 
     need("study", "dudmap study", STUDY)
     if published:
@@ -127,7 +126,7 @@ def _executor(jobs: int, cluster: str) -> "Executor":
         from dudmap.lab.study.cluster import RayExecutor
 
         return RayExecutor(cluster, jobs or None)
-    from dudmap.lab.study.executor import LocalExecutor, usable_cores
+    from dudmap.lab.study.worker import LocalExecutor, usable_cores
 
     return LocalExecutor(jobs or usable_cores())
 

@@ -83,13 +83,9 @@ def synth(
     surface_observed.ply, scene.json and sensor_truth.json.
     """
     from dudmap.lab import synthetic
-    from dudmap.lab.synthetic.cameras import find_camera
     from dudmap.lab.synthetic.faults import parse_faults
     from dudmap.lab.synthetic.folder import write_folder
-    from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
-    model = find_camera(sensor) if sensor is not None else None
-    width, height = o.image_size(size)
     sequence = synthetic.sequence(
         scene=scene,
         movers=_names(movers),
@@ -102,11 +98,11 @@ def synth(
         start_dynamic=start_dynamic,
         situation=situation,
         seed=seed,
-        camera=model.camera(width, height) if model else DEFAULT_CAMERA.resized(width, height),
+        camera=o.image_size(size),
         motion_blur=motion_blur,
         exposure_change=exposure_change,
         sensor=sensor,
-        faults=parse_faults(fault or [], model.faults if model else None),
+        faults=parse_faults(fault or []),
     )
     import time
 

@@ -22,7 +22,7 @@ core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
-core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
+core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FreeSpace,TouchedBlocks,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
 core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.collector:KeyframeCollector core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
 core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet

@@ -236,21 +236,55 @@ class DepthTiles(NamedTuple):
 
 
 class DepthView(NamedTuple):
-    """A depth image at a known pose.
+    """A depth image to be fused, at a known pose.
 
     Attributes:
         depth: (H, W) float32, metres, 0 = none.
-        tiles: Depth ranges of its tiles.
+        color: (H, W, 3) uint8.
+        used: (H, W) bool, readings to be fused; the others change nothing.
+        weights: (H, W) uint8 weight of each reading; None = cos(theta) / sigma(z) (thesis eq. 4.20).
         intrinsics: (4,) float32 fx, fy, cx, cy.
         T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
-        T_camera_world: (3, 4) float32, world to camera, metres.
+        T_camera_world: (3, 4) float32, world to camera, metres, from the local origin of the window.
+        T_world_camera: (4, 4) float64, camera to the world of the map.
     """
 
     depth: NDArray[np.float32]
-    tiles: DepthTiles
+    color: NDArray[np.uint8]
+    used: NDArray[np.bool_]
+    weights: NDArray[np.uint8] | None
     intrinsics: NDArray[np.float32]
     T_grid_camera: NDArray[np.float32]
     T_camera_world: NDArray[np.float32]
+    T_world_camera: NDArray[np.float64]
+
+
+class FreeSpace(NamedTuple):
+    """Which blocks without voxels are observed to be empty: those in every second plane of the window.
+
+    Attributes:
+        parity: 0 or 1, the first plane.
+        after: Observations that make a block known free space; it is not visited again.
+    """
+
+    parity: int
+    after: int
+
+
+class TouchedBlocks(NamedTuple):
+    """An image prepared for the fusion, and what it touches.
+
+    Attributes:
+        cells: (n,) int32, ascending, window cells of blocks without voxels that its truncation bands touch.
+        depth: (H, W) float32, metres, the readings to be fused, 0 = none.
+        weights: (H, W) uint8, weight of each.
+        tiles: Depth ranges of the tiles of the image.
+    """
+
+    cells: NDArray[np.int32]
+    depth: NDArray[np.float32]
+    weights: NDArray[np.uint8]
+    tiles: DepthTiles
 
 
 class FusedBlocks(NamedTuple):
@@ -259,10 +293,13 @@ class FusedBlocks(NamedTuple):
     Attributes:
         slots: (n,) int32.
         occupied: (n,) int32 voxels of each that hold a surface or were never seen.
+        empty: (m,) int32 window cells without an entry that were seen to be empty; their observations are the
+            caller's to store.
     """
 
     slots: NDArray[np.int32]
     occupied: NDArray[np.int32]
+    empty: NDArray[np.int32]
 
 
 class ImageStack(Protocol):

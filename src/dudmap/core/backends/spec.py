@@ -10,6 +10,7 @@ from dudmap.core.backends.parameters import (
     ColorProjection,
     DepthView,
     FilterParameters,
+    FreeSpace,
     FusedBlocks,
     FusionParameters,
     MapSample,
@@ -17,7 +18,7 @@ from dudmap.core.backends.parameters import (
     RaycastParameters,
     RaycastResult,
     RegistrationParameters,
-    SensorNoise,
+    TouchedBlocks,
     VoxelGrid,
 )
 
@@ -75,38 +76,20 @@ class Backend(Protocol):
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 
-    def view(
-        self,
-        depth: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        T_camera_world: NDArray[np.float32],
-    ) -> DepthView:
-        """A depth image (H, W) at a pose, ready for the other steps of the integration."""
-        ...
-
-    def reading_weights(
-        self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
-    ) -> NDArray[np.uint8]:
-        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m."""
-        ...
-
-    def touched_cells(
+    def touch(
         self,
         grid: VoxelGrid,
         view: DepthView,
         stamps: NDArray[np.int32],
-        stride: int,
         free_after: int,
         frame_number: int,
         parameters: FusionParameters,
-    ) -> NDArray[np.int32]:
-        """Window cells (n,), ascending, of the blocks without voxels that the truncation bands of an image touch.
+    ) -> TouchedBlocks:
+        """Prepare an image for the fusion, and find the blocks without voxels that its truncation bands touch.
 
         Args:
             grid, view: The map and the image.
             stamps: (cells,) int32, number of the frame that last found a cell; changed here.
-            stride: Step between the pixels that are looked at.
             free_after: Observations that make a block known free space.
             frame_number: Number of this frame, larger than all before.
             parameters: Of the fusion.
@@ -117,44 +100,27 @@ class Backend(Protocol):
         self,
         grid: VoxelGrid,
         view: DepthView,
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8],
+        touched: TouchedBlocks,
         candidates: NDArray[np.int32],
         fused: NDArray[np.uint8],
         turn: int,
         count: int,
+        free_space: FreeSpace | None,
         parameters: FusionParameters,
     ) -> FusedBlocks:
-        """Average an image into the voxels in view (eq. 4.18-4.23); changes ``grid.geometry`` and ``grid.colors``.
+        """Average an image into the voxels in view (eq. 4.18-4.23), and observe the space in front of its readings.
+
+        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``.
 
         Args:
             grid, view: The map and the image.
-            color: (H, W, 3) uint8.
-            weights: (H, W) uint8 weight of each reading.
+            touched: What ``touch`` found for it.
             candidates: (n,) int32 slots that may be in view.
             fused: (slots,) uint8 frames that were fused into each slot.
             turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
             count: Number of equal frames that this one stands for.
+            free_space: Which empty blocks to observe; None = none.
             parameters: Of the fusion.
-        """
-        ...
-
-    def observe_free(
-        self,
-        grid: VoxelGrid,
-        view: DepthView,
-        parity: int,
-        count: int,
-        free_after: int,
-        parameters: FusionParameters,
-    ) -> NDArray[np.int32]:
-        """Add ``count`` observations of emptiness to blocks without voxels in front of all readings.
-
-        Visits every second plane of the window, beginning at ``parity``. Changes ``grid.free_count``; a block with
-        ``free_after`` observations is not visited again.
-
-        Returns:
-            (n,) int32 window cells of empty blocks without an entry, whose observations the caller has to store.
         """
         ...
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import adaptive_raycasting
-from dudmap.core.backends.parameters import DepthView, MeshParameters, RaycastParameters, RaycastResult
+from dudmap.core.backends.parameters import DepthView, MeshParameters, RaycastParameters, RaycastResult, TouchedBlocks
 from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
@@ -119,39 +119,24 @@ class AdaptiveVolume(TsdfVolume):
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
-    def _fuse(
-        self,
-        depth: NDArray[np.float32],
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
-        T_world_camera: NDArray[np.float64],
-        count: int,
-    ) -> NDArray[np.int32]:
-        weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
-        fused = super()._fuse(depth, color, weights, T_world_camera, count)
+    def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
+        fused, touched = super()._fuse(view, count)
         number = self._frame_number
-        view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
         slots, updated = self.window.near, fused
         for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
             level.make_room(parents)
             gone = parents.entry_of[updated] < 0
             level.drop(level.children_of(updated[gone]))
             children = level.children_of(slots)
-            updated_children = self._average(n, view, color, weights, children, count)
+            updated_children = self._average(n, view, touched, children, count)
             updated = updated[~gone]
-            depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
+            depths = self._depths(parents, updated, self.voxel_size / 2**n, view.T_world_camera)
             self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
             slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
-        return fused
+        return fused, touched
 
     def _average(
-        self,
-        n: int,
-        view: DepthView,
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8],
-        candidates: NDArray[np.int32],
-        count: int,
+        self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
         """Average an image into blocks of a finer level, and drop those that it shows to be empty; slots (m,) of all
         these."""
@@ -161,8 +146,8 @@ class AdaptiveVolume(TsdfVolume):
         blocks = level.blocks
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
-        slots, occupied = self.backend.fuse(
-            grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
+        slots, occupied, _ = self.backend.fuse(
+            grid, view, touched, candidates, blocks.fused, turn, count, None, integrator.parameters
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1

@@ -4,8 +4,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.parameters import DepthView, FusionParameters, SensorNoise, TruncationBand, VoxelGrid
+from dudmap.core.backends.cpu.fusion import reading_weights
+from dudmap.core.backends.parameters import (
+    DepthView,
+    FreeSpace,
+    FusionParameters,
+    SensorNoise,
+    TouchedBlocks,
+    TruncationBand,
+    VoxelGrid,
+)
 from dudmap.core.backends.spec import Backend
+from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import BlockWindow
@@ -15,8 +25,6 @@ DEPTH_MIN = 0.05
 """Blocks nearer to the camera than this are not updated, metres."""
 MIN_LIMIT = 0.3
 """Smallest limit of the distances that voxels can store, metres."""
-FRONTAL_WEIGHT = 4.0
-"""Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
 
 
 def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
@@ -54,46 +62,64 @@ class Integrator:
         self,
         blocks: VoxelBlocks,
         window: BlockWindow,
-        camera: Camera,
-        depth: NDArray[np.float32],
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
-        T_world_camera: NDArray[np.float64],
+        view: DepthView,
         frame_number: int,
         count: int,
-    ) -> NDArray[np.int32]:
+    ) -> tuple[NDArray[np.int32], TouchedBlocks]:
         """Fuse an image.
 
         Args:
             blocks, window: Blocks of the map, and the window of those around the view, to which it has been moved;
                 changed here.
-            camera: Camera of the image.
-            depth: (H, W) float32, metres, 0 where nothing is to be fused.
-            color: (H, W, 3) uint8.
-            weights: (H, W) uint8 weight of each reading; None = by the configuration.
-            T_world_camera: (4, 4).
+            view: The image.
             frame_number: Number of the frame among those of the map, from 1.
             count: Number of equal frames that it stands for.
 
         Returns:
-            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
+            (n,) int32 slots that it was averaged into, those that it shows to be empty have been released; and the
+            prepared image.
         """
-        view = self.view(window, camera, depth, T_world_camera)
-        self._allocate(blocks, window, view, frame_number)
-        weights = self.reading_weights(depth, camera) if weights is None else weights
-        slots = self._average(blocks, window, view, color, weights, frame_number, count)
+        free_after = self.config.free_after
+        touched = self.backend.touch(
+            self.grid(blocks, window), view, window.stamps, free_after, frame_number, self.parameters
+        )
+        if len(touched.cells):
+            window.allocate(touched.cells, blocks, frame_number)
+        turn = frame_number if self.config.take_turns else -1
+        free_space = FreeSpace(frame_number % 2, free_after) if self.config.carving else None
+        slots, occupied, empty = self.backend.fuse(
+            self._local_grid(blocks, window), view, touched, window.near, blocks.fused, turn, count, free_space,
+            self.parameters,
+        )  # fmt: skip
+        blocks.written[slots] = frame_number
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
         if self.config.carving:
-            self._observe_free(blocks, window, view, frame_number, count)
-        return slots
+            window.release(slots[occupied == 0], blocks, free_after)
+            window.set_free(empty, blocks, count)
+        return slots, touched
 
     def view(
-        self, window: BlockWindow, camera: Camera, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]
+        self,
+        window: BlockWindow,
+        camera: Camera,
+        frame: Frame,
+        used: NDArray[np.bool_],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
     ) -> DepthView:
-        """A depth image (H, W) at a pose (4, 4), in coordinates from the window's local origin."""
+        """A frame at a pose (4, 4), in coordinates from the window's local origin; see ``DepthView``.
+
+        Without ``weights`` those of the configuration apply: 1, or by the angle of incidence and the sensor's noise.
+        """
         T_camera_local = se3.inverse(T_world_camera)
         T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (window.local_origin * window.block_size)
         T_camera_local = T_camera_local[:3].astype(np.float32)
-        return self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_local)
+        if weights is None and self.config.weighting == "constant":
+            weights = np.ones(frame.depth.shape, dtype=np.uint8)
+        return DepthView(
+            frame.depth, frame.color, used, weights, camera.intrinsics, window.T_grid_camera(T_world_camera),
+            T_camera_local, T_world_camera,
+        )  # fmt: skip
 
     def grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
         """The blocks around the view as a back end takes them; valid until blocks are added."""
@@ -111,55 +137,8 @@ class Integrator:
         coords = (grid.slot_coords - origin).astype(grid.slot_coords.dtype)
         return grid._replace(origin=grid.origin - origin, slot_coords=coords)
 
-    def _allocate(self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int) -> None:
-        """Allocate voxels for the blocks that the truncation band of the image touches."""
-        farthest, free_after = max(float(view.depth.max()), 0.05), self.config.free_after
-        half_block = 0.5 * window.block_size * float(view.intrinsics[0]) / farthest  # pixels, at the farthest reading
-        stride = int(np.clip(half_block, 1, 8))
-        cells = self.backend.touched_cells(
-            self.grid(blocks, window), view, window.stamps, stride, free_after, frame_number, self.parameters
-        )
-        if len(cells):
-            window.allocate(cells, blocks, frame_number)
-
     def reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
         """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
         if self.config.weighting == "constant":
             return np.ones(depth.shape, dtype=np.uint8)
-        return self.backend.reading_weights(depth, camera.intrinsics, self.parameters.band.noise, FRONTAL_WEIGHT)
-
-    def _average(
-        self,
-        blocks: VoxelBlocks,
-        window: BlockWindow,
-        view: DepthView,
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8],
-        frame_number: int,
-        count: int,
-    ) -> NDArray[np.int32]:
-        """Average distances and colours into the voxels in view; release the blocks that are seen to be empty."""
-        if len(window.near) == 0:
-            return window.near
-        turn = frame_number if self.config.take_turns else -1
-        grid = self._local_grid(blocks, window)
-        slots, occupied = self.backend.fuse(
-            grid, view, color, weights, window.near, blocks.fused, turn, count, self.parameters
-        )
-        blocks.written[slots] = frame_number
-        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
-        if self.config.carving:
-            window.release(slots[occupied == 0], blocks, self.config.free_after)
-        return slots
-
-    def _observe_free(
-        self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int, count: int
-    ) -> None:
-        """Count ``count`` more observations of emptiness for blocks without voxels in front of the image.
-
-        Each call visits every second plane of the window, so that the cost is spread over two frames.
-        """
-        cells = self.backend.observe_free(
-            self._local_grid(blocks, window), view, frame_number % 2, count, self.config.free_after, self.parameters
-        )
-        window.set_free(cells, blocks, count)
+        return reading_weights(depth, camera.intrinsics, self.parameters.band.noise)

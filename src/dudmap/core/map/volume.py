@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import meshing
 from dudmap.core.backends.cpu.backend import CpuBackend
-from dudmap.core.backends.cpu.integration import used_readings
 from dudmap.core.backends.parameters import (
     FREE,
     SURFACE,
     UNKNOWN,
+    DepthView,
     MapSample,
     MeshParameters,
     RaycastParameters,
     RaycastResult,
+    TouchedBlocks,
     VoxelGrid,
 )
 from dudmap.core.backends.spec import Backend
@@ -175,25 +176,14 @@ class TsdfVolume(PagedMap):
                 f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour "
                 f"{frame.color.shape[1]}x{frame.color.shape[0]}"
             )
-        used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else np.ascontiguousarray(static_mask)
-        depth = np.empty(frame.depth.shape, dtype=np.float32)
-        used_readings(np.ascontiguousarray(frame.depth, np.float32), used, np.float32(self.depth_max), depth)
+        used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else static_mask
         self.look_at(T_world_camera)
         self._frame_number += 1
-        self._fuse(depth, frame.color, weights, T_world_camera, count)
+        self._fuse(self._integrator.view(self.window, self.camera, frame, used, weights, T_world_camera), count)
 
-    def _fuse(
-        self,
-        depth: NDArray[np.float32],
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
-        T_world_camera: NDArray[np.float64],
-        count: int,
-    ) -> NDArray[np.int32]:
-        """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
-        return self._integrator.integrate(
-            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
-        )
+    def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
+        """Fuse an image which the window covers; see ``Integrator.integrate``."""
+        return self._integrator.integrate(self.blocks, self.window, view, self._frame_number, count)
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""

@@ -1,8 +1,4 @@
-"""Mean pull of each term of the registration, at the true pose against a map fused at true poses.
-
-An instrument for systematic errors, which neither residuals nor the ATE of a run show separately: where images, poses
-and clocks are exact, every mean correction must vanish.
-"""
+"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map."""
 
 from typing import NamedTuple
 
@@ -17,9 +13,11 @@ from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.slam import Slam
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import DatasetError
 from dudmap.io.sequences import Sequence
+from dudmap.lab.benchmark.measure import grid
 
 ITERATIONS = 8
 """Gauss-Newton steps of each registration."""
@@ -51,6 +49,9 @@ class Pull(NamedTuple):
 
 def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[Pull]:
     """Fuse a static recording at its true poses, then register every ``stride``-th frame from its true pose.
+
+    This shows systematic errors, which neither residuals nor the ATE of a run show separately: where images, poses and
+    clocks are exact, every mean correction must vanish.
 
     The world frame is the first camera's, as in a run. Frames without a true pose are left out.
 
@@ -115,14 +116,69 @@ def _registered(
 
 def bias_table(pulls: list[Pull]) -> str:
     """Markdown table of the mean corrections and their spread."""
-    lines = [
-        "| term | mean x, y, z (mm) | mean rotation x, y, z (deg) | spread (mm) | spread (deg) |",
-        "|---|---|---|---|---|",
-    ]
+    head = ["term", "mean x, y, z (mm)", "mean rotation x, y, z (deg)", "spread (mm)", "spread (deg)"]
+    rows = []
     for pull in pulls:
-        mean, spread = pull.mean, pull.spread
-        cells = [mean[:3], mean[3:], spread[:3], spread[3:]]
-        digits = (2, 3, 2, 3)
-        texts = [", ".join(f"{value:+.{n}f}" for value in cell) for cell, n in zip(cells, digits, strict=True)]
-        lines.append(f"| {pull.term} | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
+        parts = [(pull.mean[:3], 2), (pull.mean[3:], 3), (pull.spread[:3], 2), (pull.spread[3:], 3)]
+        rows.append([pull.term, *(", ".join(f"{value:+.{digits}f}" for value in cell) for cell, digits in parts)])
+    return grid(head, rows, words=5)
+
+
+FRAMES = 30
+"""Number of frames, one second of most sensors."""
+SHOWN = (1, 2, 5, 10, 20, 29)
+"""Frames of the table; the first one defines the world frame and has no error."""
+MOSTLY_COLOR = 100.0
+"""Factor of the colour weight with which distances hardly count."""
+
+
+class FirstSecond(NamedTuple):
+    """Errors of one run.
+
+    Attributes:
+        term: ``distances``, ``both`` or ``colour``.
+        rotation_deg, translation_mm: (n,) per frame, NaN where it is lost.
+    """
+
+    term: str
+    rotation_deg: NDArray[np.float64]
+    translation_mm: NDArray[np.float64]
+
+
+def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAMES) -> list[FirstSecond]:
+    """Track the first frames by distances only, as configured, and by colour almost only.
+
+    Both trajectories begin with the first camera: what its noise does to the world frame is no error.
+
+    Raises:
+        DatasetError: The recording has no true poses.
+    """
+    truth = sequence.ground_truth
+    if truth is None:
+        raise DatasetError(f"{sequence.name} has no true poses; benchmark first-second needs them")
+    weight = config.tracker.color_weight
+    found = []
+    for term, color_weight in (("distances", 0.0), ("both", weight), ("colour", MOSTLY_COLOR * weight)):
+        slam = Slam(sequence.camera, config.override([f"tracker.color_weight={color_weight}"]))
+        errors = np.full((frames, 2), np.nan)
+        T_world_first = np.eye(4)
+        for index in range(min(frames, len(sequence))):
+            T_true = truth.interpolate(float(sequence.timestamps[index]))
+            T_world_first = se3.inverse(T_true) if index == 0 else T_world_first
+            T = slam.process(sequence[index]).T_world_camera
+            if T is not None:
+                error = se3.inverse(T_world_first @ T_true) @ T
+                angle = np.linalg.norm(se3.log_rotation(error[:3, :3]))
+                errors[index] = np.degrees(angle), 1000 * np.linalg.norm(error[:3, 3])
+        found.append(FirstSecond(term, errors[:, 0], errors[:, 1]))
+    return found
+
+
+def first_second_table(runs: list[list[FirstSecond]]) -> str:
+    """Markdown table of the root mean square errors over runs, degrees and millimetres per frame."""
+    shown, rows = [n for n in SHOWN if n < len(runs[0][0].rotation_deg)], []
+    for column in zip(*runs, strict=True):
+        rotation = np.sqrt(np.nanmean([run.rotation_deg**2 for run in column], axis=0))
+        translation = np.sqrt(np.nanmean([run.translation_mm**2 for run in column], axis=0))
+        rows.append([column[0].term, *(f"{rotation[n]:.3f} deg, {translation[n]:.2f} mm" for n in shown)])
+    return grid(["term", *(f"frame {n}" for n in shown)], rows, words=len(shown) + 1)

@@ -1,24 +1,157 @@
-"""Time per frame and per kernel on a GPU and on the CPU, by image size and voxel size."""
+"""Time per frame and per kernel on a GPU and on the CPU, and Open3D's dense SLAM on the same frames and machine."""
 
+import importlib.util
+import json
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import obstacle, resolve
-from dudmap.errors import ConfigError, DeviceError, DudmapError, MapError
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, MapError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence, open_sequence
-from dudmap.lab.benchmark.interleaved import median_ms, run_open3d, save_frames
-from dudmap.lab.benchmark.table import grid
-from dudmap.lab.benchmark.timing import WARM_UP
+from dudmap.lab.benchmark.measure import Row, grid, in_own_process
+from dudmap.lab.benchmark.speed import WARM_UP
+from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import sequence as synthetic_sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+
+if TYPE_CHECKING:
+    from dudmap.io.sequences import Sequence
+
+ROUNDS = 3
+"""Number of alternating runs of each system, so that a varying load affects both."""
+
+
+class Comparison(NamedTuple):
+    """Median times per frame (ms), ATE RMSE of the last round (m; None without truth), frames, version of Open3D."""
+
+    ours_ms: float
+    theirs_ms: float
+    ours_ate: float | None
+    theirs_ate: float | None
+    frames: int
+    version: str
+
+
+def find_open3d(python: Path | None) -> str | None:
+    """Python interpreter with open3d: the given one, else this one if it has open3d, else None.
+
+    Raises:
+        DudmapError: The given interpreter cannot import open3d.
+    """
+    if python is None:
+        return sys.executable if importlib.util.find_spec("open3d") else None
+    try:
+        done = subprocess.run([python, "-c", "import open3d"], capture_output=True, text=True, check=False)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DudmapError(f"cannot run {python}: {reason}; expected a Python that has open3d") from error
+    if done.returncode:
+        reason = _last_line(done.stderr)
+        raise DudmapError(f"{python} cannot import open3d: {reason}; install it there, or leave it out")
+    return str(python)
+
+
+def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = ROUNDS) -> Comparison:
+    """Run both systems alternately on the first frames of a recording, each run in its own process.
+
+    Both receive decoded images and are timed until the pose is estimated and the frame is fused: ours with the default
+    configuration including dynamic labels, theirs with the same voxel size and largest depth.
+
+    Raises:
+        DudmapError: A run failed.
+    """
+    ours: list[Row] = []
+    theirs: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
+        folder = Path(temporary)
+        truth, stamps = save_frames(entry.open(), frames, folder)
+        for _ in range(rounds):
+            ours.append(in_own_process(_run_ours, folder))
+            if "error" in ours[-1]:
+                raise DudmapError(f"our run of the comparison failed: {ours[-1]['error']}")
+            theirs.append(run_open3d(python, folder, Config().volume.voxel_size))
+    ates: list[Any] = []
+    for row in (ours[-1], theirs[-1]):
+        poses: list[Any] = [(t, np.array(T)) for t, T in zip(stamps, row["poses"], strict=True) if T is not None]
+        known = truth is not None and len(poses) > 0
+        ates.append(accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",))["ate_rmse_m"] if known else None)
+    return Comparison(median_ms(ours), median_ms(theirs), *ates, len(stamps), str(theirs[-1]["version"]))
+
+
+def save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
+    """Write the arrays that open3d_slam.py reads; returns the ground truth and the timestamps (n,)."""
+    camera, count = sequence.camera, min(frames, len(sequence))
+    if count < 2:
+        raise DatasetError(f"{sequence.name} has {count} frames; a comparison needs two or more")
+    depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.uint16, (count, *camera.shape))
+    color = np.lib.format.open_memmap(folder / "color.npy", "w+", np.uint8, (count, *camera.shape, 3))
+    stamps = np.empty(count)
+    for index in range(count):
+        frame = sequence[index]
+        depth[index] = np.clip(np.round(frame.depth * camera.depth_scale), 0, 65535).astype(np.uint16)
+        color[index], stamps[index] = frame.color, frame.timestamp
+    depth.flush()
+    color.flush()
+    values = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")}
+    (folder / "camera.json").write_text(json.dumps(values), encoding="utf-8")
+    np.save(folder / "timestamps.npy", stamps)
+    return sequence.ground_truth, stamps
+
+
+def _run_ours(folder: Path) -> Row:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.slam import Slam
+
+    camera = Camera(**json.loads((folder / "camera.json").read_text(encoding="utf-8")))
+    depths, colors = (np.load(folder / f"{kind}.npy", mmap_mode="r", allow_pickle=False) for kind in ("depth", "color"))
+    slam, ms, poses = Slam(camera, Config()), [], []
+    for stamp, depth, color in zip(np.load(folder / "timestamps.npy", allow_pickle=False), depths, colors, strict=True):
+        frame = Frame(float(stamp), depth.astype(np.float32) / np.float32(camera.depth_scale), np.array(color))
+        start = time.perf_counter()
+        result = slam.process(frame)
+        ms.append(1000 * (time.perf_counter() - start))
+        poses.append(None if result.T_world_camera is None else result.T_world_camera.tolist())
+    return {"ms": ms, "poses": poses}
+
+
+def run_open3d(python: str, folder: Path, voxel_size: float, device: str = "CPU:0") -> Row:
+    """Open3D's dense SLAM on the frames that ``save_frames`` wrote: version, ms per frame, poses.
+
+    Voxels are in metres; ``device`` is Open3D's word, such as "CUDA:0".
+
+    Raises:
+        DudmapError: The run failed.
+    """
+    program = Path(__file__).with_name("open3d_slam.py").read_text(encoding="utf-8")
+    arguments = [str(folder), str(voxel_size), str(Config().preprocess.depth_max), device]
+    done = subprocess.run([python, "-c", program, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise DudmapError(f"Open3D's dense SLAM failed: {_last_line(done.stderr)}")
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def median_ms(rows: list[Row]) -> float:
+    """Median of the times per frame of runs, without the first frames of each, milliseconds."""
+    return float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows]))
+
+
+def _last_line(text: str) -> str:
+    return (text.strip().splitlines() or ["without a word"])[-1]
+
 
 KERNELS_EVERY = 4
 """Every so many frames the kernels are measured, and in the others the frames and their stages: events around each
@@ -27,18 +160,13 @@ kernel take time."""
 
 @dataclass(frozen=True)
 class DeviceRun:
-    """Medians of a recording on a device.
+    """Medians of a recording on a device; the voxel size is in metres, times are in milliseconds, sizes in MB.
 
     Attributes:
-        what: Recording and image size.
-        voxel: Voxel size, metres.
-        device: "cpu", "cuda:0", ...
-        frame_ms: Time per frame, milliseconds.
-        stages: Time of each stage, milliseconds.
-        mesh_ms, view_ms: Time of a mesh and of an artificial view of the camera's size.
-        triangles: Of that mesh.
-        map_mb, device_mb: Size of the map, and peak memory of the device where it is known.
-        kernels: Milliseconds per frame of each kernel, by the device's events; empty on the CPU.
+        mesh_ms, view_ms: Time of a mesh, which has so many triangles, and of an artificial view of the camera's
+            size.
+        device_mb: Peak memory of the device where it is known.
+        kernels: Time per frame of each kernel, by the device's events; empty on the CPU.
         error: Why there are no figures.
     """
 
@@ -63,9 +191,10 @@ def numbers(voxels: str, sizes: str) -> tuple[list[float], list[tuple[int, int]]
         ConfigError: A list cannot be understood.
     """
     try:
-        steps = [float(voxel) / 100 for voxel in voxels.split(",")]
         pairs = [size.split("x") for size in sizes.split(",") if size]
-        return steps, [(int(width), int(height)) for width, height in pairs]
+        return [float(voxel) / 100 for voxel in voxels.split(",")], [
+            (int(width), int(height)) for width, height in pairs
+        ]
     except ValueError:
         raise ConfigError(
             f"cannot understand --voxels {voxels!r} and --sizes {sizes!r}; expected centimetres, such as 2,1, and "
@@ -101,39 +230,42 @@ def _measured(name: str, recording: Sequence, frames: int, voxel: float, device:
     from dudmap.core.slam import Slam
 
     assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
-    slam = Slam(recording.camera, Config().override(assignments))
+    slam, on_gpu = Slam(recording.camera, Config().override(assignments)), device.startswith("cuda")
     times, stages, kernels = [], [], []
     for index in range(min(frames, len(recording))):
         frame = recording[index]
-        if device.startswith("cuda") and index % KERNELS_EVERY == 0:
+        if on_gpu and index % KERNELS_EVERY == 0:
             kernels.append(_kernel_times(lambda frame=frame: slam.process(frame)))
             continue
-        start = time.perf_counter()
-        result = slam.process(frame)
-        times.append(1000 * (time.perf_counter() - start))
+        ms, result = _timed(lambda frame=frame: slam.process(frame))
+        times.append(ms)
         stages.append(result.timings)
     pose = slam.trajectory.Ts_world_camera[-1]
     slam.volume.extract_mesh(1)
     mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
     slam.volume.raycast(pose)
     view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
+    device_mb = float("nan")
+    if on_gpu:
+        import warp as wp  # pyright: ignore[reportMissingImports]
+
+        device_mb = wp.get_mempool_used_mem_high(device) / 1e6
     warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
     return DeviceRun(
         name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
-        slam.volume.num_bytes / 1e6, _peak_megabytes(device),
+        slam.volume.num_bytes / 1e6, device_mb,
         _medians(kernels[-len(kernels) // 2 :]),  # the first frames load the kernels
     )  # fmt: skip
 
 
-def _timed(action: Any) -> tuple[float, Any]:  # noqa: ANN401
+def _timed(action: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
     result = action()
     return 1000 * (time.perf_counter() - start), result
 
 
 def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    return {key: statistics.median(row.get(key, 0.0) for row in rows) for key in keys}
+    return {key: statistics.median(row.get(key, 0.0) for row in rows) for one in rows for key in one}
 
 
 def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
@@ -154,16 +286,7 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 def measure_open3d(
     python: str, name: str, recording: Sequence, frames: int, voxels: Iterable[float], device: str
 ) -> list[DeviceRun]:
-    """Time per frame of Open3D's dense SLAM (``t.pipelines.slam``) with each voxel size, in a program of its own.
-
-    Args:
-        python: Interpreter with open3d.
-        name: Of the recording.
-        recording: The recording.
-        frames: Number of frames.
-        voxels: Voxel sizes, metres.
-        device: Device in Open3D: "CUDA:0" or "CPU:0".
-    """
+    """Time per frame of Open3D's dense SLAM with each voxel size (m), on "CUDA:0" or "CPU:0"."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="dudmap-") as folder:
         save_frames(recording, frames, Path(folder))
@@ -176,33 +299,21 @@ def measure_open3d(
     return rows
 
 
-def _peak_megabytes(device: str) -> float:
-    if not device.startswith("cuda"):
-        return float("nan")
-    import warp as wp  # pyright: ignore[reportMissingImports]
-
-    return wp.get_mempool_used_mem_high(device) / 1e6
-
-
 def table(rows: list[DeviceRun]) -> str:
     """Markdown: times and memory of each run, then the kernels of those on a GPU."""
-    stages = list(dict.fromkeys(stage for row in rows for stage in row.stages))
+    stages, body = list(dict.fromkeys(stage for row in rows for stage in row.stages)), []
+    for row in rows:
+        times = [row.frame_ms, *(row.stages.get(stage, np.nan) for stage in stages), row.mesh_ms, row.view_ms]
+        cells = ["" if np.isnan(x) else f"{x:.1f}" for x in (*times, row.map_mb, row.device_mb)]
+        body.append([row.what, f"{100 * row.voxel:g}", row.device, *cells])
     head = ["recording", "voxel, cm", "device", "frame", *stages, "mesh", "view", "map, MB", "device, MB"]
-    text = grid(head, [_line(row, stages) for row in rows])
-    reason = obstacle()
+    text, reason = grid(head, body), obstacle()
     if not any(row.device.startswith("cuda") for row in rows):
         text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not asked for'}.\n"
     for row in rows:
-        if row.error:
-            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: {row.error}\n"
+        what = f"{row.what}, {100 * row.voxel:g} cm, {row.device}"
+        text += f"\n{what}: {row.error}\n" if row.error else ""
         if row.kernels:
-            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: kernels per frame\n\n"
             lines = [[name, f"{ms:.3f}"] for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])]
-            text += grid(["kernel", "ms"], lines)
+            text += f"\n{what}: kernels per frame\n\n{grid(['kernel', 'ms'], lines)}"
     return text
-
-
-def _line(row: DeviceRun, stages: list[str]) -> list[str]:
-    times = [row.frame_ms, *(row.stages.get(stage, float("nan")) for stage in stages), row.mesh_ms, row.view_ms]
-    figures = [*times, row.map_mb, row.device_mb]
-    return [row.what, f"{100 * row.voxel:g}", row.device, *("" if np.isnan(x) else f"{x:.1f}" for x in figures)]

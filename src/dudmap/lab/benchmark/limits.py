@@ -5,68 +5,79 @@ they are present from the start, and against the speed of the camera. ``docs/lim
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, replace
-from functools import cache, lru_cache
+from collections.abc import Sequence as Listing
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError
 from dudmap.evaluation.segmentation import SCORED_COVERAGE
-from dudmap.lab.benchmark.conditions import FPS, SIZE, Condition
-from dudmap.lab.benchmark.entries import Excerpt
-from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
+from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, code_hash, grid, measure_each, measure_sequence
+from dudmap.lab.benchmark.suites import Excerpt
+from dudmap.lab.synthetic import sequence
+from dudmap.lab.synthetic.recording import SyntheticSequence
 
-if TYPE_CHECKING:
-    from dudmap.evaluation.surface import Surface
-
-CAMERA_PATHS = ("still", "slow", "handheld", "fast")
-"""Camera paths in the order of their speed; the rows contain the measured speed."""
+SIZE = (320, 240)
+"""Image size, pixels."""
+FPS = 30.0
+"""Frame rate, Hz."""
+FRAMES, QUICK_FRAMES = 90, 60
+"""Number of frames of a recording."""
 LARGEST_ATE = 0.02
 """A system copes with a condition if no frame is lost and the ATE RMSE is at most this, metres."""
 
 
-class Sweep(NamedTuple):
-    """One grid of conditions.
+@dataclass(frozen=True)
+class Condition:
+    """One experimental condition: speed of the people in m/s, built-in camera path, number of frames.
 
     Attributes:
-        name: Short name, also of the files.
-        x: Label of the horizontal axis.
-        xs: Values along the horizontal axis.
-        coverages: Values along the vertical axis: dynamic shares of the image.
+        coverage: Mean share of the image that the crowd covers once all of it is in view.
+        start_share: Share of the frames, from the first on, in which the crowd exists; None if it enters later.
     """
+
+    coverage: float
+    speed: float = 1.0
+    camera_path: str = "handheld"
+    start_share: float | None = None
+    frames: int = FRAMES
+
+    def sequence(self) -> SyntheticSequence:
+        """Recording of this condition."""
+        recording = sequence(
+            camera_path=self.camera_path, frames=self.frames, fps=FPS, speed=self.speed, coverage=self.coverage,
+            start_dynamic=self.start_share is not None, camera=SIZE,
+        )  # fmt: skip
+        until = round((self.start_share or 1.0) * self.frames)
+        return recording if until == self.frames else recording.static_twin(since=float(recording.timestamps[until]))
+
+
+class Sweep(NamedTuple):
+    """One grid of conditions: coverages against the values ``xs`` of the attribute ``varied``, with the label ``x``."""
 
     name: str
     x: str
+    varied: str
     xs: tuple[float | str, ...]
     coverages: tuple[float, ...]
 
-    @property
-    def varied(self) -> str:
-        """Attribute of ``Condition`` that varies along the horizontal axis."""
-        return {"speed": "speed", "start": "start_share", "camera": "camera_path"}[self.name]
 
-
-SWEEPS = (
-    Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 2.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9)),
-    Sweep("start", "share of frames with movers, from the first on", (0.25, 0.5, 1.0), (0.2, 0.4, 0.6)),
-    Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.7)),
+SPEED = Sweep("speed", "mover speed, m/s", "speed", (0.02, 0.1, 0.3, 1.0, 2.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9))
+START = Sweep(
+    "start", "share of frames with movers, from the first on", "start_share", (0.25, 0.5, 1.0), (0.2, 0.4, 0.6)
 )
+CAMERA = Sweep("camera", "camera path", "camera_path", ("still", "slow", "handheld", "fast"), (0.0, 0.3, 0.7))
+"""Camera paths in the order of their speed; the rows contain the measured speed."""
+SWEEPS = (SPEED, START, CAMERA)
 QUICK_SWEEPS = (
-    Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.3, 0.8)),
-    Sweep("start", "share of frames with movers, from the first on", (0.25, 1.0), (0.15,)),
-    Sweep("camera", "camera path", ("still", "fast"), (0.4,)),
+    SPEED._replace(xs=(0.1, 1.0), coverages=(0.3, 0.8)),
+    START._replace(xs=(0.25, 1.0), coverages=(0.15,)),
+    CAMERA._replace(xs=("still", "fast"), coverages=(0.4,)),
 )
-QUICK_FRAMES = 60
-SAMPLES = 40_000
-"""Points sampled on each surface; the standard error of a share of 1 % is then at most 0.05 %."""
-CHUNK = 6
-"""Number of conditions per process, which limits the loss if a process dies."""
 
 
 class Cell(NamedTuple):
@@ -93,112 +104,62 @@ def grid_cells(sweeps: tuple[Sweep, ...], frames: int) -> list[Cell]:
 def measure_cells(
     cells: list[Cell],
     systems: Mapping[str, Config],
-    cache: Path,
+    out: Path,
     workers: int,
-    done: Callable[[int], None] = lambda count: None,
+    done: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
     """One row per cell and system.
 
-    Args:
-        cells: Cells of all grids.
-        systems: Configurations by name.
-        cache: Folder of earlier measurements, which are reused for the same code, configuration and condition.
-        workers: Number of processes at a time.
-        done: Called with the number of conditions finished since the last call.
+    A file measured-<fingerprint>.jsonl in ``out`` keeps the figures: a condition that it has for the same code and
+    systems is not measured again. ``done`` is called whenever a condition was measured by all systems.
     """
-    cache.mkdir(parents=True, exist_ok=True)
-    found = sorted(dict.fromkeys(cell.condition for cell in cells), key=lambda condition: condition.camera_path)
-    files = {(c, name): cache / f"{_fingerprint(c, config)}.json" for c in found for name, config in systems.items()}
-    wanted = [
-        (condition, {name: (systems[name], files[condition, name]) for name in missing})
-        for condition in found
-        if (missing := [name for name in systems if not files[condition, name].is_file()])
-    ]
-    done(len(found) - len(wanted))
-    errors: dict[Condition, object] = {}
-
-    def measure(chunk: list[ConditionJob]) -> None:
-        answer = in_own_process(_measure_chunk, chunk)
-        errors.update((condition, answer.get("error")) for condition, _ in chunk)
-        done(len(chunk))
-
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(measure, [wanted[start : start + CHUNK] for start in range(0, len(wanted), CHUNK)]))
+    out.mkdir(parents=True, exist_ok=True)
+    text = code_hash() + "".join(f"{name}{config.to_toml()}" for name, config in systems.items())
+    file = out / f"measured-{hashlib.sha256(text.encode()).hexdigest()[:8]}.jsonl"
+    conditions = list(dict.fromkeys(cell.condition for cell in cells))
+    jobs = [(asdict(condition), (condition, dict(systems))) for condition in conditions]
+    found = dict(zip(conditions, measure_each(measure_condition, jobs, workers, done, file), strict=True))
     return [
         {"sweep": cell.sweep, "x": cell.x, "coverage": cell.condition.coverage, "system": name}
-        | (json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {"error": errors.get(cell.condition)})
+        | found[cell.condition].get(name, {"error": found[cell.condition].get("error")})
         for cell in cells
         for name in systems
-        for file in [files[cell.condition, name]]
     ]
 
 
-ConditionJob = tuple[Condition, dict[str, tuple[Config, Path]]]
-"""A condition and, by system, its configuration and the file for its figures."""
+def measure_condition(job: tuple[Condition, Mapping[str, Config]]) -> Row:
+    """Figures of every system, by its name, on the same frames of one condition."""
+    from dudmap.evaluation.surface import Surface
 
-
-def _fingerprint(condition: Condition, config: Config) -> str:
-    """File name that is unique to the code, the configuration and the condition."""
-    text = f"{code_hash()}{astuple(condition)}{SIZE}{FPS}{LARGEST_ATE}{SAMPLES}{config.to_toml()}"
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-@cache
-def code_hash(without: tuple[str, ...] = ()) -> str:
-    """SHA-256 of all sources of the package, except of the packages ``without``."""
-    import dudmap
-
-    root = Path(dudmap.__file__).parent
-    sources = sorted(
-        source for source in root.rglob("*.py") if not source.relative_to(root).as_posix().startswith(without)
-    )
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
-
-
-def _measure_chunk(chunk: list[ConditionJob]) -> Row:
-    for condition, systems in chunk:
-        measure_condition(condition, systems)
-    return {}
-
-
-def measure_condition(condition: Condition, systems: Mapping[str, tuple[Config, Path]]) -> None:
-    """Measure every system on the same frames of one condition, and write the figures to its file."""
-    recording = Excerpt(condition.sequence()).load()
-    truth, masks = recording.ground_truth, [recording.mask(index) for index in range(len(recording))]
-    assert truth is not None  # all conditions are synthetic
-    shares = np.array([mask.mean() for mask in masks if mask is not None])
+    condition, systems = job
+    made = condition.sequence()
+    recording, truth = Excerpt(made).load(), made.ground_truth
+    shares = np.array([mask.mean() for index in range(len(made)) if (mask := recording.mask(index)) is not None])
     steps = np.linalg.norm(np.diff(truth.Ts_world_camera[:, :3, 3], axis=0), axis=1)
     speed = float(steps.sum() / (recording.timestamps[-1] - recording.timestamps[0]))
     scored = shares[shares > SCORED_COVERAGE]
-    surfaces = _surfaces(condition.camera_path, condition.frames)
-    coverage = float(scored.mean()) if len(scored) else 0.0
-    conditions = {"coverage_measured": round(coverage, 4), "camera_speed": round(speed, 4)}
-    for config, file in systems.values():
+    conditions = {
+        "coverage_measured": round(float(scored.mean()) if len(scored) else 0.0, 4), "camera_speed": round(speed, 4)
+    }  # fmt: skip
+    empty = sequence(
+        camera_path=condition.camera_path, frames=condition.frames, fps=FPS, coverage=0.0, camera=made.camera
+    )
+    surfaces = (
+        Surface(empty.surface(), "the true surface"),
+        Surface(empty.surface(observed=True), "the observed part of it"),
+    )
+    rows: Row = {}
+    for name, config in systems.items():
         row: Row = dict(conditions)
         try:
-            row |= measure_sequence(recording, config, surfaces, samples=SAMPLES)
+            row |= measure_sequence(recording, config, surfaces, samples=FEWER_SAMPLES)
         except DudmapError as error:
             row["error"] = str(error)
         else:
             row["lost_share"] = round(1 - row["tracked_share"], 4)
             row["copes"] = row["lost"] == 0 and row.get("ate_rmse_m") is not None and row["ate_rmse_m"] <= LARGEST_ATE
-        temporary = file.with_suffix(".part")
-        temporary.write_text(json.dumps(row), encoding="utf-8")
-        temporary.rename(file)  # atomic: an interrupted measurement leaves no file of this name
-
-
-@lru_cache(maxsize=4)
-def _surfaces(camera_path: str, frames: int) -> "tuple[Surface, Surface]":
-    """True static surface, and the part of it that the camera sees without movers."""
-    from dudmap.evaluation.surface import Surface
-    from dudmap.lab.synthetic import sequence
-    from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-
-    camera = DEFAULT_CAMERA.resized(*SIZE)
-    empty = sequence(camera_path=camera_path, frames=frames, fps=FPS, coverage=0.0, camera=camera)
-    return Surface(empty.surface(), "the true surface"), Surface(
-        empty.surface(observed=True), "the observed part of it"
-    )
+        rows[name] = row
+    return rows
 
 
 def limit(rows: list[Row], sweep: str, system: str, x: float | str) -> float | None:
@@ -210,3 +171,36 @@ def limit(rows: list[Row], sweep: str, system: str, x: float | str) -> float | N
             break
         reached = row["coverage"]
     return reached
+
+
+def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
+    """Markdown table of the largest coverage with which each system copes, per value of every sweep."""
+    text = ""
+    for sweep in sweeps:
+        body = []
+        for x in sweep.xs:
+            reached = [limit(list(rows), sweep.name, system, x) for system in systems]
+            body.append([str(x), *("none" if share is None else f"{100 * share:.0f} %" for share in reached)])
+        text += f"\n{grid([sweep.x, *systems], body, words=1)}"
+    return text
+
+
+def cells_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
+    """Markdown table of all cells: ATE in mm and share of lost frames, bold where the system copes."""
+    text = ""
+    for sweep in sweeps:
+        found = {(row["x"], row["coverage"], row["system"]): row for row in rows if row["sweep"] == sweep.name}
+        body = [
+            [str(x), f"{100 * coverage:.0f} %", *(_cell(found.get((x, coverage, name), {})) for name in systems)]
+            for x in sweep.xs
+            for coverage in sweep.coverages
+        ]
+        text += f"\n{grid([sweep.x, 'coverage', *systems], body)}"
+    return text
+
+
+def _cell(row: Row) -> str:
+    if row.get("ate_rmse_m") is None:
+        return "no pose" if row.get("error") else ""
+    text = f"{1000 * row['ate_rmse_m']:.1f}" + (f" ({100 * row['lost_share']:.0f} % lost)" if row["lost"] else "")
+    return f"**{text}**" if row["copes"] else text

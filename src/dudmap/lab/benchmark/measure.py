@@ -1,20 +1,23 @@
-"""Measurement of one system on one recording, in a separate process so that time and memory are not shared."""
+"""Measurement of a system on a recording, in a process of its own so that nothing is shared, and tables of it."""
 
+import csv
+import hashlib
+import json
 import multiprocessing
 import tempfile
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dudmap.config import Config
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.score import SAMPLES, score_mesh, score_trajectory
-from dudmap.lab.benchmark.systems import PASSES
+from dudmap.evaluation.trajectory import RUN_FIGURES, accuracy, ate
+from dudmap.lab.benchmark.suites import PASSES, Entry
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.mesh import Mesh
@@ -23,23 +26,28 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 """One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
+SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
+"""Figures of a trajectory; the drift is that after aligning the first pose only."""
+COMPLETE_WITHIN = 0.02
+"""Largest distance to the mesh of a point of the true surface that counts as reconstructed, metres."""
+SAMPLES = 100_000
+"""Number of points sampled on each surface."""
+FEWER_SAMPLES = 40_000
+"""The same where many runs are compared; the standard error of a share of 1 % is then at most 0.05 %."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """One measurement of a suite.
+class Job(NamedTuple):
+    """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run.
 
-    Attributes:
-        entry: The recording.
-        system: Name of the system.
-        config: Parameters of the system.
-        out: Folder that keeps the run; None keeps nothing.
+    Without a folder the mesh is not scored. ``calibrate`` says whether the calibration of the colour camera is
+    estimated first, as ``dudmap run`` does.
     """
 
     entry: Entry
     system: str
     config: Config
     out: Path | None = None
+    calibrate: bool = True
 
 
 def measure(job: Job) -> Row:
@@ -48,12 +56,10 @@ def measure(job: Job) -> Row:
     Raises:
         DudmapError: The recording cannot be used, or no frame could be tracked.
     """
-    sequence = job.entry.open()
-    row = measure_sequence(
-        sequence, job.config, job.entry.surfaces(sequence), job.out, job.entry.max_frames,
-        passes=PASSES.get(job.system, 1), calibrate=True,
-    )  # fmt: skip
-    return {"sequence": job.entry.name, "system": job.system} | row
+    sequence, passes = job.entry.open(), PASSES.get(job.system, 1)
+    surfaces = job.entry.surfaces(sequence) if job.out is not None else None
+    frames, calibrate = job.entry.max_frames, job.calibrate
+    return measure_sequence(sequence, job.config, surfaces, job.out, frames, passes=passes, calibrate=calibrate)
 
 
 def measure_sequence(
@@ -70,16 +76,13 @@ def measure_sequence(
     """Run a system on a recording: figures of its metrics.json and errors of trajectory and mesh.
 
     Args:
-        sequence: The recording.
-        config: Parameters of the system.
         surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
         max_frames: Use only the first frames.
         samples: Number of points sampled on each surface.
-        passes: See ``dudmap.app.pipeline.run.run``.
-        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the recording
-            is taken as given.
-        ahead: Frames read ahead, see ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
+        passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
+        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the
+            recording is taken as given.
 
     Raises:
         DudmapError: The recording cannot be used, or no frame could be tracked.
@@ -93,17 +96,15 @@ def measure_sequence(
         ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
     config = config.override(["sensor.self_calibration=false"])  # estimated beforehand or not at all
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
-        folder = out or Path(temporary)
         report = run(
-            sequence, config, folder,
-            max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None, passes=passes,
-            calibrate=calibrate,
+            sequence, config, out or Path(temporary), max_frames=max_frames, progress=False, ahead=ahead,
+            save_map=out is not None, passes=passes, calibrate=calibrate,
         )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)
         truth = sequence.ground_truth
         if truth is not None:
-            row |= score_trajectory(report.trajectory, truth)
+            row |= accuracy(report.trajectory, truth, SCORED)
         if truth is not None and surfaces is not None and report.metrics["mesh_triangles"]:
             try:
                 row |= score_mesh(Mesh.load(report.out / "mesh.ply"), report.trajectory, truth, *surfaces, samples)
@@ -112,22 +113,87 @@ def measure_sequence(
     return row
 
 
-def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
-    """Measure all jobs, each in its own process; a failed one gives a row with ``error``.
+def score_mesh(
+    mesh: "Mesh",
+    estimate: Trajectory,
+    truth: Trajectory,
+    whole: "Mesh | Surface",
+    seen: "Mesh | Surface",
+    samples: int = SAMPLES,
+) -> Row:
+    """Accuracy, completeness and ghosts of a mesh in the world frame of the estimated trajectory.
+
+    The mesh is aligned by the first pose only, so that a bent or shifted map is penalised.
 
     Args:
-        jobs: The measurements; rows are returned in this order.
-        workers: Number of processes at a time. Times per frame are reliable with one only.
-        done: Called with every row as soon as it is complete.
-    """
+        whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
+        seen: Part of it that the camera saw, for completeness.
+        samples: Number of points sampled on each surface.
 
-    def one(job: Job) -> Row:
-        row = {"sequence": job.entry.name, "system": job.system} | in_own_process(measure, job)
-        done(row)
-        return row
+    Raises:
+        DatasetError: The trajectories have fewer than three poses in common.
+        MapError: A mesh has no faces.
+    """
+    from dudmap.evaluation.reconstruction import compare_surfaces
+    from dudmap.evaluation.surface import moved
+
+    T = ate(estimate, truth, align="origin").T_reference_estimate
+    result = compare_surfaces(moved(mesh, T), whole, observed=seen, thresholds=(COMPLETE_WITHIN,), samples=samples)
+    return {
+        "mesh_accuracy_m": round(result.accuracy.mean, 6),
+        "mesh_completeness": round(result.scores[0].recall, 5),
+        "ghost_area_m2": None if result.ghost_area_m2 is None else round(result.ghost_area_m2, 5),
+        "ghost_share": round(result.ghost_share, 5),
+    }
+
+
+def measure_each(
+    function: Callable[[Any], Row],
+    jobs: Iterable[tuple[Row, Any]],
+    workers: int = 1,
+    done: Callable[[Row], None] = lambda row: None,
+    kept: Path | None = None,
+) -> list[Row]:
+    """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a process of its own.
+
+    Args:
+        function: Makes a row of an argument; if it fails, the row has ``error``.
+        jobs: Labels, which JSON can hold and which differ, and arguments.
+        workers: Number of processes at a time. Times per frame are reliable with one only.
+        done: Called with every row as soon as it is measured.
+        kept: File (.jsonl) to which every row is added then; rows that it already has are not measured again.
+    """
+    jobs = list(jobs)
+    rows: dict[str, Row] = {}
+    lines = kept.read_text(encoding="utf-8").splitlines() if kept is not None and kept.is_file() else []
+    known = {_key(row["label"]): row["row"] for line in lines if line.endswith("}") for row in [json.loads(line)]}
+
+    def one(job: tuple[Row, Any]) -> None:
+        label, argument = job
+        key = _key(label)
+        if key in known:
+            rows[key] = label | known[key]
+            return
+        row = in_own_process(function, argument)
+        if kept is not None:
+            with kept.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps({"label": label, "row": row}) + "\n")
+        rows[key] = label | row
+        done(rows[key])
 
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(one, jobs))
+        list(pool.map(one, jobs))
+    return [rows[_key(label)] for label, _ in jobs]
+
+
+def _key(label: Row) -> str:
+    return json.dumps(label, sort_keys=True)
+
+
+def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
+    """Measure all jobs of a suite; see ``measure_each``."""
+    labelled = [({"sequence": job.entry.name, "system": job.system}, job) for job in jobs]
+    return measure_each(measure, labelled, workers, done)
 
 
 def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
@@ -142,3 +208,85 @@ def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noq
         except Exception as error:  # a defect in one measurement must not discard the others of a suite
             traceback.print_exception(error)
             return {"error": f"{type(error).__name__}: {error}"}
+
+
+@cache
+def code_hash(without: tuple[str, ...] = ()) -> str:
+    """SHA-256 of all sources of the package, except of the packages ``without``."""
+    import dudmap
+
+    root = Path(dudmap.__file__).parent
+    sources = sorted(
+        source for source in root.rglob("*.py") if not source.relative_to(root).as_posix().startswith(without)
+    )
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+
+
+class Column(NamedTuple):
+    """Format of one figure: heading with unit, factor from the stored unit, number of decimals."""
+
+    key: str
+    heading: str
+    factor: float = 1.0
+    digits: int = 0
+
+
+COLUMNS = (
+    Column("frames", "frames"),
+    Column("lost", "lost"),
+    Column("ate_rmse_m", "ATE RMSE, mm", 1000, 1),
+    Column("rpe_trans_rmse_m_per_s", "RPE, mm/s", 1000, 1),
+    Column("rpe_rot_rmse_deg_per_s", "RPE, deg/s", 1, 2),
+    Column("drift_rmse_m", "drift RMSE, mm", 1000, 1),
+    Column("rotation_rmse_deg", "rotation RMSE, deg", 1, 2),
+    Column("mask_iou_mean", "mask IoU", 1, 3),
+    Column("mesh_accuracy_m", "accuracy, mm", 1000, 1),
+    Column("mesh_completeness", "completeness, %", 100, 1),
+    Column("ghost_area_m2", "ghost, m2", 1, 3),
+    Column("ms_per_frame_median", "ms/frame", 1, 1),
+    Column("ms_per_frame_p95", "p95 ms", 1, 1),
+    Column("cpu_s", "CPU s", 1, 1),
+    Column("peak_rss_mb", "peak MB"),
+)
+"""Columns of a suite; those without any value are omitted."""
+
+
+def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and words alike
+    """Text of one cell."""
+    if value is None:
+        return ""
+    return f"{value * column.factor:.{column.digits}f}" if isinstance(value, int | float) else str(value)
+
+
+def grid(header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> str:
+    """Markdown table; the first ``words`` columns are left-aligned, the others right-aligned."""
+    lines = ["| " + " | ".join(header) + " |"]
+    lines.append("|" + "|".join("---" if number < words else "---:" for number in range(len(header))) + "|")
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def markdown(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> str:
+    """Markdown table of the rows, followed by a list of the failed ones."""
+    good = [row for row in rows if "error" not in row]
+    used = [column for column in columns if any(row.get(column.key) is not None for row in good)]
+    header = ["sequence", "system", *(column.heading for column in used)]
+    body = [
+        [str(row["sequence"]), str(row["system"]), *(shown(row.get(column.key), column) for column in used)]
+        for row in good
+    ]
+    failed = [f"- {row['sequence']}, {row['system']}: {row['error']}" for row in rows if "error" in row]
+    return grid(header, body) + ("\n" + "\n".join(failed) + "\n" if failed else "")
+
+
+def save(rows: Sequence[Row], text: str, out: Path, name: str, more: dict[str, Any] | None = None) -> None:
+    """Write <name>.md, <name>.csv and <name>.json into a folder, in stored units."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{name}.md").write_text(text, encoding="utf-8")
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, keys, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    content = {**(more or {}), "rows": list(rows)}
+    (out / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

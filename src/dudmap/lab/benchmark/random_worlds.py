@@ -1,64 +1,28 @@
 """Random worlds with random sensors: how often, and how badly, a system fails on what nobody chose."""
 
 import hashlib
-import json
 import shlex
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.limits import code_hash
-from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.measure import Row, code_hash, grid, measure_each, measure_sequence
+from dudmap.lab.benchmark.suites import Entry
+from dudmap.lab.data import tables
 
 SILENT_ATE, SILENT_LOST = 0.05, 0.2
 """A silent failure has an ATE RMSE above SILENT_ATE metres with less than the share SILENT_LOST of the frames lost."""
-SIZES = ((240, 180), (256, 192), (320, 240))
-SCENES = {"room": 0.4, "corridor": 0.15, "desk": 0.15, "yard": 0.1, "box": 0.1, "textureless": 0.05, "plane": 0.05}
-PATHS = {"handheld": 0.4, "fast": 0.15, "slow": 0.1, "pan": 0.1, "orbit": 0.1, "dolly": 0.1, "still": 0.05}
-CONTENTS = {"nothing": 0.25, "one": 0.3, "two": 0.1, "crowd": 0.2, "situation": 0.15}
-MOVERS = (
-    "person", "people", "wanderer", "carried_box", "removed_box", "ball", "balloon", "creeper", "stopping_cart",
-    "starting_cart", "door",
-)  # fmt: skip
-SITUATIONS = ("people_at_start", "follow", "stops", "starts", "put_down", "taken_away")
-"""Situations in which the camera always sees the scene; ``blocked`` and ``kidnapped`` lose frames by design."""
-CROWDED = ("room", "corridor", "yard")
-SENSORS = ("kinect_v1", "kinect_v2", "realsense_d435", "realsense_l515", "iphone_lidar")
-NOISES = ("kinect", "realsense", "d435", "kinect_v2", "l515", "iphone")
 NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
 """Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
-FAULTS: dict[str, tuple[Any, Any]] = {
-    "color_translation": ((-0.03, -0.01, -0.01), (0.03, 0.01, 0.01)),
-    "color_rotation_deg": ((-0.7,) * 3, (0.7,) * 3),
-    "color_focal_ratio": (0.92, 1.08),
-    "color_center_shift": ((-4, -4), (4, 4)),
-    "color_delay": (-0.015, 0.03),
-    "color_readout": (0.005, 0.03),
-    "color_distortion": ((-0.1, -0.1, -2e-3, -2e-3), (0.15, 0.1, 2e-3, 2e-3)),
-    "auto_exposure": (0.1, 0.6),
-    "white_balance_drift": (0.01, 0.1),
-    "vignetting": (0.05, 0.4),
-    "jpeg_quality": (50, 96),
-    "depth_scale_error": (-0.01, 0.01),
-    "depth_offset": (-0.01, 0.01),
-    "depth_bands": (2e-4, 1.5e-3),
-    "depth_distortion": (1e-3, 0.01),
-    "flying_pixels": (0.1, 0.8),
-    "multipath": (0.1, 0.5),
-    "dropped_frames": (0.01, 0.1),
-    "late_frames": (0.01, 0.1),
-}
-"""Range of each fault: what named cameras and recordings show, and a little more. JPEG quality is a whole number."""
+DRAWN = tables("benchmark/random_worlds.toml")
+"""What is drawn, and with which probabilities or from which ranges."""
 
 
 def _drawn(fault: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
-    low, high = FAULTS[fault]
+    low, high = DRAWN["faults"][fault]
     return float(rng.integers(low, high)) if fault == "jpeg_quality" else _rounded(rng.uniform(low, high))
 
 
@@ -71,35 +35,36 @@ def draw_world(seed: int, number: int) -> dict[str, Any]:
     """Arguments of ``dudmap.lab.synthetic.sequence`` (as ``Entry.parameters``) of world ``number`` of a seed."""
     rng = np.random.default_rng([seed, number])
 
-    def one_of(shares: dict[str, float]) -> str:
+    def one_of(kind: str) -> str:
+        shares = DRAWN[kind]
         return str(rng.choice(list(shares), p=np.array(list(shares.values())) / sum(shares.values())))
 
-    scene, content = one_of(SCENES), one_of(CONTENTS)
+    scene, content = one_of("scenes"), one_of("contents")
     world: dict[str, Any] = {
         "scene": scene,
-        "camera_path": one_of(PATHS),
-        "camera": SIZES[rng.integers(len(SIZES))],
+        "camera_path": one_of("paths"),
+        "camera": DRAWN["sizes"][rng.integers(len(DRAWN["sizes"]))],
         "frames": int(rng.integers(90, 121)),
         "seed": int(rng.integers(1, 100_000)),
     }
-    if content == "crowd" and scene in CROWDED:
+    if content == "crowd" and scene in DRAWN["crowded"]:
         world["coverage"] = _rounded(rng.uniform(0.05, 0.5))
     elif content == "situation":
-        world["situation"] = str(rng.choice(SITUATIONS))
+        world["situation"] = str(rng.choice(DRAWN["situations"]))
         if world["situation"] == "follow":
             world["camera_path"] = "follow"
     else:
         count = {"nothing": 0, "one": 1}.get(content, 2)
-        world["movers"] = tuple(str(name) for name in rng.choice(MOVERS, count, replace=False))
+        world["movers"] = tuple(str(name) for name in rng.choice(DRAWN["movers"], count, replace=False))
     if content != "nothing":
         world["start_dynamic"] = bool(rng.random() < 0.3)
         if rng.random() < 0.4:
             world["speed"] = _rounded(np.exp(rng.uniform(np.log(0.05), np.log(2.0))))
     if rng.random() < NAMED:
-        return world | {"sensor": str(rng.choice(SENSORS))}
-    faults = {name: _drawn(name, rng) for name in FAULTS if rng.random() < FAULTY}
+        return world | {"sensor": str(rng.choice(DRAWN["sensors"]))}
+    faults = {name: _drawn(name, rng) for name in DRAWN["faults"] if rng.random() < FAULTY}
     blur = _rounded(rng.uniform(0.1, 0.6)) if rng.random() < BLURRED else 0.0
-    return world | {"noise": str(rng.choice(NOISES)), "faults": faults, "motion_blur": blur}
+    return world | {"noise": str(rng.choice(DRAWN["noises"])), "faults": faults, "motion_blur": blur}
 
 
 def synth_command(world: dict[str, Any]) -> str:
@@ -127,41 +92,23 @@ def measure_worlds(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """One row per world, in the order of their numbers; each is written to a file as soon as it is measured.
+    """One row per world, in the order of their numbers; ``done`` is called with each that was measured now.
 
-    Args:
-        seed: Seed of the worlds.
-        numbers: Their numbers.
-        config: Configuration of the system.
-        out: Folder of the file, seed-<seed>-<fingerprint>.jsonl; worlds of the same code and configuration that it
-            holds are not measured again.
-        workers: Number of processes at a time.
-        done: Called with every row measured now.
+    Each is written to seed-<seed>-<fingerprint>.jsonl in ``out`` as soon as it is measured; worlds of the same code and
+    configuration that the file holds are not measured again.
     """
     out.mkdir(parents=True, exist_ok=True)
     fingerprint = hashlib.sha256(f"{code_hash()}{config.to_toml()}".encode()).hexdigest()[:8]
-    file = out / f"seed-{seed}-{fingerprint}.jsonl"
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    rows: dict[int, Row] = {row["world"]: row for line in lines if line.endswith("}") for row in [json.loads(line)]}
-    wanted = list(dict.fromkeys(numbers))
-
-    def one(number: int) -> None:
+    jobs = []
+    for number in dict.fromkeys(numbers):
         world = draw_world(seed, number)
-        row: Row = {"seed": seed, "world": number, "parameters": world}
-        row |= in_own_process(_measure, (Entry(f"world-{number}", parameters=world), config))
-        with file.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row) + "\n")
-        rows[number] = row
-        done(row)
-
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, [number for number in wanted if number not in rows]))
-    return [rows[number] for number in wanted]
+        label = {"seed": seed, "world": number, "parameters": world}
+        jobs.append((label, (Entry(f"world-{number}", parameters=world), config)))
+    return measure_each(_measure, jobs, workers, done, out / f"seed-{seed}-{fingerprint}.jsonl")
 
 
 def _measure(job: tuple[Entry, Config]) -> Row:
-    entry, config = job
-    return measure_sequence(entry.open(), config, None, calibrate=True)
+    return measure_sequence(job[0].open(), job[1], None, calibrate=True)
 
 
 def is_silent_failure(row: Row) -> bool:
@@ -187,8 +134,7 @@ def report(rows: list[Row], seed: int, worst: int = 10) -> str:
     else:
         text += "No world gave a result.\n"
     text += _listed("Silent failures (ATE > 50 mm, less than 20 % of the frames lost)", silent)
-    text += _listed("Worst worlds", measured[:worst])
-    return text + _listed("Worlds without a result", failed)
+    return text + _listed("Worst worlds", measured[:worst]) + _listed("Worlds without a result", failed)
 
 
 def _listed(title: str, rows: list[Row]) -> str:

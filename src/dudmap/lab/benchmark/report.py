@@ -1,17 +1,51 @@
 """Report of a suite: measured figures, results of other systems and published figures in one document."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Job, Row, measure_all
-from dudmap.lab.benchmark.published import Published, published
-from dudmap.lab.benchmark.score import score_mesh, score_trajectory
-from dudmap.lab.benchmark.suites import Suite
-from dudmap.lab.benchmark.table import COLUMNS, grid, markdown, save, shown
+from dudmap.evaluation.trajectory import accuracy
+from dudmap.lab.benchmark.measure import (
+    COLUMNS,
+    SCORED,
+    Job,
+    Row,
+    grid,
+    markdown,
+    measure_all,
+    save,
+    score_mesh,
+    shown,
+)
+from dudmap.lab.benchmark.suites import Entry, Suite
+from dudmap.lab.data import tables
+
+
+class Published(NamedTuple):
+    """One published figure: recording, system, key of our tables, value in their unit (m, m/s, deg/s), publication."""
+
+    sequence: str
+    system: str
+    metric: str
+    value: float
+    source: str
+
+
+def published(sequences: Collection[str] | None = None) -> list[Published]:
+    """Published figures (``published.toml``) of all or of the given recordings, in the order of the data file."""
+    content = tables("benchmark/published.toml")
+    sources = content["sources"]
+    return [
+        Published(sequence, row["system"], table["metric"], round(value * table["factor"], 7), sources[row["source"]])
+        for table in content["table"]
+        for row in table["rows"]
+        for sequence, value in zip(table["sequences"], row["values"], strict=True)
+        if not math.isnan(value) and (sequences is None or sequence in sequences)
+    ]
 
 
 def run_suite(
@@ -25,13 +59,8 @@ def run_suite(
 ) -> str:
     """Measure a suite, write <suite>.md, .csv and .json into ``out`` and return the Markdown.
 
-    Args:
-        suite: The recordings.
-        systems: Configurations by name.
-        others: Folders with results of other systems, by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
-        out: Folder for the tables, and for the runs in runs/<system>/<sequence>.
-        workers: Number of processes at a time.
-        done: Called with every row as soon as it is complete.
+    Runs are kept in ``out``/runs/<system>/<sequence>. ``others`` are folders with results of other systems by name:
+    FOLDER/<sequence>/trajectory.txt and mesh.ply.
     """
     jobs = [
         Job(entry, name, config, out / "runs" / name / entry.name)
@@ -94,7 +123,7 @@ def _scored(entry: Entry, folder: Path) -> Row:
             return {"error": f"{entry.name} has no ground truth to score against"}
         estimate = Trajectory.load(path)
         row: Row = {"frames": len(sequence), "lost": max(len(sequence) - len(estimate), 0)}
-        row |= score_trajectory(estimate, sequence.ground_truth)
+        row |= accuracy(estimate, sequence.ground_truth, SCORED)
         surfaces = entry.surfaces(sequence)
         if surfaces is not None and (folder / "mesh.ply").is_file():
             mesh = Mesh.load(folder / "mesh.ply")

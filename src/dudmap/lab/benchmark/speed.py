@@ -1,4 +1,4 @@
-"""Speed and memory on this machine, compared with their targets."""
+"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process."""
 
 import os
 import statistics
@@ -7,15 +7,32 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Row, in_own_process
-from dudmap.lab.benchmark.table import grid
-from dudmap.lab.benchmark.timing import time_frames, time_iteration, time_walk
+from dudmap.lab.benchmark.measure import Row, grid, in_own_process
+from dudmap.lab.benchmark.suites import Entry
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.scene import Light, Material, Scene, box, cylinder, look_at, pose
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.slam import Slam
+    from dudmap.io.sequences import Sequence
+
+WARM_UP = 10
+"""Number of frames at the start of a run that are not timed."""
+ALTERNATION = 20
+"""Number of frames after which two systems alternate."""
+FRAME_TARGETS = {0.01: 20.0, 0.02: 14.0, 0.005: 40.0}
+"""Largest acceptable median time per frame by voxel size, milliseconds by metres."""
 
 
 class SpeedFigure(NamedTuple):
@@ -35,13 +52,11 @@ def speed_figures(
     open3d: str | None = None,
     recording: Path | None = None,
 ) -> list[SpeedFigure]:
-    """Measure all figures, each in a new process.
+    """Measure all figures over so many frames; ``announce`` is called with a description of the next measurement.
 
     Args:
-        frames: Number of frames of the timed recordings.
-        long_frames: Number of frames of the walk through unseen space, which shows whether the time per frame grows; 0
-            skips it.
-        announce: Called with a description of the next measurement.
+        long_frames: Frames of the walk through unseen space, which shows whether the time per frame grows; 0 skips
+            it.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
 
@@ -50,17 +65,22 @@ def speed_figures(
     """
     figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
-    for voxel, median, p95 in ((0.01, 20.0, 50.0), (0.02, 14.0, None), (0.005, 40.0, None)):
+    for voxel, target in FRAME_TARGETS.items():
         row = _measured(time_frames, (voxel, frames))
-        name = f"frame, {100 * voxel:g} cm voxels"
-        figures.append(SpeedFigure(f"{name}, median", "ms", median, row["median"]))
-        if p95 is not None:
-            figures.append(SpeedFigure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
-            figures += _map_figures(row)
-            figures.append(SpeedFigure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
+        figures.append(SpeedFigure(f"frame, {100 * voxel:g} cm voxels, median", "ms", target, row["median"]))
+        if voxel == Config().volume.voxel_size:
+            again = f"{row['stale']} chunks; all of the map takes {1000 * row['mesh_whole_s']:.0f} ms"
+            block, free = row["bytes_per_block"] / 1024, 100 * row["free_share"]
+            figures += [
+                SpeedFigure(f"frame, {100 * voxel:g} cm voxels, 95th percentile", "ms", 50.0, row["p95"]),
+                SpeedFigure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, block),
+                SpeedFigure("free space, share of what its voxels would cost", "%", 1.0, free),
+                SpeedFigure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
+                SpeedFigure("mesh again after one frame", "ms", None, row["again_ms"], again),
+                SpeedFigure("artificial view, 320x240", "ms", 40.0, row["view_ms"]),
+            ]
     announce("one registration iteration on one thread")
-    with _environment(DUDMAP_THREADS="1"):
-        row = _measured(time_iteration, 40)
+    row = _measured(time_iteration, 40)
     figures.append(SpeedFigure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
     announce("starting")
     figures += _start_times()
@@ -77,53 +97,30 @@ def speed_figures(
     return figures
 
 
-def _map_figures(row: Row) -> list[SpeedFigure]:
-    again = f"{row['stale']} chunks; all of the map takes {1000 * row['mesh_whole_s']:.0f} ms"
-    return [
-        SpeedFigure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, row["bytes_per_block"] / 1024),
-        SpeedFigure("free space, share of what its voxels would cost", "%", 1.0, 100 * row["free_share"]),
-        SpeedFigure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
-        SpeedFigure("mesh again after one frame", "ms", None, row["again_ms"], again),
-    ]
-
-
 def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[SpeedFigure]:
-    from dudmap.lab.benchmark.interleaved import compare_with_open3d
+    from dudmap.lab.benchmark.gpu import compare_with_open3d
 
     static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
     entry = static_room if recording is None else Entry(recording.resolve().name, recording)
-    result = compare_with_open3d(python, entry, frames)
-    name, times = f"{entry.name}, {result.frames} frames", f"{result.ours_ms:.1f} to {result.theirs_ms:.1f} ms"
-    figures = [
-        SpeedFigure(
-            "frame, over Open3D's dense SLAM", "x", 1 / 3, result.ours_ms / result.theirs_ms, f"{name}, {times}"
-        )
-    ]
-    if result.ours_ate is not None and result.theirs_ate is not None:
-        errors = f"{100 * result.ours_ate:.2f} to {100 * result.theirs_ate:.2f} cm; Open3D {result.version}"
+    found = compare_with_open3d(python, entry, frames)
+    remark = f"{entry.name}, {found.frames} frames, {found.ours_ms:.1f} to {found.theirs_ms:.1f} ms"
+    figures = [SpeedFigure("frame, over Open3D's dense SLAM", "x", 1 / 3, found.ours_ms / found.theirs_ms, remark)]
+    if found.ours_ate is not None and found.theirs_ate is not None:
+        remark = f"{100 * found.ours_ate:.2f} to {100 * found.theirs_ate:.2f} cm; Open3D {found.version}"
         figures.append(
-            SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, result.ours_ate / result.theirs_ate, errors)
+            SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, found.ours_ate / found.theirs_ate, remark)
         )
     return figures
 
 
 def markdown(figures: list[SpeedFigure]) -> str:
     """The figures as a Markdown table."""
-    body = [
-        [
-            figure.what,
-            "" if figure.target is None else f"<= {figure.target:.3g} {figure.unit}",
-            "none" if figure.measured is None else f"{figure.measured:.3g} {figure.unit}",
-            "" if figure.target is None else "yes" if _reached(figure.measured, figure.target) else "NO",
-            figure.remark,
-        ]
-        for figure in figures
-    ]
+    body = []
+    for what, unit, target, measured, remark in figures:
+        reached = measured is not None and target is not None and measured <= target
+        goal = ("", "") if target is None else (f"<= {target:.3g} {unit}", "yes" if reached else "NO")
+        body.append([what, goal[0], "none" if measured is None else f"{measured:.3g} {unit}", goal[1], remark])
     return grid(["what", "target", "measured", "reached", "remark"], body, words=1)
-
-
-def _reached(measured: float | None, target: float) -> bool:
-    return measured is not None and measured <= target
 
 
 def _measured(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
@@ -131,20 +128,6 @@ def _measured(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: AN
     if "error" in row:
         raise DudmapError(f"the speed could not be measured: {row['error']}")
     return row
-
-
-@contextmanager
-def _environment(**variables: str) -> Iterator[None]:
-    """Set environment variables for the processes that are started in this context."""
-    old = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in old.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
 
 
 FIRST_POSE = """
@@ -180,13 +163,13 @@ def _start_times() -> list[SpeedFigure]:
         first_pose = ["-c", FIRST_POSE, str(recording)]
         program_seconds(first_pose, 1)
         figures.append(SpeedFigure("to the first pose, kernels cached", "s", 1.5, program_seconds(first_pose, 3)))
-        with _environment(NUMBA_CACHE_DIR=str(Path(temporary) / "cache")):
-            figures.append(SpeedFigure("to the first pose, nothing cached", "s", 20.0, program_seconds(first_pose, 1)))
+        anew = program_seconds(first_pose, 1, NUMBA_CACHE_DIR=str(Path(temporary) / "cache"))
+        figures.append(SpeedFigure("to the first pose, nothing cached", "s", 20.0, anew))
     return figures
 
 
-def program_seconds(arguments: list[str], times: int = 5) -> float:
-    """Median duration of a Python program, seconds.
+def program_seconds(arguments: list[str], times: int = 5, **variables: str) -> float:
+    """Median duration of a Python program with environment variables, seconds.
 
     Raises:
         DudmapError: The program fails.
@@ -194,8 +177,188 @@ def program_seconds(arguments: list[str], times: int = 5) -> float:
     seconds = []
     for _ in range(times):
         start = time.perf_counter()
-        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+        command, environment = [sys.executable, *arguments], os.environ | variables
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
         seconds.append(time.perf_counter() - start)
         if done.returncode:
             raise DudmapError(f"a program that should be timed failed: {done.stderr.strip().splitlines()[-1]}")
     return statistics.median(seconds)
+
+
+def _room(frames: int) -> "Sequence":
+    return Entry("room-person", parameters={"frames": frames, "start_dynamic": False}).open()
+
+
+def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
+    """Process a recording; yields the system and the time of every frame in milliseconds.
+
+    As in a run, the next frame is prepared meanwhile, and the time ends when both are complete. Rendering is not timed.
+    """
+    from dudmap.core.slam import Slam
+
+    slam = Slam(sequence.camera, config)
+    with ThreadPoolExecutor(1) as reader:
+        prepared = slam.prepare(sequence[0])
+        for index in range(frames):
+            following = sequence[min(index + 1, frames - 1)]
+            start = time.perf_counter()
+            coming = reader.submit(slam.prepare, following)
+            slam.process(prepared)
+            prepared = coming.result()
+            yield slam, 1000 * (time.perf_counter() - start)
+
+
+def time_frames(job: tuple[float, int]) -> Row:
+    """Times of the frames of a recording, and of extracting and rendering the resulting map.
+
+    Args:
+        job: Voxel size in metres, and number of frames.
+    """
+    voxel, frames = job
+    slam, times, sequence = None, [], _room(frames + 1)
+    for slam, ms in _processed(Config().override([f"volume.voxel_size={voxel}"]), sequence, frames):  # noqa: B007
+        times.append(ms)
+    assert slam is not None
+    timed = np.array(times[WARM_UP:] or times)
+    row: Row = {"median": float(np.median(timed)), "p95": float(np.percentile(timed, 95))}
+    row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
+    row["free_share"] = slam.volume.entry_bytes / (2 * 512 * 4)
+    pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
+    seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
+    row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
+    row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
+    return row | _time_again(slam, sequence[frames])
+
+
+def _time_again(slam: "Slam", frame: "Frame") -> Row:
+    """Time of the incremental mesh extraction after one more frame, and number of updated chunks."""
+    from dudmap.core.map.incremental_mesh import IncrementalMesh
+
+    live = IncrementalMesh(slam.volume)
+    live.update()
+    slam.process(frame)
+    start = time.perf_counter()
+    stale = live.update()
+    return {"again_ms": 1000 * (time.perf_counter() - start), "stale": len(stale)}
+
+
+def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
+    """Median duration after one call for warm-up, and the last result."""
+    result, seconds = action(), []
+    for _ in range(times):
+        start = time.perf_counter()
+        result = action()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds), result
+
+
+def time_iteration(frames: int) -> Row:
+    """Time of one linearisation of the 320 pixels wide level against the map of a number of frames, on one thread.
+
+    The thread is that of this process, which does nothing else.
+    """
+    os.environ["DUDMAP_THREADS"] = "1"
+    from dudmap.core.frames.observation import Level
+    from dudmap.core.frames.pyramid import halved
+
+    sequence = _room(frames)
+    slam = None
+    for slam, _ in _processed(Config(), sequence, frames):  # noqa: B007
+        pass
+    assert slam is not None
+    halvings = round(np.log2(slam.camera.width / 320))
+    depth, intensity = halved(slam.preprocess(sequence[frames - 1]), halvings)
+    level = Level(slam.camera.scaled(halvings), depth, intensity)
+    pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
+    slam.volume.look_at(pose)
+    seconds, _ = _median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
+    return {"iteration_ms": 1000 * seconds}
+
+
+def time_walk(frames: int) -> Row:
+    """Median time per frame in the first and the last tenth of a walk through unseen space.
+
+    The speed of a machine varies within minutes. Therefore a second system processes the first tenth while the first
+    one processes the last, alternating every few frames.
+    """
+    sequence, slam = passage(frames + 1), None
+    start = min(60, frames // 4)
+    tenth = max((frames - start) // 10, 1)
+    old, new = _processed(Config(), sequence, frames), _processed(Config(), sequence, frames)
+    for _ in range(frames - tenth):
+        slam, _ = next(old)
+    for _ in range(start):
+        next(new)
+    first: list[float] = []
+    last: list[float] = []
+    while len(last) < tenth:
+        for walk, times in ((new, first), (old, last)):
+            times += [next(walk)[1] for _ in range(min(ALTERNATION, tenth - len(times)))]
+    assert slam is not None
+    row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
+    row["growth"] = row["last_ms"] / row["first_ms"]
+    row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
+    return row | _time_again(slam, sequence[frames])
+
+
+SPEED, FPS = 0.3, 30.0
+"""Speed of the camera in the passage, m/s, and frame rate, Hz."""
+LAP = 194
+"""Period in frames of the sway of the camera and of the objects along the walls (up to their pattern of three).
+
+60 frames of warm-up and ten periods are 2000 frames: the first and the last tenth show the same, nine periods apart.
+"""
+SPACING = SPEED * LAP / FPS
+"""Distance that the camera covers in one period, metres."""
+BEYOND = 8.0
+"""Length of the passage beyond the last camera position, metres; its end is out of range."""
+
+
+def passage(frames: int) -> SyntheticSequence:
+    """Recording of ``frames`` frames in which the camera moves straight on and looks at either wall in turn.
+
+    The passage is 3 m wide and as long as the walk, with pilasters, boxes and columns along both walls.
+    """
+    times = np.arange(frames) / FPS
+    length = SPEED * float(times[-1]) + BEYOND
+    poses = np.array([_passage_pose(t) for t in times])
+    return SyntheticSequence(
+        _passage_scene(length), [], Trajectory(times, poses), DEFAULT_CAMERA, noise="kinect", seed=0, fps=FPS
+    )
+
+
+def _passage_pose(t: float) -> NDArray[np.float64]:
+    sway = np.sin(2 * np.pi * FPS / LAP * t)
+    x, y, z = 0.1 * sway, SPEED * t, 1.4 + 0.05 * sway
+    aside = 0.9 * sway
+    return look_at((x, y, z), (x + aside, y + 1.6, 1.0))
+
+
+def _passage_scene(length: float) -> Scene:
+    middle = length / 2 - 1.0
+    solids = [
+        box((0, middle, -0.1), (3.4, length + 2, 0.2), Material("checks", (0.4, 0.4))),
+        box((0, middle, 2.6), (3.4, length + 2, 0.2), Material("plaster", (0.5, 0.5))),
+        box((0, length, 1.25), (3.4, 0.2, 2.5), Material("brick", (0.6, 0.6))),
+    ]
+    for side, texture in ((-1, "wallpaper"), (1, "brick")):
+        solids.append(box((side * 1.6, middle, 1.25), (0.2, length + 2, 2.5), Material(texture, (0.5, 0.5))))
+        for number, y in enumerate(np.arange(0.8 + 0.4 * side, length, SPACING)):
+            height = 0.4 + 0.25 * (number % 3)
+            solids.append(box((side * 1.25, y, height / 2), (0.5, 0.6, height), Material("wood", (0.6, 0.6))))
+            solids.append(box((side * 1.45, y + 1.2, 1.25), (0.2, 0.3, 2.5), Material("plaster", (0.8, 0.8))))
+            if number % 3:
+                top, bottom = (side * 1.1, y + 0.7, 0.9), (side * 1.1, y + 0.7, 0.0)
+                solids.append(cylinder(bottom, top, 0.12, Material("stripes", (3, 3))))
+    return Scene(
+        name="passage",
+        primitives=solids,
+        home=look_at((0.0, 0.0, 1.4), (0.0, 2.0, 1.0)),
+        target=(0.0, 2.0, 1.0),
+        space=((-1.0, -0.5, 0.8), (1.0, length, 2.1)),
+        extent=((-1.5, -1.0, 0.0), (1.5, length, 2.5)),
+        walk_line=((-1.0, 2.0), (1.0, 2.0)),
+        rest=pose((0.4, 2.0, 0.0)),
+        hinge=pose(),
+        lights=tuple(Light((0.0, float(y), 2.4)) for y in np.arange(1.0, length, 4.0)),
+    )

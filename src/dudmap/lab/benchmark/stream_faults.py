@@ -1,21 +1,26 @@
-"""Faults of the stream: what a run makes of each, with the poses it vouches for compared with the truth."""
+"""Input with faults: what a run makes of faults of the stream and of recordings that are spoilt in one way."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.app.pipeline.inspection import inspect
 from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.entries import Excerpt
-from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
+from dudmap.lab.benchmark.measure import Row, grid
+from dudmap.lab.benchmark.suites import Excerpt
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream, black, scaled
 
 SILENT_ERROR = 0.03
 """Error of a pose said to be tracked from which on it is wrong, metres; at least
@@ -27,15 +32,14 @@ LAST_FRAMES = 5
 
 @dataclass(frozen=True, eq=False)
 class FaultRun:
-    """What became of the frames of one stream.
+    """What became of the frames of one stream with a fault: frames lost, and submaps in the end.
 
     Attributes:
-        fault: Its name.
         rejected: Number of frames not used, by kind (``FrameResult.rejected``, ``FrameError.kind``).
-        lost: Frames whose registration was rejected.
-        maps: Submaps in the end.
-        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a pose.
-        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or repeated.
+        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a
+            pose.
+        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or
+            repeated.
     """
 
     fault: str
@@ -70,24 +74,17 @@ class FaultRun:
 
 
 def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
-    """A synthetic scene with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+    """A synthetic scene with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
 
-    focal = 525 / 640 * width
-    camera = Camera(focal, focal, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera, noise="kinect")
+    camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
+    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera)
 
 
 def measure_stream_faults(
     recording: Sequence, config: Config, faults: list[str] | None = None, frames: int | None = None
 ) -> Iterator[tuple[FaultRun, FaultRun]]:
-    """Run the system over a recording once without a fault and once with each.
-
-    Args:
-        recording: With true poses.
-        config: All parameters.
-        faults: Names of the faults; None or none takes all.
-        frames: Use only so many frames of the recording.
+    """Run the system over a recording once without a fault and once with each of those named (none: all).
 
     Yields:
         A run as soon as it ends, and the one without a fault, which is the first.
@@ -145,21 +142,94 @@ def _true_poses(stream: FaultyStream) -> list[NDArray[np.float64]]:
 
 def table_head(name: str, frames: int) -> str:
     """Caption and head of the Markdown table."""
-    return (
-        f"{name}, {frames} frames:\n\n"
-        "| fault | what happens | outcome | frames | rejected | lost | RMSE, mm | largest, mm | wrong: silent, flagged "
-        "| frames to recovery |\n"
-        "|---|---|---|---|---|---|---|---|---|---|"
-    )
+    head = ["fault", "what happens", "outcome", "frames", "rejected", "lost", "RMSE, mm", "largest, mm",
+            "wrong: silent, flagged", "frames to recovery"]  # fmt: skip
+    return f"{name}, {frames} frames:\n\n{grid(head, [], words=10).rstrip()}"
 
 
 def fault_row(run: FaultRun, clean: FaultRun) -> str:
     """Line of the table: errors are those of the poses said to be tracked."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
-    errors = 1000 * run.errors[np.isfinite(run.errors)]
-    recovery, (silent, flagged) = run.frames_to_recovery(), run.wrong(clean)
-    return (
-        f"| {run.fault} | {FAULTS[run.fault].description} | {run.outcome(clean)} | {len(run.errors)} | {kinds} "
-        f"| {run.lost} | {np.sqrt(np.mean(errors**2)):.1f} | {errors.max():.1f} | {silent}, {flagged} "
-        f"| {'never' if recovery is None else recovery} |"
-    )
+    errors, recovery = 1000 * run.errors[np.isfinite(run.errors)], run.frames_to_recovery()
+    cells = [run.fault, FAULTS[run.fault].description, run.outcome(clean), len(run.errors), kinds, run.lost,
+             f"{np.sqrt(np.mean(errors**2)):.1f}", f"{errors.max():.1f}", "{}, {}".format(*run.wrong(clean)),
+             "never" if recovery is None else recovery]  # fmt: skip
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _turned(frame: Frame, rows: int, columns: int) -> Frame:
+    return replace(frame, color=np.ascontiguousarray(frame.color[::rows, ::columns]))
+
+
+def _wall(frame: Frame) -> Frame:
+    """A wall without relief at 2 m, whose readings have a standard deviation of 4 mm."""
+    rng = np.random.default_rng(round(1000 * frame.timestamp))
+    return replace(frame, depth=rng.normal(2.0, 0.004, frame.depth.shape).astype(np.float32))
+
+
+RIGHT = "as recorded"
+"""The recording itself, of which nothing may be said."""
+LARGE = "depth five times too large"
+FACTORS = {LARGE: 5.0, "depth five times too small": 0.2}
+"""True depth scale over the given one."""
+SPOILT: dict[str, Callable[[Frame], Frame]] = {
+    RIGHT: lambda frame: frame,
+    **{name: partial(scaled, factor=factor) for name, factor in FACTORS.items()},
+    "colour mirrored left-right": partial(_turned, rows=1, columns=-1),
+    "colour upside down": partial(_turned, rows=-1, columns=1),
+    "colour rotated by 180 degrees": partial(_turned, rows=-1, columns=-1),
+    "colour black": black,
+    "depth a flat wall of noise": _wall,
+    "the same, colour black": lambda frame: black(_wall(frame)),
+}
+"""What is done to every frame, by name."""
+
+
+class SpoiltSequence(Excerpt):
+    """The first frames of a recording, each of them spoilt in the same way, a key of ``SPOILT``."""
+
+    def __init__(self, recording: Sequence, name: str, frames: int) -> None:
+        super().__init__(recording, frames)
+        self.name = name
+        self.camera = replace(recording.camera, depth_scale=recording.camera.depth_scale / FACTORS.get(name, 1.0))
+
+    def __getitem__(self, index: int) -> Frame:
+        return SPOILT[self.name](super().__getitem__(index))
+
+
+def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str], frames: int) -> Iterator[Row]:
+    """Inspect and process a recording spoilt in the ways that are named, keys of ``SPOILT``.
+
+    Yields:
+        ``name`` of the way, ``warnings`` (sentences of ``inspect``), number of ``frames``, of those ``tracked`` and of
+        those called ``doubtful`` (uncertain or blind), and ``ate``, its RMSE in metres; None with too few poses.
+
+    Raises:
+        ConfigError: The recording has no true poses.
+    """
+    if recording.ground_truth is None:
+        raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
+    for name in names:
+        sequence = SpoiltSequence(recording, name, frames)
+        slam = Slam(sequence.camera, config, calibration=sequence.calibration)
+        results = [slam.process(sequence[index]) for index in range(len(sequence))]
+        tracked = sum(result.T_world_camera is not None for result in results)
+        doubtful = sum(bool(result.uncertain) or result.blind for result in results)
+        ate = accuracy(slam.trajectory, recording.ground_truth, ("ate_rmse_m",))["ate_rmse_m"]
+        yield {"name": name, "warnings": inspect(sequence).warnings, "frames": len(results), "tracked": tracked,
+               "doubtful": doubtful, "ate": ate}  # fmt: skip
+
+
+def fails(row: Row) -> bool:
+    """Whether nothing is said of wrong input, or something of right input."""
+    return bool(row["warnings"]) == (row["name"] == RIGHT)
+
+
+def spoilt_table(rows: list[Row]) -> str:
+    """Markdown table, one line per way."""
+    lines = []
+    for row in rows:
+        figures = [f"{row['tracked']} of {row['frames']}", str(row["doubtful"])]
+        ate = f"{1000 * row['ate']:.1f}" if isinstance(row["ate"], float) else "-"
+        lines.append([row["name"], "; ".join(row["warnings"]) or "nothing", *figures, ate])
+    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, mm"], lines)

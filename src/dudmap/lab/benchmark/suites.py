@@ -1,93 +1,141 @@
-"""Benchmark suites: their recordings and the addresses these can be downloaded from."""
+"""Recordings of a benchmark, the suites they belong to, and the systems compared; suites.toml lists them."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.io.sequences.archive import is_archive, stem
-from dudmap.lab.benchmark.entries import Entry, local_entries
+from dudmap.lab.data import find, tables
 
-TUM = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download"
-BONN = "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/"
-ICL_NUIM = "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html"
-# CoRBS and VolumeDeform: addresses given in public code that uses them; not checked.
-CORBS = "http://corbs.dfki.uni-kl.de/"
-VOLUMEDEFORM = "https://cloud9.cs.fau.de/index.php/s/46qcNZSNePHx08A"
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-SUITES: dict[str, str] = {
-    "synthetic": "Synthetic worlds with exact ground truth; needs no data.",
-    "thesis": "The recordings of tables 5.1 to 5.8 of the DUDMap thesis.",
-    "tum-dynamic": "The eight fr3 sitting and walking recordings of TUM RGB-D.",
-    "bonn": "The 24 dynamic and 2 static recordings of Bonn RGB-D Dynamic.",
-    "icl-nuim": "The ICL-NUIM living room, with and without sensor noise.",
-    "local": "Every recording in a folder.",
-}
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.mesh import Mesh
+    from dudmap.io.sequences import Sequence
 
-FR3 = [
-    f"rgbd_dataset_freiburg3_{pose}_{motion}"
-    for pose in ("sitting", "walking")
-    for motion in ("static", "xyz", "rpy", "halfsphere")
-]
-BONN_NAMES = (
-    "balloon balloon2 balloon_tracking balloon_tracking2 crowd crowd2 crowd3 kidnapping_box kidnapping_box2 "
-    "moving_nonobstructing_box moving_nonobstructing_box2 moving_obstructing_box moving_obstructing_box2 "
-    "person_tracking person_tracking2 placing_nonobstructing_box placing_nonobstructing_box2 "
-    "placing_nonobstructing_box3 placing_obstructing_box removing_nonobstructing_box removing_nonobstructing_box2 "
-    "removing_obstructing_box synchronous synchronous2 static static_close_far"
-).split()
-SYNTHETIC: dict[str, dict[str, object]] = {
-    "room-static": {"movers": ()},
-    "room-person": {},
-    "room-people-at-start": {"situation": "people_at_start"},
-    "room-crowd-50": {"coverage": 0.5, "frames": 150},
-    "room-follow": {"situation": "follow"},
-    "room-blocked": {"situation": "blocked"},
-    "room-kidnapped": {"situation": "kidnapped", "frames": 150},
-    "room-stops": {"situation": "stops", "frames": 150},
-    "room-starts": {"situation": "starts", "frames": 150},
-    "room-put-down": {"situation": "put_down", "frames": 150},
-    "room-taken-away": {"situation": "taken_away", "frames": 150},
-    "room-creeper": {"movers": ("creeper",)},
-    "room-fast-camera": {"camera_path": "fast"},
-    "room-blur-exposure": {"motion_blur": 0.5, "exposure_change": 0.15},
-    "corridor-person": {"scene": "corridor"},
-    "desk-ball": {"scene": "desk", "movers": ("ball",)},
-    "yard-people": {"scene": "yard", "movers": ("people",)},
-    "textureless-person": {"scene": "textureless"},
-    "plane-person": {"scene": "plane"},
-    "room-realsense": {"noise": "realsense"},
-}
-ROOM = {"movers": (), "frames": 120}
-UNREGISTERED = {"color_translation": (0.025, 0.0, 0.0), "color_focal_ratio": 0.95}
-DELAY = {"color_delay": 0.025}
-ROLLING = {"color_readout": 0.025}
-EXPOSURE = {"auto_exposure": 0.3, "white_balance_drift": 0.05, "vignetting": 0.3}
-SENSORS: dict[str, dict[str, object]] = {
-    "clean": {},
-    "unregistered": {"faults": UNREGISTERED},
-    "delay": {"faults": DELAY},
-    "rolling-blur": {"faults": ROLLING, "motion_blur": 0.5},
-    "exposure": {"faults": EXPOSURE},
-    "all-colour-faults": {"faults": UNREGISTERED | DELAY | ROLLING | EXPOSURE, "motion_blur": 0.5},
-    "depth-faults": {"faults": {"depth_distortion": 0.01, "depth_bands": 0.001, "depth_scale_error": 0.005}},
-    **{
-        name: {"sensor": name}
-        for name in ("kinect_v1", "kinect_v2", "realsense_d435", "realsense_l515", "iphone_lidar")
-    },
-}
+
+@dataclass(frozen=True)
+class Entry:
+    """One recording of a suite.
+
+    Attributes:
+        name: Name in tables, folders and published figures.
+        path: Folder, file or archive of a recording on disk; None for a synthetic one.
+        parameters: Arguments of ``lab.synthetic.sequence``; ``camera`` is a (width, height) in pixels, ``faults`` a
+            mapping of the fields of ``SensorFaults`` that differ from those of the sensor.
+        address: Public page it can be downloaded from, empty if there is none.
+        max_frames: Use only this many frames from the start.
+    """
+
+    name: str
+    path: Path | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    address: str = ""
+    max_frames: int | None = None
+
+    def open(self) -> "Sequence":
+        """Open the recording, or set up the synthetic one.
+
+        Raises:
+            DatasetError: The folder is missing or not a recording.
+        """
+        if self.path is not None:
+            from dudmap.io.sequences import open_sequence
+
+            return open_sequence(self.path)
+        from dudmap.lab.synthetic import sequence
+
+        return sequence(**self.parameters)
+
+    def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
+        """True static surface and its observed part, in the frame of the ground truth, if known."""
+        from dudmap.core.geometry.mesh import Mesh
+        from dudmap.lab.synthetic.recording import SyntheticSequence
+
+        if isinstance(sequence, SyntheticSequence):
+            return sequence.surface(), sequence.surface(observed=True)
+        if self.path is None or not (self.path / "surface.ply").is_file():
+            return None
+        whole, seen = self.path / "surface.ply", self.path / "surface_observed.ply"
+        return Mesh.load(whole), Mesh.load(seen if seen.is_file() else whole)
+
+
+def local_entries(data: Path) -> list[Entry]:
+    """Every recording in a folder, or the folder itself if it is a recording.
+
+    Raises:
+        DatasetError: No recording was found.
+    """
+    from dudmap.io.sequences import is_recording
+
+    if not data.is_dir():
+        raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
+    folders = [data, *sorted(child for child in data.iterdir() if child.is_dir())]
+    found = [Entry(folder.resolve().name, folder) for folder in folders if is_recording(folder)]
+    if not found:
+        raise DatasetError(f"no recording found in {data}; `dudmap info` says what it finds in a folder")
+    return found
+
+
+class Excerpt:
+    """The first frames of a recording, all without a number, each of which is read or rendered once."""
+
+    def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
+        self.recording, self.timestamps = recording, recording.timestamps[:frames]
+        self.name, self.camera = recording.name, recording.camera
+        self.calibration, self.ground_truth = recording.calibration, recording.ground_truth
+        self._frames: dict[int, Frame] = {}
+        self._masks: dict[int, NDArray[np.bool_] | None] = {}
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - what else the recording has
+        return getattr(self.recording, name)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> "Frame":
+        if index not in self._frames:
+            self._frames[index] = self.recording[index]
+        return self._frames[index]
+
+    def mask(self, index: int) -> "NDArray[np.bool_] | None":
+        """True dynamic mask (H, W) of a frame if known."""
+        if index not in self._masks:
+            self._masks[index] = self.recording.mask(index)
+        return self._masks[index]
+
+    def load(self) -> "Excerpt":
+        """Read or render all frames and masks now, so that this falls into the time of nobody."""
+        for index in range(len(self)):
+            _ = self[index], self.mask(index)
+        return self
+
+
+DATA = tables("benchmark/suites.toml")
+SUITES: dict[str, str] = DATA["suites"]
+"""What each suite is, by name."""
+WORLDS: dict[str, dict[str, dict[str, Any]]] = DATA["worlds"]
+"""Parameters of the synthetic worlds of a suite, by name."""
+SENSORS: dict[str, dict[str, Any]] = DATA["sensors"]
 """The same static room, taken with sensors of different faults and with named cameras."""
-QUICK = ("room-static", "room-person", "room-people-at-start")
+SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
+"""Differences from the default configuration, by name."""
+PASSES = {"two-passes": 2}
+"""Systems that process a recording more than once, and how often."""
+ABLATION = ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))])
+"""Systems of the suite ``ablation``."""
+ROOM = {"movers": (), "frames": 120}
+QUICK = ("room-static", "room-person", "room-people-at-start", "two-people")
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Recordings of a suite.
-
-    Attributes:
-        name: Name of the suite.
-        entries: Recordings that were found.
-        missing: Recordings that were not found.
-    """
+    """Recordings of a suite that were found, and those that are missing."""
 
     name: str
     entries: list[Entry]
@@ -99,33 +147,33 @@ class Suite:
 
 
 def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
-    """Find the recordings of a suite.
+    """Find the recordings of one of ``SUITES``.
 
     Args:
-        name: One of ``SUITES``.
-        data: Folder that is searched, two levels deep, for the recordings; only ``synthetic`` needs none.
-        quick: Only three synthetic worlds, and at most 60 frames of every recording.
+        data: Folder that is searched, two levels deep; synthetic worlds need none.
+        quick: Only one to three synthetic worlds, and at most 60 frames of every recording.
 
     Raises:
         ConfigError: There is no such suite, or it needs ``data``.
         DatasetError: ``data`` is no folder, or for the suite ``local`` holds no recording.
     """
-    if name not in SUITES:
-        raise ConfigError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
-    if name == "synthetic":
-        chosen = [
-            Entry(key, parameters=parameters) for key, parameters in SYNTHETIC.items() if not quick or key in QUICK
-        ]
-        return Suite(name, [_short(entry) for entry in chosen] if quick else chosen, [])
-    if data is None:
+    find(name, SUITES, "suite")
+    missing: list[Entry] = []
+    if name in WORLDS:
+        worlds = {key: world for key, world in WORLDS[name].items() if not quick or key in QUICK}
+        found = [Entry(key, parameters=world | ({"frames": 60} if quick else {})) for key, world in worlds.items()]
+    elif data is None:
         raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")
-    if name == "local":
-        found, missing = local_entries(data), []
+    elif name == "local":
+        found = local_entries(data)
+    elif not data.is_dir():
+        raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
     else:
-        if not data.is_dir():
-            raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
-        found, missing = _located(_entries(name), data)
-    return Suite(name, [_short(entry) for entry in found] if quick else found, missing)
+        entries = [
+            Entry(key, address=DATA["address"][page]) for page, keys in DATA["recordings"][name].items() for key in keys
+        ]
+        found, missing = _located(entries, data)
+    return Suite(name, [replace(entry, max_frames=60) for entry in found] if quick else found, missing)
 
 
 def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> list[Entry]:
@@ -141,34 +189,6 @@ def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> li
     return [Entry(name, parameters=ROOM | size | SENSORS[name]) for name in names or SENSORS]
 
 
-def _short(entry: Entry) -> Entry:
-    if entry.path is None:
-        return replace(entry, parameters={**entry.parameters, "frames": 60})
-    return replace(entry, max_frames=60)
-
-
-def _entries(suite: str) -> list[Entry]:
-    tum = [Entry(name, address=TUM) for name in FR3]
-    bonn = [Entry(f"rgbd_bonn_{name}", address=BONN) for name in BONN_NAMES]
-    rooms = [f"living_room_traj{number}{kind}_frei_png" for kind in ("n", "") for number in range(4)]
-    icl = [Entry(name, address=ICL_NUIM) for name in rooms]
-    if suite == "tum-dynamic":
-        return tum
-    if suite == "bonn":
-        return bonn
-    if suite == "icl-nuim":
-        return icl
-    named = ("sitting_static", "sitting_xyz", "walking_static", "walking_xyz", "walking_halfsphere")
-    boxes = ("rgbd_bonn_balloon_tracking2", "rgbd_bonn_moving_obstructing_box")
-    return [
-        *(entry for entry in icl if entry.name == "living_room_traj2n_frei_png"),
-        *(Entry(name, address=CORBS) for name in ("D1", "E1")),
-        *(entry for entry in tum if entry.name.endswith(named)),
-        *(entry for entry in bonn if entry.name in boxes),
-        *(Entry(name, address=VOLUMEDEFORM) for name in ("boxing", "sunflower")),
-    ]
-
-
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
     """Entries whose folder or archive is found in ``data`` or one level below, and the others.
 
@@ -180,3 +200,24 @@ def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]
         found.setdefault(name.removesuffix("_pre_registereddata"), found[name])
     located = [replace(entry, path=found[entry.name]) for entry in entries if entry.name in found]
     return located, [entry for entry in entries if entry.name not in found]
+
+
+def systems(names: str) -> dict[str, Config]:
+    """Configurations by name, of a comma-separated list of ``SYSTEMS`` and of paths of TOML files.
+
+    Raises:
+        ConfigError: The list is empty, a name is unknown, a file is not a valid configuration, or two systems have the
+            same name.
+    """
+    found: dict[str, Config] = {}
+    for name in (name.strip() for name in names.split(",") if name.strip()):
+        if name not in SYSTEMS and not name.endswith(".toml"):
+            known = f"{', '.join(SYSTEMS)} and the path of a .toml file"
+            raise ConfigError(f"unknown system {name!r}; known are {known}")
+        short = name if name in SYSTEMS else Path(name).stem
+        if short in found:
+            raise ConfigError(f"two systems have the same name in {names!r}; give the .toml files different names")
+        found[short] = Config().override(SYSTEMS[name]) if name in SYSTEMS else Config.load(name)
+    if not found:
+        raise ConfigError(f"no system is named; known are {', '.join(SYSTEMS)} and the path of a .toml file")
+    return found

@@ -1,24 +1,17 @@
 """Runs on a Ray cluster (extra ``cluster``)."""
 
-from concurrent.futures import Future
 from importlib import import_module
 from typing import Any
 
 from dudmap.errors import ConfigError
 from dudmap.extras import extra, install
-from dudmap.lab.study.executor import WorkerDied, set_threads
-from dudmap.lab.study.worker import Job, Outcome, perform
-
-CPUS_PER_RUN = 1
-"""Cores that a run reserves, and its number of threads."""
+from dudmap.lab.study.worker import Job, Outcome, perform, set_threads
 
 
 class RayExecutor:
     """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
 
-    Args:
-        address: ``auto``, or ``ray://HOST:PORT``.
-        workers: Number of runs at a time; None takes the cores of the cluster.
+    The address is ``auto`` or ``ray://HOST:PORT``; without a number of workers they take all cores of the cluster.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -35,30 +28,21 @@ class RayExecutor:
         except ImportError as error:  # ray:// needs the client of Ray
             raise ConfigError(f"ray lacks its client ({error}); {install('cluster')}") from None
         self._ray = ray
-        self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(
-            _perform
-        )  # retries: dudmap.lab.study.conduct
-        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
-        self.cores = CPUS_PER_RUN
+        self._perform: Any = ray.remote(num_cpus=1, max_retries=0)(_perform)  # dudmap's conduct tries again
+        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self.cores = 1  # that a run reserves, and its number of threads
         self._running: set[Any] = set()
 
-    def submit(self, job: Job) -> "Future[Outcome]":
+    def perform(self, job: Job) -> Outcome:
         """See ``Executor``."""
-        reference = self._perform.remote(job)
+        errors, reference = self._ray.exceptions, self._perform.remote(job)
         self._running.add(reference)
-        out: Future[Outcome] = Future()
-        reference.future().add_done_callback(lambda future: self._pass_on(reference, future, out))
-        return out
-
-    def _pass_on(self, reference: Any, future: "Future[Outcome]", out: "Future[Outcome]") -> None:  # noqa: ANN401
-        self._running.discard(reference)
-        errors = self._ray.exceptions
-        lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
-        error = future.exception()
-        if error is None:
-            out.set_result(future.result())
-        else:
-            out.set_exception(WorkerDied() if isinstance(error, lost) else error)
+        try:
+            return self._ray.get(reference)
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError):
+            return "died"
+        finally:
+            self._running.discard(reference)
 
     def close(self) -> None:
         """See ``Executor``. The cluster goes on; its runs of this study are ended."""
@@ -68,5 +52,5 @@ class RayExecutor:
 
 
 def _perform(job: Job) -> Outcome:
-    set_threads(CPUS_PER_RUN)
+    set_threads(1)
     return perform(job)

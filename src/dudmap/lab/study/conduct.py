@@ -3,17 +3,14 @@
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any
+from threading import Event, Lock
 
-from dudmap.lab.study.executor import Executor, WorkerDied
+from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import Run
-from dudmap.lab.study.store import StudyFolder
-from dudmap.lab.study.tables import Table
-from dudmap.lab.study.worker import Job
+from dudmap.lab.study.worker import Do, Executor, Job, StudyFolder
 
 ATTEMPTS = 3
 """Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""
@@ -26,9 +23,8 @@ class Progress:
     """State of a study.
 
     Attributes:
-        total: Number of different runs.
-        done: Number of runs that have a result, those of earlier starts included.
-        begun: Number of runs that had one at the start.
+        total, done, begun: Number of different runs, of those that have a result, and of those that had one at the
+            start.
         deaths: Number of workers that died.
         spent: Time of all runs so far, those of earlier starts included, seconds.
         started: ``time.monotonic`` at the start.
@@ -43,31 +39,17 @@ class Progress:
     started: float = 0.0
     cores: int = 1
 
-    def seconds_left(self) -> float | None:
-        """Expected time left at the rate so far; None before the first run ended."""
-        now = self.done - self.begun
-        return None if not now else (time.monotonic() - self.started) / now * (self.total - self.done)
-
-    @property
-    def core_hours(self) -> float:
-        """Core-hours of all runs so far."""
-        return self.spent * self.cores / 3600
-
-    def cost(self, price: float = 0.0) -> str:
-        """Time of one core so far and about how much the whole study needs, with its cost at a price per core-hour."""
-        whole = self.core_hours / self.done * self.total if self.done else 0.0
-        hours = f"{duration(3600 * self.core_hours)} of about {duration(3600 * whole)} of core time"
-        return hours + (f", cost {self.core_hours * price:.2f} of about {whole * price:.2f}" if price else "")
-
     def describe(self, price: float = 0.0) -> str:
         """State in words, with the cost at a price per core-hour."""
-        left = self.seconds_left()
-        died = f", {self.deaths} workers died" if self.deaths else ""
-        rest = "" if left is None else f", {duration(left)} left"
-        return f"run {self.done} of {self.total}{rest}, {self.cost(price)}{died}"
-
-    def __str__(self) -> str:
-        return self.describe()
+        now, spent = self.done - self.begun, self.spent * self.cores / 3600  # core-hours
+        whole = spent / max(self.done, 1) * self.total
+        left = (time.monotonic() - self.started) / now * (self.total - self.done) if now else None
+        return (
+            f"run {self.done} of {self.total}{'' if left is None else f', {duration(left)} left'}, "
+            f"{duration(3600 * spent)} of about {duration(3600 * whole)} of core time"
+            + (f", cost {spent * price:.2f} of about {whole * price:.2f}" if price else "")
+            + (f", {self.deaths} workers died" if self.deaths else "")
+        )
 
 
 def duration(seconds: float) -> str:
@@ -83,18 +65,12 @@ def conduct(
     executor: Executor,
     *,
     keep: bool = False,
-    do: Callable[[Run, Path | None], dict[str, Any]] | None = None,
+    do: Do | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Progress:
-    """Do all runs that have no result yet.
+    """Do all runs that have no result yet, equal ones once; ``report`` is called after every run.
 
-    Args:
-        runs: The runs; equal ones are done once.
-        root: Study folder.
-        executor: Where they are done.
-        keep: Keep whole run folders.
-        do: See ``Job``.
-        report: Called after every run.
+    ``keep`` keeps whole run folders, ``do`` replaces the system (see ``Job``).
     """
     folder = StudyFolder(root)
     folder.create()
@@ -106,34 +82,41 @@ def conduct(
         len(unique), len(known), len(known), spent=sum(known), started=time.monotonic(), cores=executor.cores
     )
     deaths: Counter[str] = Counter()
-    running: dict[Future[Any], str] = {}
-    ended: SimpleQueue[Future[Any]] = SimpleQueue()  # waiting for a thousand futures anew after each would take longer
-    while missing or running:
-        while missing and len(running) < executor.workers:
-            key = missing.popleft()
-            future = executor.submit(Job(unique[key], root, keep, do))
-            running[future] = key
-            future.add_done_callback(ended.put)
-        future = ended.get()
-        key = running.pop(future)
-        try:
-            outcome = future.result()
-        except WorkerDied:
-            folder.note("died", key)
-            deaths[key] += 1
-            state.deaths += 1
-            if deaths[key] < ATTEMPTS:
+    stopped, lock = Event(), Lock()
+
+    def work() -> None:
+        while missing and not stopped.is_set():
+            try:
+                key = missing.popleft()
+            except IndexError:  # another thread took it
+                return
+            outcome = executor.perform(Job(unique[key], root, keep, do))
+            if outcome == "claimed":  # by another start of the study, or a worker that has yet to notice its end
                 missing.append(key)
-            continue
-        if outcome == "claimed":  # by another start of the study, or a worker that has yet to notice its end
-            missing.append(key)
-            time.sleep(POLL)
-            continue
-        result = folder.result(key)
-        assert result is not None
-        state.done += 1
-        state.spent += result["seconds"]
-        report(state)
+                time.sleep(POLL)
+                continue
+            with lock:
+                if outcome == "died":
+                    folder.note("died", key)
+                    deaths[key] += 1
+                    state.deaths += 1
+                    if deaths[key] < ATTEMPTS:
+                        missing.append(key)
+                    continue
+                result = folder.result(key)
+                assert result is not None
+                state.done += 1
+                state.spent += result["seconds"]
+                report(state)
+
+    with ThreadPoolExecutor(executor.workers, thread_name_prefix="study") as pool:
+        try:
+            for thread in [pool.submit(work) for _ in range(executor.workers)]:
+                thread.result()
+        except BaseException:  # Ctrl-C, or a defect: the workers end at once
+            stopped.set()
+            executor.close()
+            raise
     return state
 
 

@@ -1,34 +1,161 @@
-"""Experimental designs: which combinations of levels are run.
+"""Factors of a study (configuration keys with levels or a range) and designs: which combinations are run."""
 
-Every design comes from a library: factorial, Plackett-Burman (1946), central composite (Box and Wilson 1951) and
-Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs
-of Saltelli (2010) and Morris (1991), from which their indices are computed without a model, from SALib.
-"""
-
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from operator import attrgetter
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
+from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.lab.study.factors import Factor, Value
+
+Value = float | int | bool | str | list[Any]
+"""Value of a configuration key."""
+Table = Any
+"""A pandas DataFrame or Series. Type checkers cannot follow which of its many types an expression of pandas has."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One factor: a configuration key with its levels, or with a range.
+
+    A coded value is -1 at the low end of the range and +1 at the high end.
+
+    Attributes:
+        levels: The levels in the order given; empty for a range.
+        low, high: Ends of the range, or the smallest and the largest level; NaN if the levels are no numbers.
+        scale: Whether the coded value is linear in the value or in its logarithm.
+        whole: Whether the key takes whole numbers only.
+    """
+
+    key: str
+    levels: tuple[Value, ...] = ()
+    low: float = float("nan")
+    high: float = float("nan")
+    scale: Literal["linear", "log"] = "linear"
+    whole: bool = False
+
+    @property
+    def numeric(self) -> bool:
+        """Whether the factor has a low and a high end."""
+        return bool(np.isfinite(self.low))
+
+    @property
+    def name(self) -> str:
+        """The key without its section."""
+        return self.key.rpartition(".")[2]
+
+    def coded(self, values: Any) -> NDArray[np.float64]:  # noqa: ANN401 - a number or an array
+        """Coded values of values in the units of the key."""
+        low, high, values = self._transformed(self.low), self._transformed(self.high), self._transformed(values)
+        return (values - (low + high) / 2) / ((high - low) / 2)
+
+    def value(self, coded: float) -> float | int:
+        """Value in the units of the key, inside the range; a whole number where the key needs one."""
+        low, high = self._transformed(self.low), self._transformed(self.high)
+        number = float((low + high) / 2 + coded * (high - low) / 2)
+        number = float(np.exp(number)) if self.scale == "log" else number
+        number = min(max(number, self.low), self.high)
+        return round(number) if self.whole else float(f"{number:.12g}")
+
+    def _transformed(self, value: Any) -> NDArray[np.float64]:  # noqa: ANN401
+        return np.log(np.asarray(value, float)) if self.scale == "log" else np.asarray(value, float)
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of a TOML file is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def configured(base: Config, values: Mapping[str, Value]) -> Config:
+    """Configuration ``base`` with the values of some keys.
+
+    Raises:
+        ConfigError: A key is unknown or a value invalid.
+    """
+    return base.override([f"{key}={json.dumps(value)}" for key, value in values.items()])
+
+
+def make_factor(key: str, given: object, base: Config) -> Factor:
+    """Factor of one line of a design file: a list of levels, or a table with ``levels`` or ``range``, and ``scale``.
+
+    Raises:
+        ConfigError: The key is unknown, the table malformed, or a level is not valid beside the other keys of
+            ``base``.
+    """
+    table = {"levels": given} if isinstance(given, list) else given
+    if not isinstance(table, dict) or len({"levels", "range"} & set(table)) != 1:
+        raise ConfigError(f"factor {key} is {given!r}; expected a list of levels, or range = [low, high]")
+    scale, values = table.get("scale", "linear"), table.get("levels", table.get("range"))
+    if set(table) - {"levels", "range", "scale"} or scale not in ("linear", "log"):
+        raise ConfigError(f"factor {key} is {given!r}; known are levels, range and scale = linear or log")
+    if not isinstance(values, list) or len(values) < 2 or any(value in values[:n] for n, value in enumerate(values)):
+        raise ConfigError(f"factor {key} has {values!r}; expected two or more different values")
+    if key not in keys():
+        configured(base, {key: values[0]})  # names the nearest known key
+    numeric, is_range = all(map(is_number, values)), "range" in table
+    if is_range and (not numeric or len(values) != 2 or values[0] >= values[1]):
+        raise ConfigError(f"factor {key} has range {values!r}; expected two growing numbers")
+    low, high = (float(min(values)), float(max(values))) if numeric else (float("nan"), float("nan"))
+    if scale == "log" and not low > 0:
+        raise ConfigError(f"factor {key} has the scale log and the values {values!r}; expected numbers above 0")
+    whole = numeric and type(attrgetter(key)(base)) is int
+    if whole and any(value != round(value) for value in values):
+        raise ConfigError(f"factor {key} has {values!r}; it takes whole numbers only")
+    for value in values:
+        configured(base, {key: value})
+    return Factor(key, () if is_range else tuple(values), low, high, scale, whole)
+
+
+def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...]:
+    """Factors of the table ``factors`` of a design file, whose keys are quoted or nested.
+
+    ``all_numeric`` adds every numeric key (``numeric_factors``).
+
+    Raises:
+        ConfigError: There is none, or one is invalid.
+    """
+    from dudmap.lab.study.screening import numeric_factors
+
+    flat: dict[str, object] = {}
+    for key, given in table.items():
+        nested = isinstance(given, dict) and key != "all_numeric" and not {"levels", "range"} & set(given)
+        flat |= {f"{key}.{name}": inner for name, inner in given.items()} if nested else {key: given}  # type: ignore[union-attr]
+    everything = flat.pop("all_numeric", None)
+    chosen = tuple(make_factor(key, given, base) for key, given in flat.items())
+    if "all_numeric" in table:
+        chosen += numeric_factors(everything, base, flat)
+    if not chosen:
+        raise ConfigError('the design has no factors; expected, for example, [factors] "tracker.huber" = [0.005, 0.01]')
+    return chosen
+
+
+def coded_points(factors: Sequence[Factor], points: Table) -> NDArray[np.float64]:
+    """(N, K) coded values of a table of N points with K numeric factors."""
+    return np.column_stack([factor.coded(points[factor.key]) for factor in factors])
+
 
 Coded = NDArray[np.float64]
 Point = dict[str, Value]
 """Values of all factors by key."""
-
+Kind = Literal[
+    "full-factorial", "fractional-factorial", "plackett-burman", "central-composite", "box-behnken", "latin-hypercube",
+    "sobol", "saltelli", "morris",
+]  # fmt: skip
+DESIGNS: tuple[str, ...] = get_args(Kind)
 MORRIS_LEVELS = 4
 """Levels per factor of a Morris design; Morris (1991) and SALib take 4."""
 
 
-@dataclass(frozen=True)
-class DesignOptions:
+class DesignOptions(BaseModel):
     """Table ``design`` of a design file.
 
     Attributes:
-        kind: Name of the design, one of ``DESIGNS``.
+        kind: Name of the design.
         samples: Number of points of a Latin hypercube or Sobol sequence; base samples N of a Saltelli design, which has
             N (2 K + 2) points for K factors; trajectories N of a Morris design, which has N (K + 1) points.
         resolution: Resolution of a fractional factorial design.
@@ -38,8 +165,10 @@ class DesignOptions:
             interactions of two factors.
     """
 
-    kind: str = "full-factorial"
-    samples: int = 64
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Kind = Field("full-factorial", description=f"one of {', '.join(DESIGNS)}")
+    samples: int = Field(64, ge=1)
     resolution: int = 4
     generators: str = ""
     seed: int = 0
@@ -47,25 +176,25 @@ class DesignOptions:
 
 
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
-    """All points of a design, each once.
+    """All points of a design, each once; those of Saltelli and Morris need every row for their indices.
 
     Raises:
-        ConfigError: The design does not exist, or does not fit the factors.
+        ConfigError: The design does not fit the factors.
     """
-    if options.kind not in DESIGNS:
-        raise ConfigError(f"unknown design {options.kind!r}; known are {', '.join(DESIGNS)}")
-    found: list[Point]
-    if options.kind == "full-factorial":
+    kind = options.kind
+    if kind == "full-factorial":
         found = _full_factorial(factors)
-    elif options.kind in ("fractional-factorial", "plackett-burman"):
-        found = [_two_level(factors, row) for row in DESIGNS[options.kind](factors, options)]
+    elif kind in ("fractional-factorial", "plackett-burman"):
+        ends = [(f.value(-1), f.value(1)) if f.numeric else (f.levels[0], f.levels[-1]) for f in factors]
+        rows = (_fractional if kind == "fractional-factorial" else _plackett_burman)(factors, options)
+        found = [{f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)} for row in rows]
     else:
         words = [factor.key for factor in factors if not factor.numeric]
         if words:
-            raise ConfigError(f"a {options.kind} design needs numbers, but {words[0]} has levels that are none")
-        rows = DESIGNS[options.kind](factors, options)
+            raise ConfigError(f"a {kind} design needs numbers, but {words[0]} has levels that are none")
+        rows = (_response_surface if kind in ("central-composite", "box-behnken") else _sampled)(factors, options)
         found = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
-    if options.kind in ("saltelli", "morris"):  # their indices need every row, repeated ones too
+    if kind in ("saltelli", "morris"):
         return found
     return [point for number, point in enumerate(found) if point not in found[:number]]
 
@@ -94,25 +223,16 @@ def _full_factorial(factors: Sequence[Factor]) -> list[Point]:
     return [{f.key: f.levels[n] for f, n in zip(factors, row, strict=True)} for row in rows]
 
 
-def _two_level(factors: Sequence[Factor], row: Coded) -> Point:
-    ends = [(f.levels[0], f.levels[-1]) if not f.numeric else (f.value(-1), f.value(1)) for f in factors]
-    return {f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)}
-
-
 def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
     from pyDOE3 import fracfact, fracfact_by_res
 
+    given, count = options.generators, len(factors)
     try:
-        if options.generators:
-            rows = np.asarray(fracfact(options.generators))
-        else:
-            rows = np.asarray(fracfact_by_res(len(factors), options.resolution))
+        rows = np.asarray(fracfact(given) if given else fracfact_by_res(count, options.resolution))
     except ValueError as error:
-        raise ConfigError(f"no fractional factorial design for {len(factors)} factors: {error}") from None
-    if rows.shape[1] != len(factors):
-        raise ConfigError(
-            f"the generators {options.generators!r} make {rows.shape[1]} columns for {len(factors)} factors"
-        )
+        raise ConfigError(f"no fractional factorial design for {count} factors: {error}") from None
+    if rows.shape[1] != count:
+        raise ConfigError(f"the generators {given!r} make {rows.shape[1]} columns for {count} factors")
     return rows
 
 
@@ -121,9 +241,8 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
 
     for factor in factors:
         if len(factor.levels) > 2:
-            raise ConfigError(
-                f"a plackett-burman design has two levels, but {factor.key} has {len(factor.levels)}; give it a range"
-            )
+            count = len(factor.levels)
+            raise ConfigError(f"a plackett-burman design has two levels, but {factor.key} has {count}; give it a range")
     runs = 4 * (len(factors) // 4 + 1)
     while True:  # pyDOE3 knows the sizes 2^n, 12 2^n and 20 2^n
         try:
@@ -135,18 +254,15 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
 
 
 def _response_surface(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    """Central composite or Box-Behnken design."""
     from pyDOE3 import bbdesign, ccdesign
 
-    composite = options.kind == "central-composite"
-    if len(factors) < (2 if composite else 3):
+    count, composite = len(factors), options.kind == "central-composite"
+    if count < (2 if composite else 3):
         raise ConfigError(f"a {options.kind} design needs {'two' if composite else 'three'} factors or more")
-    count = len(factors)
     return np.asarray(ccdesign(count, center=(0, 1), face="faced") if composite else bbdesign(count, center=1))
 
 
 def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    """Latin hypercube, or Sobol, Saltelli or Morris design."""
     from SALib.sample import morris, sobol
     from scipy.stats.qmc import LatinHypercube, Sobol
 
@@ -164,18 +280,5 @@ def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
 
 def problem(factors: Sequence[Factor]) -> dict[str, Any]:
     """The factors in coded units, as SALib wants them."""
-    return {
-        "num_vars": len(factors),
-        "names": [factor.name for factor in factors],
-        "bounds": [[-1.0, 1.0]] * len(factors),
-    }
-
-
-DESIGNS: dict[str, Callable[[Sequence[Factor], DesignOptions], Coded]] = {
-    "full-factorial": lambda factors, options: np.empty((0, len(factors))),
-    "fractional-factorial": _fractional,
-    "plackett-burman": _plackett_burman,
-    **dict.fromkeys(("central-composite", "box-behnken"), _response_surface),
-    **dict.fromkeys(("latin-hypercube", "sobol", "saltelli", "morris"), _sampled),
-}
-"""Designs by name, as coded points; full-factorial takes the levels themselves (``_full_factorial``)."""
+    names = [factor.name for factor in factors]
+    return {"num_vars": len(factors), "names": names, "bounds": [[-1.0, 1.0]] * len(factors)}

@@ -1,14 +1,13 @@
-"""Main effects, interactions and analysis of variance of one response."""
+"""Main effects, interactions, analysis of variance, and sensitivity indices of one response."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dudmap.lab.study.factors import Factor
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.designs import MORRIS_LEVELS, Factor, Table, coded_points, problem
 
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""
@@ -33,28 +32,6 @@ def main_effects(table: Table, factors: Sequence[Factor], response: str) -> Tabl
     return pd.DataFrame(rows, columns=["factor", "level", "runs", "mean", "low", "high"])
 
 
-def effects_by_recording(table: Table, factors: Sequence[Factor], response: str) -> Table:
-    """Main effects on every recording on its own.
-
-    Returns:
-        One row per recording, factor and level: mean of the response, and partial eta squared and p of the factor in
-        the analysis of variance of that recording.
-    """
-    import pandas as pd
-
-    parts = []
-    for recording, part in table.groupby("sequence", sort=False):
-        part = part.reset_index(drop=True)
-        means, variance = main_effects(part, factors, response), anova(part, factors, response)
-        terms = variance.table if variance is not None else pd.DataFrame(columns=["partial eta2", "p"])
-        names = {factor.key: factor.name for factor in factors}
-        for column in ("partial eta2", "p"):
-            means[column] = means["factor"].map(lambda key: terms[column].get(names[key], np.nan))  # noqa: B023
-        parts.append(means.assign(recording=recording))
-    columns = ["recording", "factor", "level", "mean", "partial eta2", "p"]
-    return pd.concat(parts)[columns].reset_index(drop=True)
-
-
 def level_groups(values: Table) -> Table:
     """Level of each run; of a factor with many values, the mean of its group."""
     import pandas as pd
@@ -65,7 +42,7 @@ def level_groups(values: Table) -> Table:
     return values.groupby(groups, observed=True).transform("mean")
 
 
-def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict[tuple[str, str], Any]:
+def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict[tuple[str, str], Table]:
     """Means of the response at all pairs of levels of two factors: one table per pair, rows of the first factor."""
     out = {}
     for a, b in combinations(factors, 2):
@@ -74,93 +51,117 @@ def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Anova:
-    """Analysis of variance.
-
-    Attributes:
-        table: One row per term: sum of squares, degrees of freedom, F, p, partial eta squared with its confidence
-            interval, and omega squared. The last row is the residual.
-        formula: The model in words.
-        residual_dof: Degrees of freedom of the residual.
-    """
-
-    table: Table
-    formula: str
-    residual_dof: int
-
-
-def anova(table: Table, factors: Sequence[Factor], response: str) -> Anova | None:
+def anova(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table, str] | None:
     """Analysis of variance with main effects and, if the runs suffice, all interactions of two factors.
 
-    Sums of squares are of type II (statsmodels). Partial eta squared is SS / (SS + SS_residual); its interval comes
-    from that of the noncentrality of F (``confint_effectsize_oneway``). Recordings are blocks.
+    Sums of squares are of type II (statsmodels). Partial eta squared is SS / (SS + SS_residual). Recordings are blocks.
 
     Returns:
-        None if the runs do not suffice even for the main effects, or the response does not vary.
+        One row per term (sum of squares, degrees of freedom, F, p, partial eta squared), the last that of the residual,
+        and the model in words; None if the runs do not suffice even for the main effects, or the response does not
+        vary.
     """
+    import pandas as pd
     from statsmodels.formula.api import ols
     from statsmodels.stats.anova import anova_lm
 
-    data, terms = _columns(table, factors, response)
+    data, names = pd.DataFrame({"y": table[response], "block": table["sequence"]}), {}
+    for number, factor in enumerate(factor for factor in factors if table[factor.key].nunique() > 1):
+        many = factor.numeric and table[factor.key].nunique() > MOST_LEVELS
+        data[f"x{number}"] = factor.coded(table[factor.key].to_numpy()) if many else table[factor.key].map(str)
+        names[f"x{number}" if many else f"C(x{number})"] = factor.name
     block = " + C(block)" if data["block"].nunique() > 1 else ""
-    if not terms or data["y"].nunique() < 2:
+    if not names or data["y"].nunique() < 2:
         return None
     for order in (2, 1):
-        model = ols(f"y ~ ({' + '.join(terms)})**{order}{block}", data).fit()
+        model = ols(f"y ~ ({' + '.join(names)})**{order}{block}", data).fit()
         if model.df_resid >= 1 and np.linalg.matrix_rank(model.model.exog) == model.model.exog.shape[1]:
             break
     else:
         return None
-    found = anova_lm(model, typ=2)
-    names = dict(zip(terms, (factor.name for factor in factors if _varies(table, factor)), strict=True))
-    result = _with_effect_sizes(found, int(model.df_resid))
-    result.index = [_readable(str(term), names) for term in found.index]
+    names |= {"C(block)": "recording", "Residual": "residual"}
+    columns = {"sum_sq": "sum of squares", "df": "dof", "PR(>F)": "p"}
+    found = anova_lm(model, typ=2).rename(columns=columns).astype({"dof": int})
+    eta = found["sum of squares"] / (found["sum of squares"] + found.loc["Residual", "sum of squares"])
+    found["partial eta2"] = eta.where(found.index != "Residual")
+    found.index = [" x ".join(names[part] for part in str(term).split(":")) for term in found.index]
     words = "main effects and interactions of two factors" if order == 2 else "main effects"
-    return Anova(result, words + (", recordings as blocks" if block else ""), int(model.df_resid))
+    return found[["sum of squares", "dof", "F", "p", "partial eta2"]], words + (
+        ", recordings as blocks" if block else ""
+    )
 
 
-def _varies(table: Table, factor: Factor) -> bool:
-    return table[factor.key].nunique() > 1
+FOLDS = 5
+"""Folds of the cross-validation of an emulator."""
+ENOUGH_PREDICTED = 0.5
+"""Smallest share of the variance that an emulator must predict in cross-validation for its indices to be shown."""
+EMULATED = 1024
+"""Base samples of the indices of an emulator; their error is then small beside that of the emulator."""
 
 
-def _columns(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table, list[str]]:
-    """Columns with names that a formula can hold, and the term of every factor that varies."""
+def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: int = 0) -> Table:
+    """First- and second-order and total Sobol indices with their confidence intervals (SALib).
+
+    ``values`` (N (2 K + 2),) are the response of all rows of a Saltelli design of K factors, in its order.
+    """
     import pandas as pd
+    from SALib.analyze.sobol import analyze
 
-    data, terms = pd.DataFrame({"y": table[response], "block": table["sequence"]}), []
-    for number, factor in enumerate(factors):
-        if not _varies(table, factor):
-            continue
-        many = factor.numeric and table[factor.key].nunique() > MOST_LEVELS
-        data[f"x{number}"] = factor.coded(table[factor.key].to_numpy()) if many else table[factor.key].map(str)
-        terms.append(f"x{number}" if many else f"C(x{number})")
-    return data, terms
-
-
-def _readable(term: str, names: dict[str, str]) -> str:
-    if term == "C(block)":
-        return "recording"
-    return " x ".join(names.get(part, part.lower()) for part in term.split(":"))
-
-
-def _with_effect_sizes(found: Table, residual_dof: int) -> Table:
-    import pandas as pd
-    from statsmodels.stats.oneway import confint_effectsize_oneway
-
-    intervals: Any = confint_effectsize_oneway
+    scaled = (values - values.mean()) / values.std()  # the estimators assume a small mean
+    found = analyze(problem(factors), scaled, calc_second_order=True, seed=seed)
     rows = []
-    residual = float(found.loc["Residual", "sum_sq"])
-    total = float(found["sum_sq"].sum())
-    for term, row in found.iterrows():
-        squares, dof, f = float(row["sum_sq"]), float(row["df"]), float(row["F"])
-        eta, low, high, omega = (np.nan,) * 4
-        if term != "Residual":
-            eta = squares / (squares + residual) if squares + residual else np.nan
-            omega = (squares - dof * residual / residual_dof) / (total + residual / residual_dof)
-            if np.isfinite(f):
-                with np.errstate(divide="ignore"):  # a lower limit of zero
-                    low, high = intervals(f, (dof, residual_dof), alpha=1 - CONFIDENCE).eta2
-        rows.append((squares, int(dof), f, float(row["PR(>F)"]), eta, max(low, 0.0), high, omega))
-    columns = ["sum of squares", "dof", "F", "p", "partial eta2", "eta2 low", "eta2 high", "omega2"]
-    return pd.DataFrame(rows, columns=columns)
+    for n, factor in enumerate(factors):
+        rows.append((factor.name, "first", found["S1"][n], found["S1_conf"][n]))
+        rows.append((factor.name, "total", found["ST"][n], found["ST_conf"][n]))
+    for a, b in combinations(range(len(factors)), 2):
+        name = f"{factors[a].name} x {factors[b].name}"
+        rows.append((name, "second", found["S2"][a, b], found["S2_conf"][a, b]))
+    return pd.DataFrame(rows, columns=["term", "order", "index", "95 % +-"])
+
+
+def emulated_indices(table: Table, factors: Sequence[Factor], response: str, seed: int = 0) -> tuple[Table, str]:
+    """Sobol indices of a Gaussian process (scikit-learn) fitted to the runs, and how much it predicts, in words.
+
+    They are None if it predicts too little.
+    """
+    import warnings
+
+    from SALib.sample.sobol import sample
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+    from sklearn.model_selection import KFold, cross_val_predict
+
+    means = table.groupby([factor.key for factor in factors], as_index=False)[response].mean()
+    x = coded_points(factors, means)
+    y = means[response].to_numpy(float)
+    if len(y) < 2 * FOLDS or np.ptp(y) == 0:
+        return None, f"{len(y)} different points are too few for an emulator, or the response does not vary."
+    lengths: Any = np.ones(len(factors))  # one per factor, which the annotation of scikit-learn forgets
+    kernel = ConstantKernel() * RBF(lengths) + WhiteKernel(1e-2)
+    process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a length at its bound; cross-validation judges the fit
+        guess = cross_val_predict(process, x, y, cv=KFold(FOLDS, shuffle=True, random_state=seed))
+        process.fit(x, y)
+    share = float(1 - np.sum((guess - y) ** 2) / np.sum((y - y.mean()) ** 2))
+    text = f"A Gaussian process predicts {max(share, 0):.0%} of the variance between the points in cross-validation"
+    if share < ENOUGH_PREDICTED:
+        return None, f"{text}; Sobol indices of it would mean nothing."
+    values = process.predict(sample(problem(factors), EMULATED, calc_second_order=True, seed=seed))
+    return sobol_indices(factors, np.asarray(values), seed), f"{text}; the indices are those of the process."
+
+
+def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values: NDArray[np.float64]) -> Table:
+    """Mean absolute elementary effect mu* with its interval, mean mu and standard deviation sigma (SALib).
+
+    ``coded`` (N (K + 1), K) is a Morris design of K factors and ``values`` (N (K + 1),) the response, in its order.
+    """
+    import pandas as pd
+    from SALib.analyze.morris import analyze
+
+    found = analyze(problem(factors), coded, values, num_levels=MORRIS_LEVELS, seed=0)
+    names = [factor.name for factor in factors]
+    columns = {"mu*": found["mu_star"], "95 % +-": found["mu_star_conf"], "mu": found["mu"], "sigma": found["sigma"]}
+    frame = pd.DataFrame({"factor": names} | {key: np.asarray(value) for key, value in columns.items()})
+    return frame.sort_values("mu*", ascending=False, ignore_index=True)

@@ -4,26 +4,100 @@ import hashlib
 import inspect
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError
-from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.study.designs import DesignOptions, Point, count_of, points_of
-from dudmap.lab.study.factors import Factor, configured, make_factors
-from dudmap.lab.study.remote import RemoteEntry, is_url, name_of
-from dudmap.lab.study.responses import RESPONSES, check_truth, known_responses
+from dudmap.lab.benchmark.suites import Entry
+from dudmap.lab.data import find
+from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, count_of, make_factors, points_of
+from dudmap.lab.study.remote import RemoteEntry, name_of
+from dudmap.lab.study.responses import RESPONSES, Scale, check_truth
 
-SECTIONS = (
-    "name", "base", "factors", "design", "sequences", "judge", "responses", "log", "calibrate", "confirm", "each",
-    "tune",
-)  # fmt: skip
-"""Sections of a design file."""
 MAX_RUNS = 1000
 """Runs of a design that is not refused unless ``--max-runs`` allows more."""
+STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class TuneOptions(BaseModel):
+    """Table ``tune`` of a design file: configurations, seed of the proposals, and when they are pruned.
+
+    ``early`` is the share of the frames after which that happens; 0 prunes none.
+    """
+
+    model_config = STRICT
+
+    trials: int = Field(40, ge=1)
+    early: float = Field(0.34, ge=0, lt=1, description="early from 0 to below 1")
+    seed: int = 0
+
+
+class RealTable(BaseModel):
+    """Table ``sequences`` of a recording."""
+
+    model_config = STRICT
+
+    path: str
+    name: str = ""
+    frames: int | None = Field(None, ge=1)
+
+
+class SyntheticTable(BaseModel):
+    """Table ``sequences`` of a synthetic recording: what is checked here of its parameters."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    name: str = ""
+    scene: str = "room"
+    replicates: int = Field(1, ge=1)
+    seed: int = 0
+    camera: list[int] | None = Field(None, min_length=2, max_length=2, description="[width, height] in pixels")
+
+
+class DesignFile(BaseModel):
+    """A design file; ``docs/study.md`` describes it."""
+
+    model_config = STRICT
+
+    name: str = ""
+    base: list[str] = Field([], description='a list of settings such as ["preset=thesis"]')
+    factors: dict[str, Any] = Field({}, description='a table such as "tracker.huber" = [0.005, 0.01]')
+    design: str | dict[str, Any] = Field({}, description="a table with kind, samples, ...")
+    sequences: list[dict[str, Any]] = Field([], description="tables [[sequences]] with path or scene")
+    judge: list[dict[str, Any]] = Field([], description="tables [[judge]] with path or scene")
+    responses: list[str] = Field(["ate", "ms"], min_length=1, description=f"a list of {', '.join(RESPONSES)}")
+    log: list[str] = Field([], description="a list of responses")
+    calibrate: bool = Field(False, description="true or false")
+    confirm: int = Field(1, ge=0, description="the number of confirmation runs, 0 or more")
+    each: bool = Field(False, description="true or false")
+    tune: dict[str, Any] = Field({}, description="a table with trials, early, seed")
+
+
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+def checked(kind: type[Checked], given: object, what: str) -> Checked:
+    """A table of a design file as what it must be.
+
+    Raises:
+        ConfigError: A key is unknown or a value invalid.
+    """
+    try:
+        return kind.model_validate(given, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if not first["loc"]:
+            raise ConfigError(f"{what} is {given!r}; expected a table") from None
+        key = str(first["loc"][0])
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(f"unknown key {key!r} of {what}; known are {', '.join(kind.model_fields)}") from None
+        expected = kind.model_fields[key].description or first["msg"]
+        raise ConfigError(f"{key} of {what} is {first['input']!r}; expected {expected}") from None
 
 
 @dataclass(frozen=True)
@@ -33,9 +107,7 @@ class Run:
     Attributes:
         point: Number of the point in the design; -1 for a confirmation run.
         values: Values of the factors by key.
-        entry: The recording.
-        sequence: Name of the recording without its replicate.
-        replicate: Number of the replicate of a synthetic recording.
+        entry, sequence, replicate: The recording, its name without its replicate, and the number of that.
         config: All parameters.
         calibrate: Whether the colour camera is calibrated first, as ``dudmap run`` does.
         surfaces: Whether the mesh is scored.
@@ -67,18 +139,13 @@ class Plan:
     """A study as a design file describes it; see ``docs/study.md`` for the file.
 
     Attributes:
-        name: Name of the study.
         base: Configuration of the keys that are no factors.
-        factors: The factors.
-        options: The design.
-        entries: Recordings with the name of each without its replicate, and the number of the replicate.
+        entries: Recordings: the name of each without its replicate, the number of the replicate, and the recording.
         responses: Names of the responses; the first is optimised, the others are reported beside it.
         log: Names of the responses that are analysed as logarithms.
-        calibrate: Whether every run calibrates the colour camera first, as ``dudmap run`` does.
         confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
         each: Whether every recording also has a model and a confirmation of its own.
         code: Hash of the code.
-        tune: Options of ``dudmap study tune``.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
     """
 
@@ -93,7 +160,7 @@ class Plan:
     confirm: int = 1
     each: bool = False
     code: str = ""
-    tune: Mapping[str, Any] = field(default_factory=dict)
+    tune: TuneOptions = field(default_factory=TuneOptions)
     judges: tuple[tuple[str, int, Entry], ...] = ()
 
     def runs(self) -> list[Run]:
@@ -114,21 +181,25 @@ class Plan:
 
     def confirmation_runs(self, point: Point) -> list[Run]:
         """Runs at the predicted optimum: on every real recording, and on synthetic ones with seeds never seen."""
-        out = []
-        for name in dict.fromkeys(name for name, _, _ in self.entries):
+        entries: list[tuple[str, int, Entry]] = []
+        for name in self.recordings:
             same = [(replicate, entry) for other, replicate, entry in self.entries if other == name]
             if same[0][1].path is not None:
-                entries = same[:1]
+                entries.append((name, *same[0]))
             else:
                 last = max(int(entry.parameters["seed"]) for _, entry in same)
-                entries = [(-1 - n, _with_seed(same[0][1], last + 1 + n)) for n in range(self.confirm)]
-            fresh = replace(
-                self,
-                entries=tuple((name, replicate, entry) for replicate, entry in entries),
-                responses=self.responses[:1],
-            )
-            out += fresh.runs_at(-1, point)
-        return out
+                fresh = [_with_seed(same[0][1], last + 1 + n) for n in range(self.confirm)]
+                entries += [(name, -1 - n, entry) for n, entry in enumerate(fresh)]
+        return replace(self, entries=tuple(entries), responses=self.responses[:1]).runs_at(-1, point)
+
+    @property
+    def recordings(self) -> list[str]:
+        """Names of the recordings without their replicates."""
+        return list(dict.fromkeys(name for name, _, _ in self.entries))
+
+    def scale(self, response: str) -> Scale:
+        """How a response is analysed."""
+        return Scale(response, response in self.log)
 
     def check(self, max_runs: int = MAX_RUNS) -> None:
         """Check everything that can be known before anything is run.
@@ -168,74 +239,46 @@ def load_plan(path: str | Path) -> Plan:
 
 def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Plan:
     """Plan of the tree of a design file; see ``load_plan``."""
-    for section in tree:
-        if section not in SECTIONS:
-            raise ConfigError(f"unknown section {section!r} of the design; known are {', '.join(SECTIONS)}")
-    settings = tree.get("base", [])
-    if not isinstance(settings, list):
-        raise ConfigError(f'base is {settings!r}; expected a list of settings such as ["preset=thesis"]')
-    base = Config().override(settings)
-    factors = make_factors(tree.get("factors", {}), base)
-    responses = known_responses(tree.get("responses", ["ate", "ms"]))
-    log = known_responses(tree["log"]) if tree.get("log") else ()
-    options = _options(tree.get("design", {}))
-    confirm = tree.get("confirm", 1)
-    if not isinstance(confirm, int) or confirm < 0:
-        raise ConfigError(f"confirm is {confirm!r}; expected the number of confirmation runs, 0 or more")
-    for key, expected in (("calibrate", bool), ("each", bool), ("tune", dict)):
-        if key in tree and not isinstance(tree[key], expected):
-            raise ConfigError(f"{key} is {tree[key]!r}; expected {'true or false' if expected is bool else 'a table'}")
+    file = checked(DesignFile, tree, "the design")
+    base = Config().override(file.base)
+    for response in (*file.responses, *file.log):
+        find(response, RESPONSES, "response")
+    design = {"kind": file.design} if isinstance(file.design, str) else file.design
     return Plan(
-        str(tree.get("name", name)), base, factors, options,
-        make_entries(tree.get("sequences", []), folder), responses, log,
-        tree.get("calibrate", False), confirm, tree.get("each", False), method_hash(), tree.get("tune", {}),
-        make_entries(tree["judge"], folder) if tree.get("judge") else (),
-    )  # fmt: skip
+        name=file.name or name,
+        base=base,
+        factors=make_factors(file.factors, base),
+        options=checked(DesignOptions, design, "the design"),
+        entries=make_entries(file.sequences, folder),
+        responses=tuple(dict.fromkeys(file.responses)),
+        log=tuple(file.log),
+        calibrate=file.calibrate,
+        confirm=file.confirm,
+        each=file.each,
+        code=method_hash(),
+        tune=checked(TuneOptions, file.tune, "tune"),
+        judges=make_entries(file.judge, folder) if file.judge else (),
+    )
 
 
 def method_hash() -> str:
     """Hash of all code that a result depends on: all but the commands and the analysis of studies."""
-    from dudmap.lab.benchmark.limits import code_hash
+    from dudmap.lab.benchmark.measure import code_hash
 
     return code_hash(without=("cli", "lab/study"))
 
 
-def _options(table: object) -> DesignOptions:
-    table = {"kind": table} if isinstance(table, str) else table
-    if not isinstance(table, dict):
-        raise ConfigError(f"design is {table!r}; expected a table with kind, samples, ...")
-    return DesignOptions(**checked_options(table, DesignOptions, "the design"))
-
-
-def checked_options(table: Mapping[str, Any], options: type, what: str) -> dict[str, Any]:
-    """Options of a table of a design file, whose names and types are those of the fields of a class.
-
-    Raises:
-        ConfigError: An option is unknown, has another type, or is a number of samples or trials below 1.
-    """
-    known = {option.name: type(option.default) for option in fields(options)}
-    for key, value in table.items():
-        if key not in known:
-            raise ConfigError(f"unknown option {key!r} of {what}; known are {', '.join(known)}")
-        number = known[key] is float and type(value) is int
-        if (type(value) is not known[key] and not number) or (key in ("samples", "trials") and value < 1):
-            raise ConfigError(f"option {key} of {what} is {value!r}; expected a {known[key].__name__}")
-    return dict(table)
-
-
-def make_entries(tables: object, folder: Path) -> tuple[tuple[str, int, Entry], ...]:
+def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str, int, Entry], ...]:
     """Recordings of the tables ``sequences`` of a design file: name, replicate and entry of each.
 
     Raises:
         ConfigError: There is none, or one is malformed.
     """
-    if not isinstance(tables, list) or not tables:
+    if not tables:
         raise ConfigError('the design has no sequences; expected, for example, [[sequences]] path = "recordings/desk"')
     out: list[tuple[str, int, Entry]] = []
     for table in tables:
-        if not isinstance(table, dict):
-            raise ConfigError(f"sequence {table!r} is no table; expected [[sequences]] with path or scene")
-        out += _real(table, folder) if "path" in table else _synthetic(table)
+        out += [_real(table, folder)] if "path" in table else _synthetic(table)
     names = [entry.name for _, _, entry in out]
     for name in names:
         if names.count(name) > 1:
@@ -250,53 +293,29 @@ def place_of(entry: Entry) -> str | None:
     return None if entry.path is None else str(entry.path.resolve())
 
 
-def _real(table: dict[str, Any], folder: Path) -> list[tuple[str, int, Entry]]:
-    for key in table:
-        if key not in ("name", "path", "frames"):
-            raise ConfigError(f"a recording has no {key!r}; known are name, path and frames")
-    text, frames = str(table["path"]), _count(table, "frames", None)
-    if is_url(text):
-        name = str(table.get("name", name_of(text).partition(".")[0]))
-        return [(name, 0, RemoteEntry(name, Path(text), max_frames=frames, url=text))]
-    path = folder / Path(text).expanduser()
-    name = str(table.get("name", path.resolve().name))
-    return [(name, 0, Entry(name, path, max_frames=frames))]
+def _real(table: dict[str, Any], folder: Path) -> tuple[str, int, Entry]:
+    given = checked(RealTable, table, "a sequence")
+    if "://" in given.path:
+        name = given.name or name_of(given.path).partition(".")[0]
+        return name, 0, RemoteEntry(name, Path(given.path), max_frames=given.frames, url=given.path)
+    path = folder / Path(given.path).expanduser()
+    name = given.name or path.resolve().name
+    return name, 0, Entry(name, path, max_frames=given.frames)
 
 
 def _synthetic(table: dict[str, Any]) -> list[tuple[str, int, Entry]]:
     from dudmap.lab.synthetic import sequence
 
-    known = set(inspect.signature(sequence).parameters)
+    given, known = checked(SyntheticTable, table, "a synthetic sequence"), set(inspect.signature(sequence).parameters)
     for key in table:
         if key not in known | {"name", "replicates"}:
             raise ConfigError(f"a synthetic sequence has no parameter {key!r}; known are {', '.join(sorted(known))}")
-    parameters = {key: value for key, value in table.items() if key in known}
-    camera = parameters.get("camera")
-    if camera is not None and not (
-        isinstance(camera, list) and len(camera) == 2 and all(type(n) is int for n in camera)
-    ):
-        raise ConfigError(f"camera of a synthetic sequence is {camera!r}; expected [width, height] in pixels")
-    count, seed = _count(table, "replicates", 1), parameters.get("seed", 0)
-    assert count is not None
-    if type(seed) is not int:
-        raise ConfigError(f"seed of a synthetic sequence is {seed!r}; expected a whole number")
-    name = str(table.get("name", parameters.get("scene", "room")))
-    entries = [_with_seed(Entry(name, parameters=parameters), seed + n) for n in range(count)]
-    return [(name, n, entry if count > 1 else replace(entry, name=name)) for n, entry in enumerate(entries)]
-
-
-def _count(table: Mapping[str, Any], key: str, usual: int | None) -> int | None:
-    value = table.get(key, usual)
-    if value is not None and (type(value) is not int or value < 1):
-        raise ConfigError(f"{key} of a sequence is {value!r}; expected a whole number of 1 or more")
-    return value
+    name = given.name or given.scene
+    first = Entry(name, parameters={key: value for key, value in table.items() if key in known})
+    entries = [_with_seed(first, given.seed + n) for n in range(given.replicates)]
+    return [(name, n, entry if given.replicates > 1 else replace(entry, name=name)) for n, entry in enumerate(entries)]
 
 
 def _with_seed(entry: Entry, seed: int) -> Entry:
     base = entry.name.rpartition("#")[0] or entry.name
     return replace(entry, name=f"{base}#{seed}", parameters={**entry.parameters, "seed": seed})
-
-
-def sequence_names(plan: Plan) -> Sequence[str]:
-    """Names of the recordings without their replicates."""
-    return list(dict.fromkeys(name for name, _, _ in plan.entries))

@@ -12,16 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.extras import need
-from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.suites import Entry
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.mesh import Mesh
     from dudmap.io.sequences import Sequence
-
-
-def is_url(text: str) -> bool:
-    """Whether the path of a recording is a URL such as ``s3://bucket/desk.zip``, and not a path."""
-    return "://" in text
 
 
 def name_of(url: str) -> str:
@@ -31,11 +26,7 @@ def name_of(url: str) -> str:
 
 @dataclass(frozen=True)
 class RemoteEntry(Entry):
-    """Recording behind a URL, which every machine fetches when it first needs it.
-
-    Attributes:
-        url: The URL, of an archive, a file or a folder, of any file system that fsspec knows.
-    """
+    """Recording behind a URL of any file system that fsspec knows; every machine fetches it when it first needs it."""
 
     url: str = ""
 

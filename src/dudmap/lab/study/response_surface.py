@@ -1,16 +1,16 @@
-"""Full quadratic response surface (Box and Wilson 1951): fit, optimum within bounds, stationary point, lack of fit."""
+"""Full quadratic response surface (Box and Wilson 1951): fit, optimum, doubts about it, and its confirmation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.lab.study.designs import Factor, Point, Table, coded_points
 from dudmap.lab.study.effects import CONFIDENCE
-from dudmap.lab.study.factors import Factor, coded_points
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.responses import Scale
 
 Numbers = NDArray[np.float64]
 
@@ -23,6 +23,7 @@ class Surface:
     """Quadratic model y = b0 + sum b_i x_i + sum b_ij x_i x_j in coded units (-1 to 1) of K factors.
 
     Attributes:
+        scale: The response.
         factors: The K numeric factors.
         features: Maps (N, K) coded values to (N, P) terms.
         model: Fitted model of statsmodels.
@@ -30,9 +31,9 @@ class Surface:
         observed: (N,) values of the response.
         coded: (N, K) coded values of the runs.
         labels: (N,) description of every run.
-        better: Whether ``low`` or ``high`` values are good.
     """
 
+    scale: Scale
     factors: tuple[Factor, ...]
     features: Any
     model: Any
@@ -40,7 +41,6 @@ class Surface:
     observed: Numbers
     coded: Numbers
     labels: list[str]
-    better: str
 
     @property
     def r2(self) -> float:
@@ -60,21 +60,20 @@ class Surface:
 
     def predict(self, coded: Numbers) -> Numbers:
         """(N,) predictions at (N, K) coded values, for the mean over all recordings."""
-        terms = self.features.transform(coded)
-        return np.asarray(self.model.predict(self._exog(terms)))
+        return np.asarray(self.model.predict(self._exog(coded)))
 
-    def interval(self, coded: Numbers, count: int = 1) -> tuple[float, float, float]:
+    def interval(self, coded: Numbers, count: int) -> tuple[float, float, float]:
         """Prediction at one point, and the interval in which the mean of ``count`` new runs should fall."""
         from scipy import stats
 
-        frame = self.model.get_prediction(self._exog(self.features.transform(coded[None])))
+        frame = self.model.get_prediction(self._exog(coded[None]))
         mean, se = float(frame.predicted_mean[0]), float(frame.se_mean[0])
         half = stats.t.ppf((1 + CONFIDENCE) / 2, self.model.df_resid) * np.hypot(se, self.residual_sd / np.sqrt(count))
         return mean, mean - float(half), mean + float(half)
 
     def mean_interval(self, coded: Numbers) -> Numbers:
         """(N, 3) prediction of the mean at (N, K) coded values, and its confidence interval."""
-        frame = self.model.get_prediction(self._exog(self.features.transform(coded)))
+        frame = self.model.get_prediction(self._exog(coded))
         return np.column_stack([frame.predicted_mean, frame.conf_int(alpha=1 - CONFIDENCE)])
 
     @property
@@ -86,10 +85,10 @@ class Surface:
     @property
     def best_seen(self) -> float:
         """Best mean response of a point that was run."""
-        return float(self.point_means.min() if self.better == "low" else self.point_means.max())
+        return float(self.scale.sign * np.min(self.scale.sign * self.point_means))
 
-    def _exog(self, terms: Numbers) -> Numbers:
-        return np.hstack([np.asarray(terms), np.zeros((len(terms), self.blocks))])
+    def _exog(self, coded: Numbers) -> Numbers:
+        return np.hstack([np.asarray(self.features.transform(coded)), np.zeros((len(coded), self.blocks))])
 
     @property
     def quadratic_form(self) -> tuple[Numbers, Numbers]:
@@ -106,51 +105,50 @@ class Surface:
         return b, B
 
 
-def fit_surface(table: Table, factors: Sequence[Factor], response: str, better: str = "low") -> Surface | str:
-    """Fit the full quadratic model by least squares; recordings are blocks whose effects sum to zero.
+def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface | str:
+    """Fit the full quadratic model to runs of ``Scale.usable`` by least squares, or say why there is none.
 
-    Returns:
-        The model, or a sentence that says why there is none.
+    Recordings are blocks whose effects sum to zero.
     """
     import statsmodels.api as sm
     from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures
 
-    used = tuple(factor for factor in factors if factor.numeric and table[factor.key].nunique() > 1)
+    used = tuple(factor for factor in factors if factor.numeric and data[factor.key].nunique() > 1)
     if not used:
         return "There is no response surface: no numeric factor varies."
-    coded = coded_points(used, table[[factor.key for factor in used]].to_dict("records"))
+    coded = coded_points(used, data)
     features = PolynomialFeatures(2).fit(coded)
-    blocks = np.asarray(OneHotEncoder(sparse_output=False).fit_transform(table[["sequence"]]))
+    blocks = np.asarray(OneHotEncoder(sparse_output=False).fit_transform(data[["sequence"]]))
     effects = blocks[:, :-1] - blocks[:, -1:]
     exog = np.hstack([np.asarray(features.transform(coded)), effects])
-    rank = np.linalg.matrix_rank(exog)
-    if rank < exog.shape[1]:
+    rank, (runs, terms) = np.linalg.matrix_rank(exog), exog.shape
+    if rank < terms:
         return (
-            f"There is no response surface: the design tells apart {rank} of the {exog.shape[1]} terms of the full "
-            "quadratic model; take three or more levels per factor (central-composite, box-behnken, full-factorial)."
+            f"There is no response surface: the design tells apart {rank} of the {terms} terms of the full quadratic "
+            "model; take three or more levels per factor (central-composite, box-behnken, full-factorial)."
         )
-    if len(exog) <= exog.shape[1]:
-        return f"There is no response surface: {len(exog)} runs leave nothing over for {exog.shape[1]} terms."
-    observed = table[response].to_numpy(float)
+    if runs <= terms:
+        return f"There is no response surface: {runs} runs leave nothing over for {terms} terms."
+    observed = data[scale.response].to_numpy(float)
     if np.ptp(observed) == 0:
         return "There is no response surface: the response is the same in all runs."
     labels = [
-        ", ".join(f"{f.name} {row[f.key]:g}" for f in used) + f" on {row['sequence']}"
-        for row in table.to_dict("records")
+        f"{values_text({f.key: row[f.key] for f in used})} on {row['sequence']}" for row in data.to_dict("records")
     ]
-    model = sm.OLS(observed, exog).fit()
-    return Surface(used, features, model, effects.shape[1], observed, coded, labels, better)
+    return Surface(scale, used, features, sm.OLS(observed, exog).fit(), effects.shape[1], observed, coded, labels)
+
+
+def values_text(values: dict[str, Any]) -> str:
+    """Values of factors in words."""
+    return ", ".join(
+        f"{key.rpartition('.')[2]} {value:.4g}" if isinstance(value, float) else f"{key.rpartition('.')[2]} {value}"
+        for key, value in values.items()
+    )
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Best prediction within the bounds of the factors.
-
-    Attributes:
-        coded: (K,) coded values.
-        values: Values by key.
-        predicted: Predicted response.
-    """
+    """Best prediction within the bounds: coded values (K,), values by key, and predicted response."""
 
     coded: tuple[float, ...]
     values: dict[str, float]
@@ -159,91 +157,192 @@ class Optimum:
 
 def optimum(surface: Surface) -> Optimum:
     """Best prediction inside the bounds: L-BFGS-B (scipy) from all corners, edges, faces and the centre."""
+    import pandas as pd
     from scipy.optimize import minimize
     from scipy.stats.qmc import Sobol
 
-    sign = 1.0 if surface.better == "low" else -1.0
     count = len(surface.factors)
     if 3**count <= MOST_STARTS:
         starts = np.array(list(product((-1.0, 0.0, 1.0), repeat=count)))
     else:
         starts = 2 * Sobol(count, rng=np.random.default_rng(0)).random_base2(9) - 1
-    b, B = surface.quadratic_form
+    b, B = (surface.scale.sign * part for part in surface.quadratic_form)
     found = [
-        minimize(
-            lambda x: sign * (b @ x + x @ B @ x), start, jac=lambda x: sign * (b + 2 * B @ x), bounds=[(-1, 1)] * count
-        )
+        minimize(lambda x: b @ x + x @ B @ x, start, jac=lambda x: b + 2 * B @ x, bounds=[(-1, 1)] * count)
         for start in starts
     ]
     best = min(found, key=lambda result: result.fun).x
     values = {f.key: f.value(float(x)) for f, x in zip(surface.factors, best, strict=True)}
-    exact = coded_points(surface.factors, [values])[0]  # whole numbers were rounded
-    return Optimum(tuple(map(float, exact)), values, float(surface.predict(exact[None])[0]))
+    exact = coded_points(surface.factors, pd.DataFrame([values]))  # whole numbers were rounded
+    return Optimum(tuple(map(float, exact[0])), values, float(surface.predict(exact)[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class Canonical:
-    """Canonical analysis: y = y_s + sum lambda_i w_i^2 around the stationary point.
-
-    Attributes:
-        point: (K,) coded stationary point; None if the surface has none.
-        values: Its values by key, None outside the bounds of the factors.
-        predicted: Predicted response there.
-        eigenvalues: (K,) eigenvalues of B, ascending; all positive: a minimum; all negative: a maximum; else a saddle.
-        directions: (K, K) eigenvectors, one per column.
-    """
-
-    point: Numbers | None
-    values: dict[str, float] | None
-    predicted: float
-    eigenvalues: Numbers
-    directions: Numbers
-
-    @property
-    def kind(self) -> str:
-        """What the stationary point is."""
-        tolerance = 1e-9 * np.abs(self.eigenvalues).max()
-        if np.all(self.eigenvalues > tolerance):
-            return "minimum"
-        return "maximum" if np.all(self.eigenvalues < -tolerance) else "saddle"
-
-
-def canonical_analysis(surface: Surface) -> Canonical:
-    """Stationary point x_s = -B^-1 b / 2 and eigenvalues of B."""
-    b, B = surface.quadratic_form
-    eigenvalues, directions = np.linalg.eigh(B)
-    if np.linalg.matrix_rank(B) < len(b):
-        return Canonical(None, None, float("nan"), eigenvalues, directions)
-    point = np.asarray(np.linalg.solve(-2 * B, b), float)
-    inside = bool(np.all(np.abs(point) <= 1))
-    values = {f.key: f.value(float(x)) for f, x in zip(surface.factors, point, strict=True)} if inside else None
-    return Canonical(point, values, float(surface.predict(point[None])[0]), eigenvalues, directions)
-
-
-@dataclass(frozen=True)
-class LackOfFit:
-    """Test of the model against the means of repeated points: F, p and degrees of freedom of the pure error."""
-
-    f: float
-    p: float
-    pure_dof: int
-
-
-def lack_of_fit(surface: Surface) -> LackOfFit | None:
-    """F test of the quadratic against the saturated model (``anova_lm``); None without repeated points."""
+def lack_of_fit(surface: Surface) -> tuple[float, float] | None:
+    """F and p of the quadratic against the saturated model (``anova_lm``); None without repeated points."""
     import statsmodels.api as sm
     from statsmodels.stats.anova import anova_lm
 
-    blocks = (
-        np.asarray(surface.model.model.exog)[:, -surface.blocks :]
-        if surface.blocks
-        else np.empty((len(surface.observed), 0))
-    )
-    cells = np.hstack([surface.coded, blocks]).round(9)
+    exog = np.asarray(surface.model.model.exog)
+    cells = np.hstack([surface.coded, exog[:, exog.shape[1] - surface.blocks :]]).round(9)
     _, group = np.unique(cells, axis=0, return_inverse=True)
-    group = group.ravel()
-    if group.max() + 1 in (len(group), surface.model.model.exog.shape[1]):
+    group, count = group.ravel(), int(group.max()) + 1
+    if count in (len(group), exog.shape[1]):
         return None
-    saturated = sm.OLS(surface.observed, np.eye(group.max() + 1)[group]).fit()
-    row = anova_lm(surface.model, saturated).iloc[1]
-    return LackOfFit(float(row["F"]), float(row["Pr(>F)"]), int(saturated.df_resid))
+    row = anova_lm(surface.model, sm.OLS(surface.observed, np.eye(count)[group]).fit()).iloc[1]
+    return float(row["F"]), float(row["Pr(>F)"])
+
+
+ENOUGH_EXPLAINED = 0.5
+"""Smallest share of the variance that a model must predict (leave-one-out) to be better than a guess."""
+SIGNIFICANT = 0.05
+"""Largest p of a significant lack of fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Quadratic model of a response, its optimum and the best point of the design.
+
+    Attributes:
+        point: Values of all factors at the optimum; those without numbers have their best level.
+        best_point: Values of all factors at the best point of the design.
+        reasons: What speaks against the optimum before it is confirmed, each a sentence.
+    """
+
+    surface: Surface
+    best: Optimum
+    point: Point
+    best_point: Point
+    reasons: tuple[str, ...]
+
+
+def predict_optimum(data: Table, factors: Sequence[Factor], scale: Scale) -> Prediction | str:
+    """Quadratic model of runs of ``Scale.usable`` and its optimum, or a sentence that says why there is none."""
+    surface = fit_surface(data, factors, scale)
+    if isinstance(surface, str):
+        return surface
+    best, name = optimum(surface), scale.response
+    sizes = data.groupby("point")[name].transform("size")
+    means = scale.sign * data[sizes == sizes.max()].groupby("point")[name].mean()
+    first = data[data["point"] == means.idxmin()].iloc[0]
+    point: dict[str, Any] = {}
+    for factor in factors:
+        labels = data[factor.key].map(str)
+        label = (scale.sign * data.groupby(labels)[name].mean()).idxmin()
+        point[factor.key] = best.values.get(factor.key, _plain(data[factor.key][labels == label].iloc[0]))
+    best_point = {factor.key: _plain(first[factor.key]) for factor in factors}
+    return Prediction(surface, best, point, best_point, reasons_against(surface, best))
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - a value of a table as plain Python
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
+    """Reasons not to believe the optimum of a surface before it is confirmed, each a sentence."""
+    reasons, scale = [], surface.scale
+    if surface.r2_predicted < ENOUGH_EXPLAINED:
+        reasons.append(
+            f"The model explains {surface.r2:.0%} of the variance (R2 = {surface.r2:.2f}) and predicts "
+            f"{max(surface.r2_predicted, 0):.0%} of it when each run is left out in turn "
+            f"(R2 = {surface.r2_predicted:.2f})."
+        )
+    seen = surface.best_seen
+    noise = surface.residual_sd / np.sqrt(len(surface.observed) / len(surface.point_means))
+    if abs(seen - best.predicted) < noise:
+        beyond = scale.sign * best.predicted < scale.sign * seen
+        side = "below" if scale.sign > 0 else "above"
+        where = f"lies {side} everything observed" if beyond else "is no better than the best observed"
+        reasons.append(
+            f"The prediction {scale.text(best.predicted)} {where} ({scale.text(seen)}), from which it differs by less "
+            f"than the standard deviation of the residuals of a point, {noise:.3g}{scale.unit}."
+        )
+    if (single := carried_by(surface)) is not None:
+        reasons.append(single)
+    fit = lack_of_fit(surface)
+    if fit is not None and fit[1] < SIGNIFICANT:
+        reasons.append(f"The lack of fit is significant (F = {fit[0]:.2f}, p = {fit[1]:.2g}): it is not quadratic.")
+    return tuple(reasons)
+
+
+def carried_by(surface: Surface) -> str | None:
+    """The run that carries the model, and the model without it, as a sentence; None if no run does.
+
+    A run carries the model if its Cook's distance is beyond the median of F(P, N - P): it then moves the estimate out
+    of its own 50 % confidence region (Cook 1977).
+    """
+    import statsmodels.api as sm
+    from scipy import stats
+
+    model, scale = surface.model, surface.scale
+    distances, exog = model.get_influence().cooks_distance[0], np.asarray(model.model.exog)
+    worst, limit = int(np.argmax(distances)), float(stats.f.ppf(0.5, exog.shape[1], model.df_resid))
+    rest = np.arange(len(distances)) != worst
+    if distances[worst] <= limit or np.linalg.matrix_rank(exog[rest]) < exog.shape[1] or rest.sum() <= exog.shape[1]:
+        return None
+    observed = surface.observed[rest]
+    smaller = replace(surface, model=sm.OLS(observed, exog[rest]).fit(), observed=observed, coded=surface.coded[rest])
+    best = optimum(smaller)
+    return (
+        f"One value carries the model: {scale.text(surface.observed[worst])} at {surface.labels[worst]}, with a Cook's "
+        f"distance of {distances[worst]:.2f} (limit {limit:.2f}); without it R2 is {smaller.r2:.2f}, and the optimum "
+        f"{scale.text(best.predicted)} at {values_text(best.values)}."
+    )
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Runs at the predicted optimum, beside runs at the best point of the design on the same recordings.
+
+    Attributes:
+        scale: The response; all values are as it is analysed.
+        predicted, low, high: Prediction of the model, and the interval in which the mean of ``count`` runs should
+            fall.
+        design_mean: Mean of all runs of the design: what one would predict without a model.
+        measured, best_point: Means of the runs at the optimum and at the best point of the design.
+    """
+
+    scale: Scale
+    predicted: float
+    low: float
+    high: float
+    design_mean: float
+    measured: float
+    best_point: float
+    count: int
+
+    @property
+    def informative(self) -> bool:
+        """Whether the interval excludes the mean of the design: a wider one holds whatever is measured."""
+        return not self.low <= self.design_mean <= self.high
+
+    @property
+    def improves(self) -> bool:
+        """Whether the optimum is at least as good as the best point of the design."""
+        return self.scale.sign * self.measured <= self.scale.sign * self.best_point
+
+    @property
+    def held(self) -> bool:
+        """Whether the model held: it said what would be measured, more exactly than the mean does, and where to go."""
+        return self.low <= self.measured <= self.high and self.informative and self.improves
+
+    def __str__(self) -> str:
+        text = self.scale.text
+        runs = "1 run" if self.count == 1 else f"mean of {self.count} runs"
+        part = "inside" if self.low <= self.measured <= self.high else "outside"
+        wide = "" if self.informative else f" (so wide that it holds the mean of the design, {text(self.design_mean)})"
+        found = "no worse" if self.improves else "worse"
+        return (
+            f"Predicted {text(self.predicted)}, measured {text(self.measured)} ({runs}), {part} the interval "
+            f"{text(self.low)} to {text(self.high)}{wide}; {found} than the best point of the design on the same "
+            f"recordings, {text(self.best_point)}. The prediction was {'' if self.held else 'not '}confirmed."
+        )
+
+
+def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_point: Sequence[float]) -> Confirmation:
+    """Compare runs at the optimum (M,), as many on every recording, with the prediction and with the best point.
+
+    ``best_point`` (M,) is the response of runs at the best point of the design, on the same recordings.
+    """
+    predicted, low, high = surface.interval(np.array(best.coded), len(measured))
+    mean, other, usual = (float(np.mean(values)) for values in (measured, best_point, surface.observed))
+    return Confirmation(surface.scale, predicted, low, high, usual, mean, other, len(measured))

@@ -1,14 +1,15 @@
 """Screening of many keys: all numeric keys as factors, and the effect of each on each recording."""
 
 from collections.abc import Collection, Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.lab.study.factors import Factor, is_number, value_of
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study import report as figures
+from dudmap.lab.study.designs import Factor, Table, is_number
 
 if TYPE_CHECKING:
     from dudmap.lab.study.report import Report
@@ -24,12 +25,8 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
 
     Both ends are kept inside the bounds of the key; where a bound excludes its own value, the end lies halfway between
     value and bound. A whole number changes by 1 at least. Of a list of numbers all elements change together, and the
-    factor has two levels. A key with the value 0 has no ratio and is left out.
-
-    Args:
-        given: Table ``all_numeric`` of a design file: ``ratio``, and keys to leave out (``without``).
-        base: Configuration whose values are varied.
-        chosen: Keys that the design file gives itself, which are left out.
+    factor has two levels. A key with the value 0 has no ratio and is left out, as are the keys ``chosen`` by the design
+    file and those that its table (``ratio``, ``without``) names.
 
     Raises:
         ConfigError: The table is malformed.
@@ -46,7 +43,7 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
             raise ConfigError(f"all_numeric leaves out {key!r}, which is no configuration key")
     out = []
     for key in keys():
-        value = value_of(base, key)
+        value = attrgetter(key)(base)
         if key in without or key in chosen:
             continue
         if isinstance(value, tuple):
@@ -63,11 +60,13 @@ def _ends(key: str, value: float, ratio: float) -> tuple[float, float]:
     low, high = sorted((_scaled(value, 1 / ratio), _scaled(value, ratio)))
     if isinstance(value, int):
         low, high = min(low, value - 1), max(high, value + 1)
-    for name, bound in bounds_of(key).items():
-        if name in ("ge", "gt"):
-            low = max(low, bound) if name == "ge" else low if low > bound else (value + bound) / 2
-        else:
-            high = min(high, bound) if name == "le" else high if high < bound else (value + bound) / 2
+    bounds = bounds_of(key)
+    low = max(low, bounds.get("ge", low))
+    high = min(high, bounds.get("le", high))
+    if low <= bounds.get("gt", -np.inf):
+        low = (value + bounds["gt"]) / 2
+    if high >= bounds.get("lt", np.inf):
+        high = (value + bounds["lt"]) / 2
     return float(low), float(high)
 
 
@@ -78,8 +77,7 @@ def _scaled(value: float, factor: float) -> float:
 def bounds_of(key: str) -> dict[str, float]:
     """Bounds of a numeric key by their kind: ``ge``, ``gt``, ``le``, ``lt``."""
     section, _, name = key.rpartition(".")
-    model: Any = type(getattr(Config(), section))
-    found = model.model_fields[name].metadata
+    found = type(getattr(Config(), section)).model_fields[name].metadata
     return {kind: getattr(item, kind) for item in found for kind in ("ge", "gt", "le", "lt") if hasattr(item, kind)}
 
 
@@ -88,12 +86,11 @@ def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
 
     Least squares with all factors together (statsmodels), each recording on its own, so that a key that matters on one
     recording only is found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
-    and Hochberg 1995). In a design that is folded over, the effects are free of interactions of two factors, which are
-    in the residual.
+    and Hochberg 1995). In a design that is folded over, interactions of two factors are in the residual.
 
     Returns:
-        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in standard
-        deviations of the residual.
+        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in
+            standard deviations of the residual.
 
     Raises:
         ConfigError: The runs of a recording do not suffice for all factors.
@@ -124,58 +121,41 @@ def _signs(values: Table) -> Any:  # noqa: ANN401 - an array
     return np.where(plain == plain.max(), 1.0, -1.0)
 
 
-def describe_screening(report: "Report", effects: Table, heading: str) -> None:
-    """Add the keys that matter, with their effects per recording, and the names of the others."""
-    from dudmap.lab.study import figures
+def strongest(effects: Table) -> list[str]:
+    """Keys with a significant effect on any recording, the largest in standard deviations of the residual first."""
+    sure = effects[effects["p"] < FALSE_SHARE]
+    return list(sure["relative"].abs().groupby(sure["key"]).max().sort_values(ascending=False).index)
 
-    significant = effects[effects["p"] < FALSE_SHARE]
-    order = significant.groupby("key")["relative"].agg(lambda column: column.abs().max()).sort_values(ascending=False)
-    count = effects["key"].nunique()
+
+def describe_screening(report: "Report", effects: Table, heading: str) -> None:
+    """Add the keys that matter for a response, with their effects per recording."""
+    order, count = strongest(effects), effects["key"].nunique()
     report.text(
         f"{len(order)} of {count} keys have an effect on {heading} on at least one recording (from the low to the high "
         f"end; at most {FALSE_SHARE:.0%} of them by chance, Benjamini and Hochberg)."
     )
-    if order.empty:
+    if not order:
         return
-    wide = effects.pivot_table(index="key", columns="recording", values="effect", sort=False).loc[order.index]
-    sure = effects.assign(sure=effects["p"] < FALSE_SHARE).pivot_table(index="key", columns="recording", values="sure")
-    cells = wide.copy().astype(object)
-    for key in wide.index:
-        for recording in wide.columns:
-            star = "*" if sure.loc[key, recording] else ""
-            cells.loc[key, recording] = f"{wide.loc[key, recording]:.3g}{star}"
-    report.table(cells.reset_index())
+    stars = effects["p"].lt(FALSE_SHARE).map({True: "*", False: ""})
+    cells = effects.assign(effect=effects["effect"].map("{:.3g}".format) + stars)
+    report.table(cells.pivot(index="key", columns="recording", values="effect").loc[order].reset_index())
     report.text("A star marks the effects that are significant.")
-    shown = effects[effects["key"].isin(order.index[:MOST_SHOWN])]
-    report.figure(
-        figures.screening_figure(shown, list(order.index[:MOST_SHOWN]), heading), "Effects with 95 % intervals."
-    )
+    shown = order[:MOST_SHOWN]
+    figure = figures.screening_figure(effects[effects["key"].isin(shown)], shown, heading)
+    report.figure(figure, "Effects with 95 % intervals.")
 
 
-def summary(effects: Table) -> str:
-    """Which keys matter for which response, in words; the table has the columns of ``screen`` and ``response``."""
-    if effects.empty:
-        return "No response could be screened."
-    sure = effects[effects["p"] < FALSE_SHARE]
-    lines = [f"{sure['key'].nunique()} of {effects['key'].nunique()} keys have a significant effect:"]
-    for name, part in sure.groupby("response", sort=False):
-        order = part.groupby("key")["relative"].agg(lambda column: column.abs().max()).sort_values(ascending=False)
-        lines.append(f"{name}: {', '.join(order.index)}")
-    return "\n".join(lines)
-
-
-def which_matter(effects: Mapping[str, Table]) -> Table:
-    """For every key, the largest effect on each response in standard deviations of the residual; NaN if none is sure.
+def summary(effects: Mapping[str, Table]) -> str:
+    """Which keys matter for which response, in words.
 
     Args:
         effects: Tables of ``screen`` by the name of the response.
     """
-    import pandas as pd
-
-    columns = {}
-    for name, table in effects.items():
-        sure = table[table["p"] < FALSE_SHARE]
-        largest = sure.loc[sure.groupby("key")["relative"].apply(lambda column: column.abs().idxmax())]
-        columns[name] = largest.set_index("key")["relative"]
-    every = list(dict.fromkeys(key for table in effects.values() for key in table["key"]))
-    return pd.DataFrame(columns).reindex(every).rename_axis("key").reset_index()
+    if not effects:
+        return "No response could be screened."
+    by_response = {name: strongest(table) for name, table in effects.items()}
+    keys = list(dict.fromkeys(key for table in effects.values() for key in table["key"]))
+    rest = [key for key in keys if not any(key in found for found in by_response.values())]
+    lines = [f"{len(keys) - len(rest)} of {len(keys)} keys have a significant effect:"]
+    lines += [f"{name}: {', '.join(found)}" for name, found in by_response.items() if found]
+    return "\n".join([*lines, f"Without a significant effect on any response: {', '.join(rest)}."])

@@ -1,21 +1,24 @@
-"""A whole study: its runs, its confirmation, its tables and its report."""
+"""A whole study: its runs, its confirmation, its tables and its report; and chapter 6 of the thesis as studies."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import ConfigError
+from dudmap.lab.data import find
 from dudmap.lab.study.conduct import Progress, conduct, table_of
-from dudmap.lab.study.effects import effects_by_recording
-from dudmap.lab.study.executor import Executor
-from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, sequence_names
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.designs import Table
+from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, make_plan
+from dudmap.lab.study.responses import RESPONSES
+from dudmap.lab.study.worker import Executor
 
 if TYPE_CHECKING:
-    from dudmap.lab.study.analysis import Prediction
-    from dudmap.lab.study.judgement import Confirmation
+    from dudmap.lab.study.response_surface import Confirmation, Prediction
+
+NOTHING = "There is nothing to confirm."
 
 
 def run_study(
@@ -29,13 +32,7 @@ def run_study(
 ) -> str:
     """Do all runs that are missing, confirm the optimum, and write runs.csv, confirmation.csv and the report.
 
-    Args:
-        plan: The study.
-        out: Its folder.
-        executor: Where the runs are done; it is closed.
-        max_runs: Largest number of runs.
-        keep: Keep whole run folders.
-        report: Called after every run.
+    The executor is closed. ``keep`` keeps whole run folders; ``report`` is called after every run.
 
     Returns:
         The outcome in words.
@@ -43,23 +40,22 @@ def run_study(
     Raises:
         DudmapError: The study is refused before anything is run (``Plan.check``), or no run has a response.
     """
-    from dudmap.lab.study.analysis import predict_optimum
+    from dudmap.lab.study.response_surface import predict_optimum
 
     try:
         plan.check(max_runs)
-        runs = plan.runs()
+        runs, scale = plan.runs(), plan.scale(plan.responses[0])
         do = partial(conduct, root=out, executor=executor, keep=keep, report=report)
         state = do(runs)
         table = table_of(runs, out)
         table.to_csv(out / "runs.csv", index=False)
-        predicted = predict_optimum(table, plan.factors, plan.responses[0], plan.responses[0] in plan.log)
-        confirmation: Confirmation | str = "There is nothing to confirm."
-        if not isinstance(predicted, str) and plan.confirm:
-            confirmation = _confirm(plan, predicted, out, do)
+        predicted = predict_optimum(scale.usable(table), plan.factors, scale)
+        confirmation = NOTHING if isinstance(predicted, str) or not plan.confirm else _confirm(plan, predicted, out, do)
         each = confirm_each(plan, table, out, do) if plan.each else None
     finally:
         executor.close()
-    return write_report(plan, table, predicted, confirmation, out, executor.workers, state, each)
+    died = f"; {state.deaths} workers died" if state.deaths else ""
+    return write_report(plan, table, predicted, confirmation, out, f"{executor.workers} at a time{died}", each)
 
 
 def confirm_each(plan: Plan, table: Table, out: Path, do: Callable[[Sequence[Run]], Progress]) -> Table:
@@ -69,30 +65,27 @@ def confirm_each(plan: Plan, table: Table, out: Path, do: Callable[[Sequence[Run
     prediction, mean of the confirmation runs, best point of the design on the same recordings, frames lost in the
     confirmation runs, whether the model held, and whether anything spoke against it before.
     """
-    import numpy as np
     import pandas as pd
 
-    from dudmap.lab.study.analysis import predict_optimum
+    from dudmap.lab.study.response_surface import predict_optimum
 
-    name, rows = plan.responses[0], []
-    plain = np.exp if name in plan.log else np.asarray
-    for recording in sequence_names(plan):
+    scale, rows = plan.scale(plan.responses[0]), []
+    for recording in plan.recordings:
         alone = replace(plan, entries=tuple(entry for entry in plan.entries if entry[0] == recording))
-        predicted = predict_optimum(table[table["sequence"] == recording], plan.factors, name, name in plan.log)
+        predicted = predict_optimum(scale.usable(table[table["sequence"] == recording]), plan.factors, scale)
         if isinstance(predicted, str):
             rows.append({"recording": recording, "held": predicted})
             continue
-        point = {key.rpartition(".")[2]: value for key, value in predicted.point.items()}
-        surface = predicted.surface
+        point, surface = {key.rpartition(".")[2]: value for key, value in predicted.point.items()}, predicted.surface
         row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
-        row |= {"best run": float(plain(surface.best_seen)), "predicted": float(plain(predicted.best.predicted))}
+        row |= {"best run": scale.plain(surface.best_seen), "predicted": scale.plain(predicted.best.predicted)}
         file = f"confirmation-{recording}.csv"
         found = _confirm(alone, predicted, out, do, file)
         if isinstance(found, str):
             rows.append(row | {"held": found})
             continue
-        row |= {"measured": float(plain(found.measured)), "best point": float(plain(found.best_point))}
         runs = pd.read_csv(out / file)
+        row |= {"measured": scale.plain(found.measured), "best point": scale.plain(found.best_point)}
         row["lost at the optimum"] = float(runs.loc[runs["at"] == "optimum", "lost"].mean())
         warned = "yes" if predicted.reasons else "no"
         rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
@@ -111,24 +104,21 @@ def _confirm(
     """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
 
-    from dudmap.lab.study.analysis import usable
-    from dudmap.lab.study.judgement import confirm
+    from dudmap.lab.study.response_surface import confirm
 
-    name = plan.responses[0]
+    scale = plan.scale(plan.responses[0])
     at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)
     do([*at_optimum, *at_best])
-    tables = [table_of(at_optimum, out), table_of(at_best, out)]
-    pd.concat(tables, keys=["optimum", "best point of the design"], names=["at"]).reset_index("at").to_csv(
-        out / file, index=False
-    )
+    tables = {"optimum": table_of(at_optimum, out), "best point of the design": table_of(at_best, out)}
+    pd.concat(tables, names=["at"]).reset_index("at").to_csv(out / file, index=False)
     try:
-        measured, best = (usable(table, name, name in plan.log) for table in tables)
+        measured, best = (scale.usable(table)[scale.response].tolist() for table in tables.values())
     except ConfigError as error:
         return f"The prediction was not confirmed: a confirmation failed, {error}."
     if len(measured) < len(at_optimum):
         failed = f"{len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed"
         return f"The prediction was not confirmed: {failed}."
-    return confirm(predicted.surface, predicted.best, measured[name].tolist(), best[name].tolist())
+    return confirm(predicted.surface, predicted.best, measured, best)
 
 
 def write_report(
@@ -137,63 +127,123 @@ def write_report(
     predicted: "Prediction | str",
     confirmation: "Confirmation | str",
     out: Path,
-    workers: int,
-    state: Progress | None = None,
+    how: str,
     each: Table | None = None,
 ) -> str:
     """Write report.md and report.html; return the outcome in words."""
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.study import analysis, screening
     from dudmap.lab.study.report import Report
+    from dudmap.lab.study.response_surface import values_text
 
-    report = Report(f"Study {plan.name}")
-    died = f" {state.deaths} workers died." if state and state.deaths else ""
+    report, first = Report(f"Study {plan.name}"), plan.scale(plan.responses[0])
     report.text(
         f"{plan.options.kind} design of {len(plan.factors)} factors, {table['point'].nunique()} points, "
-        f"{len(table)} runs on {', '.join(sequence_names(plan))}; {workers} at a time.{died}"
+        f"{len(table)} runs on {', '.join(plan.recordings)}; {how}."
     )
     report.items(
         f"{f.key}: {', '.join(map(str, f.levels)) if f.levels else f'{f.low:g} to {f.high:g} ({f.scale})'}"
         for f in plan.factors
     )
     report.text(f"Base configuration: {plan.base.preset}. {machine()['cpu']}, {versions()}".replace("'", ""))
+    effects: dict[str, Table] = {}
     for name in plan.responses:
         try:
-            analysis.describe_response(report, table, plan.factors, name, plan.options, name in plan.log)
+            found = analysis.describe_response(report, plan, table, name)
+            effects |= {} if found is None else {name: found}
         except ConfigError as error:
-            report.heading(name)
             report.text(f"{error}.")
-        if name == plan.responses[0]:
+        if name == first.response:
             report.heading("Confirmation")
             report.text(str(confirmation))
             if each is not None:
-                report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
+                report.heading(f"{plan.scale(name)._replace(log=False).heading}: each recording on its own")
                 report.table(each)
-                levels = effects_by_recording(analysis.usable(table, name, name in plan.log), plan.factors, name)
-                levels.to_csv(out / "levels.csv", index=False)
-                report.text(f"Mean {analysis.heading_of(name, name in plan.log)} at every level:")
-                report.table(levels)
-    effects = None
-    if plan.options.kind == "plackett-burman":
-        effects = analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log)
-        effects.to_csv(out / "effects.csv", index=False)
+    screened = plan.options.kind == "plackett-burman"
+    if screened:
+        import pandas as pd
+
+        report.heading("Which keys matter")
+        report.text(screening.summary(effects))
+        if effects:
+            pd.concat(effects, names=["response"]).reset_index("response").to_csv(out / "effects.csv", index=False)
     else:
-        analysis.describe_pareto(report, table, plan.factors, plan.responses)
-        analysis.describe_points(report, table, plan.factors, plan.responses)
+        analysis.describe_points(report, plan, table)
     analysis.describe_losses(report, table)
     analysis.describe_failures(report, table)
     report.save(out)
-    heading = analysis.heading_of(plan.responses[0], plan.responses[0] in plan.log)
-    return outcome(heading, predicted, confirmation) if effects is None else screening.summary(effects)
-
-
-def outcome(heading: str, predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:
-    """What a study found of the response with a heading, name and unit, in words."""
-    from dudmap.lab.study.analysis import values_text
-
-    if isinstance(predicted, str):
-        return predicted
-    lines = [f"{heading}: predicted optimum {predicted.best.predicted:.4g} at {values_text(predicted.point)}."]
+    if screened or isinstance(predicted, str):
+        return screening.summary(effects) if screened else str(predicted)
+    best = first.text(predicted.best.predicted)
+    lines = [f"{RESPONSES[first.response].name}: predicted optimum {best} at {values_text(predicted.point)}."]
     if predicted.reasons:
         lines += ["Reasons to doubt it before it is measured:", *(f"- {reason}" for reason in predicted.reasons)]
     return "\n".join([*lines, f"Confirmation runs: {confirmation}"])
+
+
+HUBER, DAMPING, VOXEL, WEIGHT = "tracker.huber", "tracker.damping", "volume.voxel_size", "tracker.color_weight"
+TABLES: Mapping[str, dict[str, list[float]]] = {
+    "6.1": {HUBER: [0.005, 0.01, 0.025], DAMPING: [0.002, 0.01, 0.02], VOXEL: [0.01, 0.02, 0.05],
+            WEIGHT: [0.025, 0.1, 0.175]},
+    "6.2": {WEIGHT: [0.1, 0.11, 0.12, 0.125, 0.1275, 0.13, 0.1325, 0.14, 0.15, 0.175]},
+    "6.3": {VOXEL: [0.005, 0.01, 0.02, 0.05], WEIGHT: [0.01, 0.025, 0.04]},
+}  # fmt: skip
+"""Factors and levels: table 6.1 with figures 6.1, 6.2 and 6.4, table 6.2 with figure 6.3, and table 6.3. The other keys
+have the values of preset ``thesis``, which are those of the thesis in tables 6.2 and 6.3."""
+ROOM: dict[str, Any] = {
+    "name": "room", "scene": "room", "movers": ["person"], "frames": 240, "camera": [320, 240],
+}  # fmt: skip
+"""Recording of a study without any: a synthetic room with a walking person. The thesis took freiburg3_walking_xyz for
+tables 6.1 and 6.2 and freiburg3_walking_static for table 6.3."""
+PUBLISHED_CONFIRMATION = 89.0
+"""ATE that the thesis measured at its quadratic optimum, millimetres (section 6.1)."""
+
+
+def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int | None = None) -> Plan:
+    """Plan of table 6.1, 6.2 or 6.3 of the thesis, on ``ROOM`` unless recordings are named.
+
+    Raises:
+        ConfigError: There is no such table.
+    """
+    some = {} if frames is None else {"frames": frames}
+    return make_plan(
+        {
+            "name": f"thesis, table {table}",
+            "base": ["preset=thesis"],
+            "factors": find(table, TABLES, "table"),
+            "sequences": [{"path": str(path.absolute()), **some} for path in recordings] or [{**ROOM, **some}],
+        }
+    )
+
+
+def published_table() -> Table:
+    """The 81 values of table 6.1 as runs: ATE RMSE in metres on freiburg3_walking_xyz."""
+    import pandas as pd
+
+    with (files("dudmap.lab.study") / "thesis_table_6_1.csv").open(encoding="utf-8") as file:
+        given = pd.read_csv(file)
+    columns = {"huber": HUBER, "damping": DAMPING, "voxel_size": VOXEL, "color_weight": WEIGHT, "ate_m": "ate_rmse_m"}
+    return given.rename(columns=columns).assign(
+        run=given.index, point=given.index, sequence="freiburg3_walking_xyz", replicate=0
+    )
+
+
+def published_report(out: Path) -> str:
+    """Analyse the values of table 6.1 as the thesis printed them; write the report and return the outcome.
+
+    The confirmation is the thesis' own: 0.089 m at its optimum, 0.080 m at the best point of the design.
+    """
+    from dudmap.lab.study.response_surface import confirm, predict_optimum
+    from dudmap.lab.study.study import write_report
+
+    plan, table = thesis_plan(), published_table()
+    recording = (str(table["sequence"][0]), 0, plan.entries[0][2])
+    plan = replace(plan, name="thesis, table 6.1 as published", entries=(recording,), responses=("ate",))
+    out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out / "runs.csv", index=False)
+    scale = plan.scale("ate")
+    data = scale.usable(table)
+    predicted = predict_optimum(data, plan.factors, scale)
+    assert not isinstance(predicted, str)
+    confirmation = confirm(predicted.surface, predicted.best, [PUBLISHED_CONFIRMATION], [float(data["ate"].min())])
+    return write_report(plan, table, predicted, confirmation, out, "nothing was run")

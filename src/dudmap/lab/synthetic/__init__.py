@@ -24,12 +24,11 @@ def __getattr__(name: str) -> object:
 
 def names() -> dict[str, list[str]]:
     """Names of all scenes, movers, camera paths, situations, noise models and sensors."""
-    from dudmap.lab.synthetic.cameras import CAMERAS
     from dudmap.lab.synthetic.movers import MOVERS
     from dudmap.lab.synthetic.paths import FOLLOW, PATHS
     from dudmap.lab.synthetic.rooms import SCENES
-    from dudmap.lab.synthetic.sensors import SENSORS
-    from dudmap.lab.synthetic.situations import SITUATIONS
+    from dudmap.lab.synthetic.sensors import CAMERAS, SENSORS
+    from dudmap.lab.synthetic.setup import SITUATIONS
 
     return {
         "scenes": list(SCENES),

@@ -1,8 +1,9 @@
-"""Colour camera of a synthetic sensor: its place, its time of exposure, its lens and its exposure."""
+"""Colour camera of a synthetic sensor (place, time, lens, exposure), and systematic errors of its depth."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError
 from dudmap.lab.synthetic.faults import SensorFaults
+from dudmap.lab.synthetic.kernels import depth_noise as kernels
+from dudmap.lab.synthetic.render import over_rows
 
 Image = NDArray[np.float32]
 TARGET_LEVEL = 110.0
@@ -22,16 +25,9 @@ WHITE_BALANCE_PERIOD = 8.0
 
 
 class ColorCamera:
-    """Colour camera beside a depth camera.
+    """Colour camera beside a depth camera, with true intrinsics ``camera``.
 
-    Args:
-        faults: Its place, delay, readout, lens, white balance and vignetting.
-        depth_camera: Intrinsics of the depth camera.
-        exposure_time: Duration of the exposure of a row, seconds; 0 for no motion blur.
-        frame_interval: Time between two frames, seconds.
-
-    Attributes:
-        camera: True intrinsics.
+    The exposure of a row takes ``exposure_time`` (0: no motion blur); times in seconds.
     """
 
     def __init__(self, faults: SensorFaults, depth_camera: Camera, exposure_time: float, frame_interval: float) -> None:
@@ -88,15 +84,10 @@ class ColorCamera:
 
 
 def exposure_gains(levels: NDArray[np.float64], times: NDArray[np.float64], lag: float) -> NDArray[np.float64]:
-    """Exposure factors (N,) of an automatic exposure with a lag.
+    """Exposure factors (N,) of an automatic exposure with a lag in seconds, of mean grey values (N,) at factor 1.
 
     A control loop of first order on the logarithm of the exposure: each frame moves by 1 - exp(-dt / lag) towards the
     factor that would have brought the frame before to ``TARGET_LEVEL``. The first frame is settled.
-
-    Args:
-        levels: (N,) mean grey values at factor 1.
-        times: (N,) seconds.
-        lag: Time constant in seconds, positive.
     """
     wanted = np.clip(np.log(TARGET_LEVEL / np.maximum(levels, 1.0)), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
     gains = np.empty(len(times))
@@ -113,14 +104,7 @@ def white_balance(faults: SensorFaults, t: float) -> NDArray[np.float32]:
 
 
 class Lens:
-    """Lens that distorts an ideal image of a somewhat larger view.
-
-    Args:
-        camera: Intrinsics and distortion of the image to be made.
-
-    Attributes:
-        margin: Number of pixels by which the ideal image is larger on every side.
-    """
+    """Lens that distorts an ideal image of a view that is larger by ``margin`` pixels on every side."""
 
     def __init__(self, camera: Camera) -> None:
         rows, columns = np.indices(camera.shape, dtype=np.float64)
@@ -147,3 +131,131 @@ def compressed(color: NDArray[np.uint8], quality: float) -> NDArray[np.uint8]:
     image = cv2.imdecode(code, cv2.IMREAD_COLOR)
     assert image is not None
     return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8, copy=False)
+
+
+BANDS = 8
+"""Number of vertical bands over the width of the image, assumed."""
+MODES = 6
+"""Number of waves of the smooth distortion."""
+PATCHES = 16
+"""Patches over the width of the image from which indirect light comes."""
+WAVE_NUMBER = 2 * np.pi * 80e6 / 299792458.0
+"""Wave number, rad/m, of light modulated with 80 MHz, the middle one of the three frequencies of a Kinect v2."""
+EDGE = (0.04, 0.02)
+"""A neighbour is beyond a depth edge if it differs by more than EDGE[0] z + EDGE[1], metres."""
+
+
+class DepthFaults:
+    """Systematic errors of the depth of one sensor, whose patterns are drawn from a seed."""
+
+    def __init__(self, faults: SensorFaults, camera: Camera, seed: int) -> None:
+        self._faults, self._camera, self._seed = faults, camera, seed
+        rng = np.random.default_rng([seed, 6])
+        bands = rng.standard_normal(BANDS)
+        bands -= bands.mean()
+        self.bands = faults.depth_bands * bands / np.sqrt(np.mean(bands**2))
+        waves = rng.uniform(-2.0, 2.0, (MODES, 2))  # half periods over the width and height of the image
+        phases, turns = rng.uniform(0, 2 * np.pi, MODES), rng.uniform(-0.6, 0.6, MODES)  # rad, rad/m
+        sizes = rng.uniform(0.5, 1.0, MODES)
+        sizes *= faults.depth_distortion / np.sqrt(0.5 * np.sum(sizes**2))
+        self.modes = np.column_stack([sizes, waves, phases, turns])
+
+    def __bool__(self) -> bool:
+        f = self._faults
+        smooth = f.depth_scale_error or f.depth_offset or f.depth_bands or f.depth_distortion
+        return bool(smooth or f.flying_pixels or f.multipath)
+
+    def truth(self) -> dict[str, Any]:
+        """The patterns, with the formula that they belong to."""
+        return {
+            "depth_model": "z1 = z (1 + depth_scale_error + z/2 sum_k size_k cos(pi (wave_u_k u / W + wave_v_k v / H) "
+            "+ phase_k + turn_k z)) + depth_offset; reading = 1 / (1 / z1 + band(u)), band(u) = bands[int(u n / W)]; "
+            "z is the true depth plus the error of flying pixels and multi-path",
+            "depth_distortion_columns": ["size", "wave_u", "wave_v", "phase", "turn_per_m"],
+            "depth_distortion_modes": self.modes.tolist(),
+            "depth_bands_per_m": self.bands.tolist(),
+        }
+
+    def multiplier(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Any]) -> NDArray[np.float64]:
+        """Factor of scale error and smooth distortion at pixels u, v and true depths z in metres, arrays that match."""
+        total = np.zeros(np.broadcast(u, v, z).shape)
+        if self._faults.depth_distortion:
+            width, height = self._camera.width, self._camera.height
+            for size, wave_u, wave_v, phase, turn in self.modes:
+                total += size * np.cos(np.pi * (wave_u * u / width + wave_v * v / height) + phase + turn * z)
+        return 1.0 + self._faults.depth_scale_error + 0.5 * z * total
+
+    def apply(self, exact: NDArray[np.float32], index: int) -> NDArray[np.float32]:
+        """Depth (H, W) in metres that the sensor would read without noise, of the true one; 0 stays 0."""
+        faults, depth = self._faults, exact
+        if faults.multipath:
+            depth = with_multipath(depth, self._camera, faults.multipath)
+        if faults.flying_pixels:
+            depth = with_flying_pixels(depth, faults.flying_pixels, np.random.default_rng([self._seed, 7, index]))
+        v, u = np.arange(depth.shape[0])[:, None], np.arange(depth.shape[1])
+        z = depth.astype(np.float64)
+        z = z * self.multiplier(u, v, z) + faults.depth_offset
+        if faults.depth_bands:
+            z = 1.0 / (1.0 / np.maximum(z, 1e-3) + self.bands[(u * BANDS) // self._camera.width])
+        return np.where((depth > 0) & (z > 0), z, 0).astype(np.float32)
+
+
+def with_flying_pixels(depth: NDArray[np.float32], share: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Depth (H, W) in which ``share`` of the pixels at a depth edge lie between the two surfaces."""
+    valid = np.where(depth > 0, depth, np.nan)
+    padded = np.pad(valid, 1, constant_values=np.nan)
+    around = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
+    gaps = np.nan_to_num(around - valid, nan=0.0)
+    pick = np.abs(gaps).argmax(axis=0)
+    gap = np.take_along_axis(gaps, pick[None], axis=0)[0]
+    mixed = (np.abs(gap) > EDGE[0] * depth + EDGE[1]) & (depth > 0) & (rng.random(depth.shape) < share)
+    weight = rng.uniform(0.05, 0.95, depth.shape)
+    return np.where(mixed, depth + weight * gap, depth).astype(np.float32)
+
+
+def with_multipath(depth: NDArray[np.float32], camera: Camera, reflectance: float) -> NDArray[np.float32]:
+    """Depth (H, W) of a time-of-flight sensor whose light also arrives over one other surface.
+
+    The light source is at the camera. A patch q of area A, irradiated by E_q ~ cos / d_q^2, sends to the point p the
+    share a = (reflectance / pi) (E_q / E_p) cos_q cos_p A / r^2 of p's direct light, over a path longer by
+    L = d_q + r - d_p. The sensor measures the phase of the sum, so that the range is too long by
+    arg(1 + sum a exp(i k L)) / (2 k) with the wave number k of the modulation (Fuchs 2010, "Multipath interference
+    compensation in time-of-flight camera images"). All surfaces are matt and of one reflectance; occlusion between p
+    and q is not tested.
+    """
+    points = camera.backproject(depth)
+    normals = surface_normals(points)
+    stride = max(camera.width // PATCHES, 1)
+    rows, columns = (slice(stride // 2, None, stride),) * 2
+    patches, facing = points[rows, columns].reshape(-1, 3), normals[rows, columns].reshape(-1, 3)
+    distance = np.linalg.norm(patches, axis=1)
+    cosine = -np.sum(patches * facing, axis=1) / np.maximum(distance, 1e-6)
+    good = (distance > 0) & (cosine > 0.1)
+    patches, facing, distance, cosine = patches[good], facing[good], distance[good], cosine[good]
+    # Area of a patch: its solid angle stride^2 z^3 / (fx fy d^3) times d^2 / cosine.
+    area = stride**2 * patches[:, 2] ** 3 / (camera.fx * camera.fy * distance * cosine)
+    table = np.column_stack([patches, facing, distance, area, cosine / distance**2]).astype(np.float32)
+    # The error is smooth on a surface: every second row and column is enough.
+    points, normals = np.ascontiguousarray(points[::2, ::2]), np.ascontiguousarray(normals[::2, ::2])
+    ratio = np.empty(points.shape[:2], dtype=np.float32)
+    gain = np.float32(reflectance / np.pi)
+    over_rows(len(ratio), kernels.multipath, points, normals, table, gain, np.float32(WAVE_NUMBER), ratio)
+    return depth * np.repeat(np.repeat(ratio, 2, axis=0), 2, axis=1)[: depth.shape[0], : depth.shape[1]]
+
+
+def surface_normals(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit normals (H, W, 3) towards the camera of points (H, W, 3), from the nearer neighbour on each axis."""
+    slopes = []
+    for axis in (1, 0):
+        steps = np.diff(points, axis=axis)
+        valid = np.minimum(np.take(points, range(points.shape[axis] - 1), axis)[..., 2],
+                           np.take(points, range(1, points.shape[axis]), axis)[..., 2]) > 0  # fmt: skip
+        steps = np.where(valid[..., None], steps, np.float32(1e3))
+        edge = np.full_like(np.take(steps, [0], axis), 1e3)
+        before, after = np.concatenate([edge, steps], axis), np.concatenate([steps, edge], axis)
+        nearer = np.linalg.norm(before, axis=2) < np.linalg.norm(after, axis=2)
+        slopes.append(np.where(nearer[..., None], before, after))
+    normals = np.cross(slopes[1], slopes[0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    flip = np.sum(normals * points, axis=2, keepdims=True) > 0
+    return np.where(flip, -normals, normals).astype(np.float32)

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.movers import Staging, SyntheticMover
-from dudmap.lab.synthetic.person import Figure
+from dudmap.lab.synthetic.motion import Figure
+from dudmap.lab.synthetic.movers import Staging, SyntheticMover, placed
 from dudmap.lab.synthetic.render import Renderer
 from dudmap.lab.synthetic.scene import pose
 
@@ -34,6 +34,8 @@ class Crowd:
         self.reach = 0.75 * self.distance + 1.0 * size  # half the length of the lane
         self.count = int(np.ceil(2 * self.reach / self.spacing))
         self.lane = self.count * self.spacing
+        self.hurry = max(self.speed, ENTRY_SPEED * size)
+        self.steady_from = 0.0 if staging.start_dynamic else 0.5 + self.lane / self.hurry  # the whole lane is occupied
         self.staging = staging
         stride = 1.35 * float(np.clip(np.sqrt(self.speed / size / 1.2), 0.35, 1.2))
         rng = np.random.default_rng(staging.rng.integers(2**32))
@@ -41,18 +43,9 @@ class Crowd:
 
     def advanced(self, t: float) -> float:
         """Distance in metres that everybody has walked at time ``t``; without ``start_dynamic`` it starts at 0.5 s."""
-        if self.staging.start_dynamic:
-            return self.lane + self.speed * t
-        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
-        begin, arrived = 0.5, 0.5 + self.lane / hurry
-        if t <= arrived:
-            return hurry * (t - begin)
-        return self.lane + self.speed * (t - arrived)
-
-    def steady_from(self) -> float:
-        """Time in seconds from which the whole lane is occupied."""
-        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
-        return 0.0 if self.staging.start_dynamic else 0.5 + self.lane / hurry
+        if t <= self.steady_from and not self.staging.start_dynamic:
+            return self.hurry * (t - 0.5)
+        return self.lane + self.speed * (t - self.steady_from)
 
     def movers(self) -> list[SyntheticMover]:
         """Movers of the crowd, one per person."""
@@ -84,9 +77,7 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
     renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
     shares = []
     for t, T in zip(times, Ts_world_camera, strict=True):
-        Ts = np.concatenate([m.parts(t) @ np.array([p.T_body_primitive for p in m.primitives]) for m in movers])
-        present = np.concatenate([np.full(len(m.primitives), m.present(t)) for m in movers])
-        image = renderer.render(camera, T, Ts, present, with_color=False)
+        image = renderer.render(camera, T, *placed(movers, t), with_color=False)
         shares.append(float((image.primitive >= len(scene.primitives)).mean()))
     return float(np.mean(shares))
 
@@ -94,13 +85,9 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
 def crowd_of(
     coverage: float, staging: Staging, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]
 ) -> Crowd:
-    """Crowd that covers ``coverage`` of the image on average, once all of it is in view; found by bisection.
+    """Crowd that covers the share ``coverage`` of the image on average, once all of it is in view; by bisection.
 
-    Args:
-        coverage: Share of the image.
-        staging: Scene, random numbers, speed, duration, and whether the crowd is in view in the first frame.
-        times: (N,) timestamps of the frames, seconds.
-        Ts_world_camera: (N, 4, 4) camera poses of the frames.
+    The frames have timestamps (N,) in seconds and camera poses (N, 4, 4).
 
     Raises:
         ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene covers it.
@@ -112,7 +99,7 @@ def crowd_of(
     def attempt(density: float) -> tuple[Crowd, float]:
         rng = np.random.default_rng(seed)
         crowd = Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
-        steady = np.flatnonzero(times >= min(crowd.steady_from(), 0.75 * times[-1]))
+        steady = np.flatnonzero(times >= min(crowd.steady_from, 0.75 * times[-1]))
         chosen = steady[np.unique(np.linspace(0, len(steady) - 1, 8).astype(int))]
         return crowd, _coverage(crowd, times[chosen], Ts_world_camera[chosen])
 

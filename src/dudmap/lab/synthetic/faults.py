@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
+from dudmap.lab.data import find
 
 BAND_ROWS, MOST_BANDS = 16, 24
 """Rows of a colour image with a rolling shutter are rendered in up to ``MOST_BANDS`` bands of one time each, of at
@@ -117,11 +118,6 @@ class SensorFaults:
         names = [fault.name for fault in fields(self) if fault.name.startswith("color_")]
         return any(np.any(np.not_equal(getattr(self, name), getattr(without, name))) for name in names)
 
-    def row_times(self, height: int, margin: int = 0) -> NDArray[np.float64]:
-        """Exposure (H + 2 margin,) of the rows from -margin on relative to the stamp, seconds; H = ``height``."""
-        rows = np.arange(-margin, height + margin)
-        return self.color_delay + self.color_readout * ((rows + 0.5) / height - 0.5)
-
     def row_bands(self, height: int, margin: int = 0, step: float = 0.0) -> list[tuple[int, int, float]]:
         """Bands of rows rendered at one time: first row, row after the last, and time relative to the stamp, s.
 
@@ -131,7 +127,8 @@ class SensorFaults:
         count = max(min(MOST_BANDS, height // BAND_ROWS), 1) if self.color_readout else 1
         if step > 0:
             count = min(count, max(int(np.ceil(abs(self.color_readout) / step)), 1))
-        times = self.row_times(height, margin)
+        rows = np.arange(-margin, height + margin)
+        times = self.color_delay + self.color_readout * ((rows + 0.5) / height - 0.5)
         edges = np.linspace(0, len(times), count + 1).astype(int)
         return [(int(a), int(b), float(times[a:b].mean())) for a, b in pairwise(edges)]
 
@@ -161,22 +158,21 @@ LIMITS: dict[str, tuple[float, float]] = {fault.name: fault.metadata["limits"] f
 """Smallest and largest accepted value of every fault."""
 
 
-def parse_faults(assignments: Sequence[str], base: SensorFaults | None = None) -> SensorFaults:
-    """Faults of ``NAME=VALUE`` pairs, on top of ``base``; a value of several numbers is comma-separated.
+def parse_faults(assignments: Sequence[str]) -> dict[str, Any]:
+    """Faults of ``NAME=VALUE`` pairs by name; a value of several numbers is comma-separated.
 
     Raises:
-        ConfigError: A pair cannot be understood, or a value is out of range.
+        ConfigError: A pair cannot be understood.
     """
-    base = base or SensorFaults()
     values: dict[str, Any] = {}
     for assignment in assignments:
         name, _, text = assignment.partition("=")
         name = name.strip()
-        if name not in LIMITS:
-            raise ConfigError(f"unknown fault {name!r}; known faults: {', '.join(LIMITS)}")
-        several = isinstance(getattr(base, name), tuple) or "," in text
+        find(name, LIMITS, "fault")
         try:
-            values[name] = tuple(float(part) for part in text.split(",")) if several else float(text)
+            numbers = tuple(float(part) for part in text.split(","))
         except ValueError:
             raise ConfigError(f"cannot understand the fault {assignment!r}; expected NAME=NUMBER[,NUMBER...]") from None
-    return replace(base, **values)
+        several = isinstance(getattr(SensorFaults(), name), tuple) or len(numbers) > 1
+        values[name] = numbers if several else numbers[0]
+    return values

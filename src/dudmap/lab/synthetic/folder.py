@@ -26,20 +26,14 @@ def write_folder(
     surface: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render all frames into a folder.
+    """Render all frames into a folder, which is created if needed.
 
     The folder receives rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = dynamic), their
     lists rgb.txt, depth.txt, mask.txt and associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (dynamic
-    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults
-    of the sensor), surface.ply (the static surface) and surface_observed.ply (the part
-    of it that the camera saw). If writing is interrupted, the lists contain the complete frames.
-
-    Args:
-        sequence: The recording.
-        out: The folder; created if needed.
-        overwrite: Accept a folder that is not empty.
-        surface: Write the two meshes.
-        progress: Called with the number of finished frames.
+    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults of the sensor), surface.ply (the static
+    surface) and surface_observed.ply (the part of it that the camera saw). If writing is interrupted, the lists contain
+    the complete frames. ``overwrite`` accepts a folder that is not empty; ``progress`` is called with the number of
+    finished frames.
 
     Raises:
         DatasetError: The folder is not empty, or cannot be written.
@@ -95,16 +89,11 @@ def _write_image(path: Path, image: NDArray) -> None:
 
 def _movers_line(sequence: SyntheticSequence, index: int) -> str:
     states = [
-        {
-            "id": state.id,
-            "name": state.name,
-            "moving": state.moving,
-            "T_world_mover": np.round(state.T_world_mover, 6).tolist(),
-            "velocity": np.round(state.velocity, 5).tolist(),
-            "speed": round(float(np.linalg.norm(state.velocity)), 5),
-        }
+        {"id": state.id, "name": state.name, "moving": state.moving,
+         "T_world_mover": np.round(state.T_world_mover, 6).tolist(), "velocity": np.round(state.velocity, 5).tolist(),
+         "speed": round(float(np.linalg.norm(state.velocity)), 5)}
         for state in sequence.movers(index)
-    ]
+    ]  # fmt: skip
     return json.dumps({"frame": index, "timestamp": float(sequence.timestamps[index]), "movers": states})
 
 
@@ -112,14 +101,9 @@ def _write_parameters(sequence: SyntheticSequence, out: Path) -> None:
     camera = sequence.camera
     keys = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
     (out / "intrinsics.txt").write_text("".join(f"{key} {getattr(camera, key)}\n" for key in keys), encoding="utf-8")
-    sensor = sequence.sensor_model
-    parameters = {
-        "made_by": f"dudmap {__version__}",
-        "name": sequence.name,
-        **sequence.parameters,
-        "camera": asdict(camera),
-        "sensor": asdict(sensor) if sensor else None,
-    }
+    sensor = asdict(sequence.sensor_model) if sequence.sensor_model else None
+    made = {"made_by": f"dudmap {__version__}", "name": sequence.name}
+    parameters = {**made, **sequence.parameters, "camera": asdict(camera), "sensor": sensor}
     (out / "scene.json").write_text(json.dumps(parameters, indent=2) + "\n", encoding="utf-8")
     truth = json.dumps(sequence.sensor_truth(), indent=2)
     (out / "sensor_truth.json").write_text(truth + "\n", encoding="utf-8")

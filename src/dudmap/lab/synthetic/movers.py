@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
-from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.motion import FloorPath, crossing, smooth_step
-from dudmap.lab.synthetic.person import Figure
+from dudmap.lab.data import find
+from dudmap.lab.synthetic.motion import Figure, FloorPath, crossing, smooth_step
 from dudmap.lab.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
 
 Matrix = NDArray[np.float64]
-Line = tuple[tuple[float, float], tuple[float, float]]
 MOVING_SPEED = 0.01
 """Speed below which an object is at rest, m/s."""
 
@@ -56,13 +54,22 @@ class SyntheticMover:
         return float(np.linalg.norm(where[1] - where[0], axis=2).max() / span)
 
 
+def placed(movers: list[SyntheticMover], t: float) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Poses (P, 4, 4) of all solids of movers at a time in seconds, and which of them exist then (P,)."""
+    Ts, present = [np.empty((0, 4, 4))], []
+    for mover in movers:
+        count, exists = len(mover.primitives), mover.present(t)
+        local = np.array([primitive.T_body_primitive for primitive in mover.primitives])
+        Ts.append(mover.parts(t) @ local if exists else np.tile(np.eye(4), (count, 1, 1)))
+        present += [exists] * count
+    return np.concatenate(Ts), np.array(present, dtype=bool)
+
+
 @dataclass(frozen=True)
 class Staging:
     """Conditions under which movers are built.
 
     Attributes:
-        scene: Scene in which they move.
-        rng: Random number generator.
         speed: Requested speed, m/s; None for the natural speed of each mover.
         duration: Duration of the recording, seconds.
         start_dynamic: Whether they are in view and moving in the first frame.
@@ -85,11 +92,7 @@ class Staging:
 
 
 def person_on(
-    path: FloorPath,
-    figure: Figure,
-    ground: float,
-    name: str = "person",
-    carrying: Callable[[float], float] = lambda _: 0.0,
+    path: FloorPath, figure: Figure, ground: float, carrying: Callable[[float], float] = lambda _: 0.0
 ) -> SyntheticMover:
     """Person walking along a path; ``carrying`` is a function of time for the lift of the arms in [0, 1]."""
 
@@ -99,7 +102,7 @@ def person_on(
     def parts(t: float) -> Matrix:
         return figure.poses(reference(t), path.at(t)[2], carrying(t))
 
-    return SyntheticMover(name, figure.primitives, parts, reference, path.present, settles=False)
+    return SyntheticMover("person", figure.primitives, parts, reference, path.present, settles=False)
 
 
 def rigid(
@@ -114,26 +117,20 @@ def rigid(
     )
 
 
-def shifted(line: Line, shift: float, reverse: bool = False) -> Line:
-    """Line shifted by ``shift`` metres to its left, and reversed with ``reverse``."""
-    a, b = np.asarray(line[0]), np.asarray(line[1])
-    normal = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
-    (ax, ay), (bx, by) = (end + shift * normal for end in (a, b))
-    start, end = (float(ax), float(ay)), (float(bx), float(by))
-    return (end, start) if reverse else (start, end)
-
-
 def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
     size = staging.scene.mover_scale
     return Figure(staging.rng, outfit, size, 1.35 * float(np.clip(np.sqrt(speed / size / 1.2), 0.35, 1.2)))
 
 
 def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
-    scene, speed = staging.scene, staging.pace(1.2)
+    """Person on the walk line of the scene, shifted to its left (metres at life size), and in the other direction."""
+    scene, speed, size = staging.scene, staging.pace(1.2), staging.scene.mover_scale
+    a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
+    aside = shift * size * (np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a))
+    line = (b + aside, a + aside) if reverse else (a + aside, b + aside)
     path = crossing(
-        shifted(scene.walk_line, shift * scene.mover_scale, reverse), speed, staging.duration,
-        enter=1.0 + delay, start_inside=staging.start_dynamic, entry_speed=1.2 * scene.mover_scale,
-    )  # fmt: skip
+        line, speed, staging.duration, enter=1.0 + delay, start_inside=staging.start_dynamic, entry_speed=1.2 * size
+    )
     return person_on(path, _figure(staging, outfit, speed), scene.ground)
 
 
@@ -158,14 +155,6 @@ def _wanderer(staging: Staging) -> list[SyntheticMover]:
     keep = times <= staging.duration + 2.0
     path = FloorPath(list(times[keep] - 1.5), loop[keep].tolist(), smooth=0.1)
     return [person_on(path, _figure(staging, 3, speed), scene.ground)]
-
-
-CARTON = (0.36, 0.30, 0.28)
-
-
-def _carton(size: float) -> list[Primitive]:
-    x, y, z = (extent * size for extent in CARTON)
-    return [box((0, 0, z / 2), (x, y, z), Material("cardboard", (1.9 / size, 1.9 / size)))]
 
 
 def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
@@ -201,10 +190,10 @@ def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
         start = pose((*stand, scene.ground), yaw) @ pose((0.40 * size, 0, 0.92 * size))
         return se3.interpolate(start, scene.rest, share(t))
 
-    def present(t: float) -> bool:
-        return put_down or t < times[-1]
-
-    return [person, rigid("carried_box" if put_down else "removed_box", _carton(size), reference, present)]
+    x, y, z = 0.36 * size, 0.30 * size, 0.28 * size
+    carton = [box((0, 0, z / 2), (x, y, z), Material("cardboard", (1.9 / size, 1.9 / size)))]
+    name = "carried_box" if put_down else "removed_box"
+    return [person, rigid(name, carton, reference, lambda t: put_down or t < times[-1])]
 
 
 def _ball(staging: Staging) -> list[SyntheticMover]:
@@ -237,26 +226,22 @@ def _balloon(staging: Staging) -> list[SyntheticMover]:
     return [rigid("balloon", solids, reference, path.present)]
 
 
-def _cart_solids(size: float) -> list[Primitive]:
-    rubber = Material("denim", (3, 3), tint=(0.25, 0.25, 0.25))
+def _cart(path: FloorPath, scene: Scene, name: str) -> list[SyntheticMover]:
+    size, rubber = scene.mover_scale, Material("denim", (3, 3), tint=(0.25, 0.25, 0.25))
     body = box((0, 0, 0.38 * size), (0.5 * size, 0.4 * size, 0.6 * size), Material("books", (1.6 / size, 1.6 / size)))
     wheels = [
         cylinder((x * size, y * size - 0.02 * size, 0.06 * size), (x * size, y * size + 0.02 * size, 0.06 * size),
                  0.06 * size, rubber)
         for x in (-0.18, 0.18) for y in (-0.15, 0.15)
     ]  # fmt: skip
-    return [body, *wheels]
-
-
-def _cart(path: FloorPath, scene: Scene, name: str) -> SyntheticMover:
-    return rigid(name, _cart_solids(scene.mover_scale), lambda t: path.pose(t, scene.ground), path.present)
+    return [rigid(name, [body, *wheels], lambda t: path.pose(t, scene.ground), path.present)]
 
 
 def _creeper(staging: Staging) -> list[SyntheticMover]:
     """Cart that enters quickly and then crosses the view at 5 cm/s."""
     speed = staging.pace(0.05)
     path = staging.crossing(speed, max(speed, staging.scene.mover_scale))
-    return [_cart(path, staging.scene, "creeper")]
+    return _cart(path, staging.scene, "creeper")
 
 
 def _stopping(staging: Staging) -> list[SyntheticMover]:
@@ -267,7 +252,7 @@ def _stopping(staging: Staging) -> list[SyntheticMover]:
         a = spot + 0.5 * (a - spot)
     begin = 0.0 if staging.start_dynamic else 0.5
     end = begin + float(np.linalg.norm(spot - a)) / speed
-    return [_cart(FloorPath([begin, end], [list(a), list(spot)], smooth=0.2), scene, "stopping_cart")]
+    return _cart(FloorPath([begin, end], [list(a), list(spot)], smooth=0.2), scene, "stopping_cart")
 
 
 def _starting(staging: Staging) -> list[SyntheticMover]:
@@ -277,7 +262,7 @@ def _starting(staging: Staging) -> list[SyntheticMover]:
     begin = 0.4 if staging.start_dynamic else 0.5 * staging.duration
     end = begin + float(np.linalg.norm(b - spot)) / speed
     path = FloorPath([begin, end], [list(spot), list(b)], smooth=0.2, gaps=[(end, np.inf)])
-    return [_cart(path, scene, "starting_cart")]
+    return _cart(path, scene, "starting_cart")
 
 
 def _door(staging: Staging) -> list[SyntheticMover]:
@@ -325,9 +310,5 @@ def build_movers(names: tuple[str, ...], staging: Staging) -> list[SyntheticMove
     Raises:
         ConfigError: A name is unknown.
     """
-    movers: list[SyntheticMover] = []
-    for name in names:
-        if name not in MOVERS:
-            raise ConfigError(f"unknown mover {name!r}; known movers: {', '.join(MOVERS)}")
-        movers += MOVERS[name](staging)
-    return movers
+    makers = [find(name, MOVERS, "mover") for name in names]
+    return [mover for make in makers for mover in make(staging)]

@@ -41,7 +41,8 @@ def _tremor(rng: np.random.Generator, times: Array, size: float) -> Array:
 
 
 def _aimed(positions: Array, targets: Array) -> Array:
-    """Camera poses (N, 4, 4) at positions (N, 3) looking at targets (N, 3)."""
+    """Camera poses (N, 4, 4) at positions (N, 3) looking at targets (N, 3), or at one."""
+    targets = np.broadcast_to(targets, positions.shape)
     return np.stack([look_at(eye, target) for eye, target in zip(positions, targets, strict=True)])
 
 
@@ -71,7 +72,7 @@ def handheld(
     """Hand-held camera aimed at the target: mean speed in m/s (at life size), mean rotation rate in degrees/s."""
     shift = _within(scene, _wander(rng, times, speed * max(scene.mover_scale, 0.3), quick))
     shift += _tremor(rng, times, 0.0005 * tremor * scene.mover_scale)
-    Ts = _aimed(scene.home[:3, 3] + shift, np.tile(scene.target, (len(times), 1)))
+    Ts = _aimed(scene.home[:3, 3] + shift, np.asarray(scene.target))
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     own = np.mean([se3.rotation_angle(se3.inverse(a) @ b) for a, b in pairwise(Ts)] or [0.0]) / step
     left = np.sqrt(max(np.radians(turn) ** 2 - own**2, np.radians(0.35 * turn) ** 2))
@@ -87,7 +88,7 @@ def _turned(offset: Array, angle: Array) -> Array:
 
 def _at_target(scene: Scene, rng: np.random.Generator, times: Array, eyes: Array, tremor_deg: float = 0.04) -> Array:
     """Poses at eyes (N, 3) aimed at the target of the scene, with a tremor of the hand."""
-    Ts = _aimed(eyes, np.tile(scene.target, (len(times), 1)))
+    Ts = _aimed(eyes, np.asarray(scene.target))
     return _shaken(Ts, _tremor(rng, times, np.radians(tremor_deg)))
 
 
@@ -96,20 +97,6 @@ def _turning(scene: Scene, rng: np.random.Generator, times: Array, angle: Array,
     aims = _turned(scene.target - scene.home[:3, 3], angle)
     eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, speed * scene.mover_scale))
     return _shaken(_aimed(eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
-
-
-def _still(scene: Scene, times: Array) -> Array:
-    return np.tile(scene.home, (len(times), 1, 1))
-
-
-def _pan(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Rotation about the vertical, 40 degrees to either side at 20 degrees per second on average."""
-    return _turning(scene, rng, times, np.radians(40.0) * np.sin(2 * np.pi * times / 8.0), 0.03)
-
-
-def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Rotation by 405 degrees about the vertical, so that the last frames show the first view again."""
-    return _turning(scene, rng, times, np.radians(405.0) * (times / max(times[-1], 1e-9)), 0.1)
 
 
 def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
@@ -144,11 +131,13 @@ PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {
     "handheld": handheld,
     "slow": lambda scene, rng, times: handheld(scene, rng, times, 0.06, 3.0, 0.7),
     "fast": lambda scene, rng, times: handheld(scene, rng, times, 0.6, 45.0, 1.5, 2.2),
-    "still": lambda scene, rng, times: _still(scene, times),
-    "pan": _pan,
+    "still": lambda scene, rng, times: np.tile(scene.home, (len(times), 1, 1)),
+    # 40 degrees to either side about the vertical, at 20 degrees per second on average
+    "pan": lambda scene, rng, t: _turning(scene, rng, t, np.radians(40.0) * np.sin(2 * np.pi * t / 8.0), 0.03),
     "orbit": _orbit,
     "dolly": _dolly,
-    "round": _round,
+    # 405 degrees about the vertical, so that the last frames show the first view again
+    "round": lambda scene, rng, t: _turning(scene, rng, t, np.radians(405.0) * (t / max(t[-1], 1e-9)), 0.1),
 }
 FOLLOW = "follow"
 

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import FrameError
-from dudmap.lab.synthetic.color_camera import ColorCamera, compressed, exposure_gains, white_balance
-from dudmap.lab.synthetic.depth_faults import DepthFaults
+from dudmap.io.exporting.mesh_editing import with_faces
+from dudmap.lab.synthetic.color_camera import ColorCamera, DepthFaults, compressed, exposure_gains, white_balance
 from dudmap.lab.synthetic.faults import SensorFaults
-from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover
+from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover, placed
 from dudmap.lab.synthetic.render import Renderer, Rendering
 from dudmap.lab.synthetic.scene import Scene
 from dudmap.lab.synthetic.sensors import Sensor, SensorModel, TimeOfFlightModel
-from dudmap.lab.synthetic.surface import count_views, tessellate, with_faces
+from dudmap.lab.synthetic.surface import count_views, tessellate
 
 NEAREST, FARTHEST = 0.3, 6.0
 """Range of an ideal sensor, for the observed part of the surface, metres."""
@@ -29,14 +29,9 @@ DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, heigh
 
 
 class MoverState(NamedTuple):
-    """State of a mover in one frame.
+    """State of a mover in one frame: identity from 1 on, pose (4, 4), velocity (3,) in m/s (world frame), kind.
 
-    Attributes:
-        id: Identity, from 1 on, the same in every frame.
-        T_world_mover: (4, 4) pose.
-        velocity: (3,) m/s, world frame.
-        name: Kind of object.
-        moving: Whether it counts as dynamic in this frame.
+    ``moving`` says whether it counts as dynamic in this frame.
     """
 
     id: int
@@ -50,13 +45,10 @@ class SyntheticSequence:
     """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        name: Names of scene and movers.
         camera: Intrinsics of the depth camera, which are also those that the files state for colour.
         faults: What the sensor does and its files do not say.
         timestamps: (N,) seconds.
-        ground_truth: Exact camera poses.
         parameters: Arguments from which it was made.
-        scene: The static scene.
     """
 
     calibration = None
@@ -146,18 +138,20 @@ class SyntheticSequence:
             if mover.present(t)
         ]
 
-    def static_twin(self) -> "SyntheticSequence":
-        """Recording with the same camera path and sensor noise, but without movers."""
+    def static_twin(self, since: float = -np.inf) -> "SyntheticSequence":
+        """Recording with the same camera path and sensor noise, but without movers, or without them from a time on."""
+        movers = [replace(m, present=lambda t, m=m: t < since and m.present(t)) for m in self._movers]
+        kept, parameters = (movers, self.parameters) if since > -np.inf else ([], self.parameters | {"movers": []})
         return SyntheticSequence(
-            self.scene, [], self.ground_truth, self.camera,
+            self.scene, kept, self.ground_truth, self.camera,
             noise=self._noise, seed=self._seed, fps=self._fps, motion_blur=self._motion_blur,
-            exposure_change=self._exposure_change, faults=self.faults, parameters=self.parameters | {"movers": []},
+            exposure_change=self._exposure_change, faults=self.faults, parameters=parameters,
         )  # fmt: skip
 
     def mover_numbers(self, index: int) -> NDArray[np.int16]:
         """Identity (H, W) of the mover that a pixel shows, 0 for none; includes movers at rest."""
-        table = np.concatenate([np.zeros(len(self.scene.primitives), dtype=np.int16), self._owner + 1, [0]])
-        return table.astype(np.int16)[self._render(self._number(index), with_color=False).primitive]
+        numbers = np.arange(1, len(self._movers) + 1, dtype=np.int16)
+        return self._by_pixel(numbers, self._render(self._number(index), with_color=False))
 
     def surface(self, observed: bool = False, views: int = 3) -> Mesh:
         """True static surface in the world frame at the end of the sequence.
@@ -247,8 +241,12 @@ class SyntheticSequence:
     def _mask_of(self, rendering: Rendering, index: int) -> NDArray[np.bool_]:
         t = float(self.timestamps[index])
         moving = np.array([mover.present(t) and self._moves(mover, t) for mover in self._movers], dtype=bool)
-        table = np.concatenate([np.zeros(len(self.scene.primitives), dtype=bool), moving[self._owner], [False]])
-        return table[rendering.primitive]
+        return self._by_pixel(moving, rendering)
+
+    def _by_pixel(self, of_movers: NDArray[Any], rendering: Rendering) -> NDArray[Any]:
+        """Value (H, W) of the mover that each pixel shows, of values (M,) of all movers; 0 or False for none."""
+        still = np.zeros(len(self.scene.primitives), dtype=of_movers.dtype)
+        return np.concatenate([still, of_movers[self._owner], still[:1]])[rendering.primitive]
 
     def _render(self, index: int, with_color: bool) -> Rendering:
         t = float(self.timestamps[index])
@@ -286,16 +284,6 @@ class SyntheticSequence:
         return se3.interpolate(Ts[at], Ts[at + 1], (t - stamps[at]) / (stamps[at + 1] - stamps[at]))
 
     def _render_at(self, t: float, T_world_camera: NDArray[np.float64], camera: Camera, with_color: bool) -> Rendering:
-        Ts = np.empty((len(self._owner), 4, 4))
-        present = np.zeros(len(self._owner), dtype=bool)
-        start = 0
-        for mover in self._movers:
-            end = start + len(mover.primitives)
-            if mover.present(t):
-                Ts[start:end] = mover.parts(t) @ np.array([p.T_body_primitive for p in mover.primitives])
-                present[start:end] = True
-            else:
-                Ts[start:end] = np.eye(4)
-            start = end
+        Ts, present = placed(self._movers, t)
         gain = 1.0 + self._exposure_change * np.sin(2 * np.pi * t / 2.7)
         return self._renderer.render(camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)

@@ -40,12 +40,7 @@ class Rendering:
 class Renderer:
     """Renderer of a fixed set of primitives (static ones first, then those of the movers) at any poses.
 
-    Args:
-        scene: Static primitives and lights.
-        primitives: All primitives; those from ``len(scene.primitives)`` on belong to movers.
-
-    Attributes:
-        atlas: The textures in use.
+    Primitives from ``len(scene.primitives)`` on belong to movers; ``atlas`` holds the textures in use.
     """
 
     def __init__(self, scene: Scene, primitives: list[Primitive]) -> None:
@@ -69,16 +64,15 @@ class Renderer:
         gain: float = 1.0,
         vignette: float = 0.12,
     ) -> Rendering:
-        """Render an image.
+        """Render an image of a camera, whose distortion is ignored, at T_world_camera (4, 4).
 
         Args:
-            camera: Intrinsics; distortion is ignored.
-            T_world_camera: (4, 4) pose.
             Ts_world_mover: (M, 4, 4) poses of the movers' primitives.
             present: (M,) which of them exist in this image.
             with_color: Also compute the colour.
             gain: Exposure factor of the colour.
-            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit depth.
+            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit
+                depth.
         """
         T_camera_world = se3.inverse(T_world_camera)
         Ts = T_camera_world @ np.concatenate([self._static, Ts_world_mover])

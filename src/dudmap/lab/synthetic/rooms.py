@@ -1,4 +1,4 @@
-"""Built-in static scenes, which ``scenes.toml`` describes; z is up, lengths in metres.
+"""Furniture, and the built-in static scenes, which ``scenes.toml`` describes; z is up, lengths in metres.
 
 A row of ``solids`` names a kind of solid or of furniture with its position (the start of a capsule or cylinder), its
 other measures, and a material of the scene or of the furniture. A row with ``repeat`` (first, end, step) stands for
@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from dudmap.errors import ConfigError
-from dudmap.lab.synthetic import furniture
-from dudmap.lab.synthetic.data import tables
+from dudmap.lab.data import find, tables
 from dudmap.lab.synthetic.scene import (
     Light,
     Material,
     Primitive,
     Scene,
+    Vector,
     box,
     capsule,
     cylinder,
@@ -28,16 +27,94 @@ from dudmap.lab.synthetic.scene import (
     torus,
 )  # fmt: skip
 
+WOOD = Material("wood", (0.9, 0.9))
+DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
+METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
+CARDBOARD = Material("cardboard", (1.6, 1.6))
+MATERIALS = {"wood": WOOD, "dark wood": DARK_WOOD, "metal": METAL, "cardboard": CARDBOARD}
+"""Materials that every scene knows by name."""
+
+
+def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
+    """Table of the given width, depth and height on four legs."""
+    (x, y), (w, d, h) = center, size
+    legs = [
+        box((x + sx * (w / 2 - 0.05), y + sy * (d / 2 - 0.05), (h - 0.04) / 2), (0.06, 0.06, h - 0.04), material)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    return [box((x, y, h - 0.02), (w, d, 0.04), material), *legs]
+
+
+def chair(center: tuple[float, float], yaw: float, material: Material) -> list[Primitive]:
+    """Chair with a cushion, its back towards +y before the rotation by ``yaw`` degrees."""
+    parts = [
+        box((0, 0, 0.45), (0.44, 0.44, 0.05), Material("plaid", (2.3, 2.3))),
+        box((0, 0.2, 0.75), (0.42, 0.04, 0.3), material),
+    ]
+    parts += [
+        cylinder((sx * 0.19, sy * 0.19, 0), (sx * 0.19, sy * 0.19, 0.43), 0.02, METAL)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    parts += [cylinder((sx * 0.17, 0.2, 0.45), (sx * 0.17, 0.2, 0.75), 0.015, METAL) for sx in (-1, 1)]
+    return [p.moved(pose((*center, 0), yaw)) for p in parts]
+
+
+def poster(
+    center: Vector, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
+) -> Primitive:
+    """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
+    w, h = size
+    material = Material(
+        "poster",
+        (0.5 / w, 0.5 / h),
+        ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25),
+        variation=0.05,
+        faces=False,
+    )
+    extent = (depth, w, h) if side else (w, depth, h)
+    return box(center, extent, material)
+
+
+def shelf(center: tuple[float, float], width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
+    """Bookshelf standing at ``center``, open towards -y before the rotation by ``yaw`` degrees."""
+    height, depth = 0.42 * rows, 0.3
+    parts = [
+        box((-width / 2 + 0.01, 0, height / 2), (0.02, depth, height), WOOD),
+        box((width / 2 - 0.01, 0, height / 2), (0.02, depth, height), WOOD),
+        box((0, depth / 2 - 0.005, height / 2), (width, 0.01, height), DARK_WOOD),
+    ]
+    for row in range(rows + 1):
+        parts.append(box((0, 0, min(0.01 + 0.42 * row, height - 0.01)), (width, depth, 0.02), WOOD))
+    for row in range(rows):
+        books = Material("books", (1.0, 0.25 / 0.36), (0.13 * row, 0.25 * row), variation=0.05)
+        length = width * (0.62 if row % 2 else 0.86)
+        parts.append(box((-width / 2 + 0.03 + length / 2, 0.02, 0.02 + 0.42 * row + 0.16), (length, 0.2, 0.32), books))
+    return [p.moved(pose((*center, 0), yaw)) for p in parts]
+
+
+def plant(center: tuple[float, float], spread: float = 0.35) -> list[Primitive]:
+    """Pot with seven stalks and leaves."""
+    x, y = center
+    leaf = Material("grass", (2, 2))
+    parts = [cylinder((x, y, 0), (x, y, 0.35), 0.17, Material("brick", (1.5, 1.5)))]
+    for a in np.arange(7) * 0.9:
+        tip = (x + spread * np.cos(a), y + 0.7 * spread * np.sin(a), 0.75 + 0.25 * np.sin(2.3 * a))
+        parts.append(capsule((x, y, 0.35), tip, 0.018, leaf))
+        parts.append(ellipsoid(tip, (0.13, 0.09, 0.06), leaf, 57.3 * a))
+    return parts
+
+
 MAKERS: dict[str, Any] = {
     "box": box, "ellipsoid": ellipsoid, "capsule": capsule, "cylinder": cylinder, "torus": torus,
-    "table": furniture.table, "chair": furniture.chair, "poster": furniture.poster, "shelf": furniture.shelf,
-    "plant": furniture.plant,
+    "table": table, "chair": chair, "poster": poster, "shelf": shelf, "plant": plant,
 }  # fmt: skip
 """Functions that make a solid, or a list of them, from the values of a row."""
 
 
-SCENES = tuple(tables("scenes.toml"))
-"""Names of the scenes."""
+SCENES = tables("synthetic/scenes.toml")
+"""Rows of the scenes by name."""
 
 
 def build_scene(name: str) -> Scene:
@@ -46,23 +123,21 @@ def build_scene(name: str) -> Scene:
     Raises:
         ConfigError: There is no scene of this name.
     """
-    if name not in SCENES:
-        raise ConfigError(f"unknown scene {name!r}; known scenes: {', '.join(SCENES)}")
-    table = dict(tables("scenes.toml")[name])
-    if "painted" in table:
-        scene = build_scene(table["painted"])
+    row = dict(find(name, SCENES, "scene"))
+    if "painted" in row:
+        scene = build_scene(row["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]
         solids = [replace(p, material=paint) for p, paint in zip(scene.primitives, plain, strict=True)]
         return replace(scene, name=name, primitives=solids)
-    materials = furniture.MATERIALS | {key: Material(**row) for key, row in table.pop("materials").items()}
+    materials = MATERIALS | {key: Material(**given) for key, given in row.pop("materials").items()}
     return Scene(
         name=name,
-        primitives=[solid for row in table.pop("solids") for solid in _solids(row, materials)],
-        home=look_at(**table.pop("home")),
-        rest=pose(**table.pop("rest")),
-        hinge=pose(**table.pop("hinge")),
-        lights=tuple(Light(**light) for light in table.pop("lights")),
-        **table,
+        primitives=[solid for given in row.pop("solids") for solid in _solids(given, materials)],
+        home=look_at(**row.pop("home")),
+        rest=pose(**row.pop("rest")),
+        hinge=pose(**row.pop("hinge")),
+        lights=tuple(Light(**light) for light in row.pop("lights")),
+        **row,
     )
 
 

@@ -41,14 +41,13 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """One solid in the frame of its body.
+    """One solid in the frame of its body; for static solids the body is the world.
 
     Attributes:
         kind: BOX, ELLIPSOID, CAPSULE and CYLINDER (axis z), TORUS (around z).
         half: Half extents in metres: box hx hy hz; ellipsoid semi-axes; capsule and cylinder (radius, radius, half
             length of the axis); torus (ring radius, ring radius, tube radius).
-        T_body_primitive: (4, 4) pose in the frame of the body; for static solids the body is the world.
-        material: Appearance.
+        T_body_primitive: (4, 4) pose in the frame of the body.
     """
 
     kind: int

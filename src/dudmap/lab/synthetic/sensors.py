@@ -1,4 +1,4 @@
-"""Noise models of depth and colour sensors: triangulation (pattern or stereo) and time of flight."""
+"""Sensors: noise models of depth and colour, and five RGB-D cameras as people own them."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,45 +8,55 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.data import tables
+from dudmap.core.geometry.camera import Camera
+from dudmap.lab.data import find, tables
+from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.kernels import depth_noise as kernels
 from dudmap.lab.synthetic.render import Rendering, over_rows
 
 NOISE_SIZE = 1024
 
 
-@dataclass(frozen=True)
-class SensorModel:
+@dataclass(frozen=True, kw_only=True)
+class NoiseModel:
+    """What all noise models have.
+
+    Attributes:
+        lateral: Standard deviation of the lateral noise, pixels.
+        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
+        grazing: Cosine of the angle of incidence below which readings are lost.
+        edge_loss: Share of readings lost at a depth edge: on its far side, by time of flight on both.
+        speckle: Share of readings lost at random.
+        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
+        color_noise: Standard deviation of the colour noise, grey values.
+    """
+
+    lateral: float
+    nearest: float
+    fade: float
+    farthest: float
+    grazing: float
+    edge_loss: float
+    speckle: float
+    correlation: float
+    color_noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorModel(NoiseModel):
     """Sensor with noise in the disparity ``d = fx b / z``, so that sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
 
     Attributes:
         baseline: Distance from the camera to the projector or second camera on its right, metres.
         depth_noise: Standard deviation of the depth at 1 m including the quantisation by ``step``, metres.
         step: Quantisation step of the disparity, pixels.
-        lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
         fatten: Width by which near surfaces are dilated (foreground fattening of window matching), pixels.
-        grazing: Cosine of the angle of incidence below which readings are lost.
-        edge_loss: Share of readings lost on the far side of a depth edge.
-        speckle: Share of readings lost at random.
-        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
-        color_noise: Standard deviation of the colour noise, grey values.
     """
 
     baseline: float
     depth_noise: float
     step: float
-    lateral: float
-    nearest: float
-    fade: float
-    farthest: float
     fatten: int
-    grazing: float
-    edge_loss: float
-    speckle: float
-    correlation: float
-    color_noise: float
 
     def row(self, focal: float) -> NDArray[np.float64]:
         """Parameters in the order of the kernel, for a focal length in pixels.
@@ -59,8 +69,8 @@ class SensorModel:
         return np.array([*numbers, self.fatten, self.grazing, self.edge_loss, self.speckle])
 
 
-@dataclass(frozen=True)
-class TimeOfFlightModel:
+@dataclass(frozen=True, kw_only=True)
+class TimeOfFlightModel(NoiseModel):
     """Sensor that measures the range itself, so that its noise does not follow z^2.
 
     The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 plus slant z^1.5 (theta / (pi/2 -
@@ -69,27 +79,11 @@ class TimeOfFlightModel:
     Attributes:
         noise: Coefficients of 1, z and z^2, metres.
         slant: Coefficient of the term that grows with the angle of incidence, metres.
-        lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
-        grazing: Cosine of the angle of incidence below which readings are lost.
-        edge_loss: Share of readings lost on both sides of a depth edge.
-        speckle: Share of readings lost at random.
-        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
-        color_noise: Standard deviation of the colour noise, grey values.
         native_width: Width in pixels at which the sensor measures; a wider image is interpolated from it. 0: any.
     """
 
     noise: tuple[float, float, float]
     slant: float
-    lateral: float
-    nearest: float
-    fade: float
-    farthest: float
-    grazing: float
-    edge_loss: float
-    speckle: float
-    correlation: float
-    color_noise: float
     native_width: int = 0
 
     def row(self) -> NDArray[np.float64]:
@@ -102,25 +96,19 @@ def _model(row: dict[str, Any]) -> SensorModel | TimeOfFlightModel | None:
     return None if not row else TimeOfFlightModel(**row) if "noise" in row else SensorModel(**row)
 
 
-SENSORS = {name: _model(row) for name, row in tables("sensors.toml")["noise"].items()}
+SENSORS = {name: _model(row) for name, row in tables("synthetic/sensors.toml")["noise"].items()}
 """Noise models by name; None is an ideal sensor. ``sensors.toml`` has the values and their sources."""
 
 
 class Sensor:
-    """Simulated sensor that adds noise to ideal images; equal seeds and frame numbers give equal errors.
-
-    Args:
-        name: One of ``SENSORS``.
-        seed: Seed of the noise.
+    """Sensor, one of ``SENSORS``, that adds noise to ideal images; equal seeds and frame numbers give equal errors.
 
     Raises:
         ConfigError: The name is unknown.
     """
 
     def __init__(self, name: str, seed: int) -> None:
-        if name not in SENSORS:
-            raise ConfigError(f"unknown noise model {name!r}; known models: {', '.join(SENSORS)}")
-        self.model = SENSORS[name]
+        self.model = find(name, SENSORS, "noise model")
         self._seed = seed
 
     def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -173,3 +161,30 @@ def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]
     gain = np.exp(-2 * (np.pi * correlation) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE))) * gain).real
     return (field / field.std()).astype(np.float32), rng.standard_normal(65536).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """One camera, described as its driver delivers it: colour registered to depth.
+
+    Only what registration leaves over is a fault of place; add ``color_translation`` and the like for unregistered
+    streams. ``field_of_view`` is that of a 4:3 depth image, horizontally, in degrees, and ``motion_blur`` the exposure
+    time of the colour as a share of the frame interval.
+    """
+
+    noise: str
+    field_of_view: float
+    motion_blur: float
+    faults: SensorFaults
+
+    def camera(self, width: int, height: int) -> Camera:
+        """Intrinsics of an image of this camera's view, with square pixels."""
+        focal = width / 2 / np.tan(np.radians(self.field_of_view / 2))
+        return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=5000.0)
+
+
+CAMERAS: dict[str, CameraModel] = {
+    name: CameraModel(**row | {"faults": SensorFaults(**row["faults"])})
+    for name, row in tables("synthetic/sensors.toml")["cameras"].items()
+}
+"""Cameras by name."""

@@ -1,7 +1,7 @@
 """Faults of the stream of frames between a sensor and the program, injected into any recording."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import ConfigError, FrameError
+from dudmap.errors import FrameError
 from dudmap.io.sequences import Sequence
+from dudmap.lab.data import find
 
 Alteration = Callable[[Frame], Frame]
 """Changes a frame, or raises FrameError if the fault leaves none."""
 SPAN = 0.4, 0.6
 """Part of the recording in which frames are altered or missing, as shares of its frames."""
-LONG_GAP = 10.0
-"""Length of a gap, seconds."""
-CLOCK_STEP = 3600.0
-"""Step of a clock that is set, seconds."""
+LONG_GAP, CLOCK_STEP = 10.0, 3600.0
+"""Length of a gap, and step of a clock that is set, seconds."""
 BURST, BURST_SPACING = 5, 0.001
 """Frames that arrive together, and the time between their stamps, seconds."""
 INVALID_SHARE = 0.3
@@ -28,13 +27,7 @@ INVALID_SHARE = 0.3
 
 
 class Delivery(NamedTuple):
-    """One frame as it arrives.
-
-    Attributes:
-        number: Its number in the recording.
-        timestamp: Stamp that it carries, seconds.
-        alter: What happens to its images; None leaves them.
-    """
+    """One frame as it arrives: number in the recording, stamp that it carries (s), and what happens to its images."""
 
     number: int
     timestamp: float
@@ -45,41 +38,26 @@ Schedule = Callable[[NDArray[np.float64]], list[Delivery]]
 """Deliveries of a recording from its stamps (N,), seconds."""
 
 
-@dataclass(frozen=True)
-class StreamFault:
-    """A fault.
-
-    Attributes:
-        description: What happens, for tables.
-        schedule: Deliveries of a recording from its stamps.
-    """
+class StreamFault(NamedTuple):
+    """A fault: what happens, for tables, and the deliveries of a recording from its stamps."""
 
     description: str
     schedule: Schedule
 
 
 class FaultyStream:
-    """A recording as it arrives over a faulty stream; its stamps need not increase.
-
-    Args:
-        recording: The recording.
-        fault: Name of the fault, one of ``FAULTS``.
-
-    Attributes:
-        deliveries: What arrives, in order of arrival.
+    """A recording as it arrives, in ``deliveries``, with one of ``FAULTS``; its stamps need not increase.
 
     Raises:
         ConfigError: There is no such fault.
     """
 
     def __init__(self, recording: Sequence, fault: str) -> None:
-        if fault not in FAULTS:
-            raise ConfigError(f"unknown fault {fault!r} of a stream; expected one of {', '.join(FAULTS)}")
         self.recording = recording
         self.name = f"{recording.name}-{fault.replace(' ', '-')}"
         self.camera, self.calibration = recording.camera, recording.calibration
         self.ground_truth: Trajectory | None = recording.ground_truth
-        self.deliveries = FAULTS[fault].schedule(recording.timestamps)
+        self.deliveries = find(fault, FAULTS, "fault").schedule(recording.timestamps)
         self.timestamps = np.array([delivery.timestamp for delivery in self.deliveries])
 
     def __len__(self) -> int:
@@ -96,9 +74,6 @@ class FaultyStream:
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame if known."""
         return self.recording.mask(self.deliveries[index].number)
-
-
-# -- schedules ---------------------------------------------------------------------------------------------------------
 
 
 def _span(times: NDArray[np.float64]) -> tuple[int, int]:
@@ -148,23 +123,18 @@ def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
 def _missing(times: NDArray[np.float64], gap: float) -> list[Delivery]:
     """The frames of the span never arrive, and it lasts ``gap`` seconds longer: the camera moves meanwhile."""
     first, stop = _span(times)
-    return [
-        item._replace(timestamp=item.timestamp + gap * (item.number >= stop))
-        for item in _plain(times)
-        if not first <= item.number < stop
-    ]
+    kept = [item for item in _plain(times) if not first <= item.number < stop]
+    return [item._replace(timestamp=item.timestamp + gap * (item.number >= stop)) for item in kept]
 
 
-def _later(times: NDArray[np.float64], step: float) -> list[Delivery]:
-    """The stamps of all frames from the span on are later by ``step`` seconds: a pause of a camera at rest, or a clock
-    that is set."""
-    first, _ = _span(times)
-    return [item._replace(timestamp=item.timestamp + step * (item.number >= first)) for item in _plain(times)]
+def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -> list[Delivery]:
+    """The stamps of all frames from the span on, or of some, are later by ``step`` seconds.
 
-
-def _one_wrong_stamp(times: NDArray[np.float64]) -> list[Delivery]:
-    first, _ = _span(times)
-    return [item._replace(timestamp=item.timestamp + CLOCK_STEP * (item.number == first)) for item in _plain(times)]
+    A pause of a camera at rest, or a clock that is set.
+    """
+    items, (first, _) = _plain(times), _span(times)
+    stop = len(items) if frames is None else first + frames
+    return [item._replace(timestamp=item.timestamp + step * (first <= item.number < stop)) for item in items]
 
 
 def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Delivery]:
@@ -183,9 +153,6 @@ def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Del
     items = _altered(times, freeze)
     items[first - 1] = items[first - 1]._replace(alter=remember)
     return items
-
-
-# -- alterations -------------------------------------------------------------------------------------------------------
 
 
 def scaled(frame: Frame, factor: float) -> Frame:
@@ -231,7 +198,7 @@ FAULTS: dict[str, StreamFault] = {
     "clock forwards": StreamFault("the clock is set forwards by 1 h", partial(_later, step=CLOCK_STEP)),
     "clock backwards": StreamFault("the clock is set back by 1 h", partial(_later, step=-CLOCK_STEP)),
     "clock slightly back": StreamFault("the clock is set back by 0.5 s", partial(_later, step=-0.5)),
-    "wrong stamp": StreamFault("one stamp is 1 h late", _one_wrong_stamp),
+    "wrong stamp": StreamFault("one stamp is 1 h late", partial(_later, step=CLOCK_STEP, frames=1)),
     "frozen": StreamFault("depth and colour repeat", partial(_frozen, depth=True, color=True)),
     "frozen depth": StreamFault("the depth image repeats", partial(_frozen, depth=True, color=False)),
     "frozen colour": StreamFault("the colour image repeats", partial(_frozen, depth=False, color=True)),

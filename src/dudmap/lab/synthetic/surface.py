@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.io.exporting.mesh_editing import with_faces
 from dudmap.lab.synthetic.kernels import raytracing as kernels
 from dudmap.lab.synthetic.render import over_rows
 from dudmap.lab.synthetic.scene import BOX, CAPSULE, CYLINDER, ELLIPSOID, TORUS, Primitive
@@ -60,28 +61,31 @@ def _profile(primitive: Primitive, fine: float, detail: float) -> tuple[Points, 
     if primitive.kind == CAPSULE:
         top, bottom = arc(hx, 0.0, np.pi / 2), arc(hx, np.pi / 2, np.pi)
         points = np.concatenate([top * hx + (0, hz), bottom * hx - (0, hz)])
-        return points, np.concatenate([top, bottom])
+        pieces = np.ceil(np.linalg.norm(np.diff(points, axis=0), axis=1) / detail)  # the straight side is long
+        return _divided(points, pieces), _divided(np.concatenate([top, bottom]), pieces)
     if primitive.kind == CYLINDER:
         across = np.linspace(0, hx, max(int(np.ceil(hx / detail)), 1) + 1)
         down = np.linspace(hz, -hz, steps)
-        points = np.concatenate(
-            [
-                np.stack([across, np.full_like(across, hz)], axis=1),
-                np.stack([np.full_like(down, hx), down], axis=1),
-                np.stack([across[::-1], np.full_like(across, -hz)], axis=1),
-            ]
-        )
+        outline = ((across, np.full_like(across, hz)), (np.full_like(down, hx), down),
+                   (across[::-1], np.full_like(across, -hz)))  # fmt: skip
+        points = np.concatenate([np.stack(part, axis=1) for part in outline])
         normals = np.repeat([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]], [len(across), len(down), len(across)], axis=0)
         return points, normals
     ring = arc(hz, 0.0, 2 * np.pi)
     return ring * hz + (hx, 0), ring
 
 
+def _divided(values: Points, pieces: Points) -> Points:
+    """Values (K, 2) with as many steps of equal length between neighbours as ``pieces`` (K - 1,) says."""
+    counts = np.maximum(pieces, 1).astype(int)
+    at = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(at)) - (np.cumsum(counts) - counts)[at] + 1) / counts[at]
+    return np.concatenate([values[:1], values[at] + share[:, None] * np.diff(values, axis=0)[at]])
+
+
 def _revolved(primitive: Primitive, detail: float) -> tuple[Points, Points, Faces]:
     fine = max(min(detail, 0.35 * primitive.half[2 if primitive.kind == TORUS else 0]), 0.004)
     profile, slopes = _profile(primitive, fine, detail)
-    if primitive.kind == CAPSULE:  # also divide the straight side
-        profile, slopes = _divided(profile, slopes, detail)
     widest = float(np.abs(profile[:, 0]).max()) * (max(primitive.half) if primitive.kind == ELLIPSOID else 1.0)
     turns = max(int(np.ceil(2 * np.pi * widest / fine)), 12)
     angles = np.linspace(0, 2 * np.pi, turns + 1)
@@ -98,16 +102,6 @@ def _revolved(primitive: Primitive, detail: float) -> tuple[Points, Points, Face
     # rows go down, columns counter-clockwise: seen from outside (a, a+columns+1, a+1) is counter-clockwise
     faces = _grid_faces(len(profile), turns + 1)[:, ::-1]
     return points.reshape(-1, 3), normals.reshape(-1, 3), faces
-
-
-def _divided(profile: Points, slopes: Points, detail: float) -> tuple[Points, Points]:
-    points, normals = [profile[:1]], [slopes[:1]]
-    for k in range(1, len(profile)):
-        pieces = max(int(np.ceil(np.linalg.norm(profile[k] - profile[k - 1]) / detail)), 1)
-        share = (np.arange(1, pieces + 1) / pieces)[:, None]
-        points.append(profile[k - 1] + share * (profile[k] - profile[k - 1]))
-        normals.append(slopes[k - 1] + share * (slopes[k] - slopes[k - 1]))
-    return np.concatenate(points), np.concatenate(normals)
 
 
 def _colors(primitive: Primitive, local: Points, normals: Points, detail: float, atlas: NDArray[np.int32]) -> Points:
@@ -191,15 +185,6 @@ def _world_bounds(primitive: Primitive) -> tuple[Points, Points]:
     return center - reach, center + reach
 
 
-def with_faces(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
-    """Mesh of the selected faces (F,) only, without unused vertices."""
-    faces = mesh.faces[keep]
-    used = np.zeros(len(mesh.vertices), dtype=bool)
-    used[faces.ravel()] = True
-    number = np.cumsum(used) - 1
-    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.colors[used], mesh.normals[used])
-
-
 def count_views(
     mesh: Mesh,
     camera: Camera,
@@ -207,14 +192,10 @@ def count_views(
     depth_range: tuple[float, float],
     grazing: float,
 ) -> NDArray[np.int32]:
-    """Number of views (V,) in which each vertex is seen.
+    """Number of views (V,) in which each vertex of a mesh in the world frame is seen.
 
-    Args:
-        mesh: Surface in the world frame.
-        camera: Intrinsics.
-        views: Pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres.
-        depth_range: Smallest and largest depth that counts, metres.
-        grazing: Cosine of the angle of incidence below which a surface does not count as seen.
+    Views are pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres. Depths within ``depth_range``
+    count, and surfaces whose angle of incidence has at least the cosine ``grazing``.
     """
     counts = np.zeros(len(mesh.vertices), dtype=np.int32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float64]
+Maker = Callable[[np.random.Generator], Image]
 
 SIZE = 512  # must equal kernels.raytracing.TEXTURE_SIZE
 HALF = SIZE // 2
@@ -41,12 +42,13 @@ def _plain(_: np.random.Generator) -> Image:
     return np.full((SIZE, SIZE, 3), 0.75)
 
 
-def _cloud(rng: np.random.Generator) -> Image:
-    return _gray(0.5 + 0.22 * fractal(rng, 1.2, 1, 24))
+def _noise(mean: float, *parts: tuple[float, ...], color: tuple[float, float, float] = (1, 1, 1)) -> Maker:
+    """Maker of a texture of noise: its mean, and of every part the amplitude and the arguments of ``fractal``."""
 
+    def make(rng: np.random.Generator) -> Image:
+        return _gray(sum((size * fractal(rng, *rest) for size, *rest in parts), mean), color)
 
-def _plaster(rng: np.random.Generator) -> Image:
-    return _gray(0.76 + 0.035 * fractal(rng, 0.7, 2, 60) + 0.03 * fractal(rng, 1.0, 1, 12))
+    return make
 
 
 def _wallpaper(rng: np.random.Generator) -> Image:
@@ -176,14 +178,6 @@ def _plaid(rng: np.random.Generator) -> Image:
     return image * (1 + 0.05 * fractal(rng, 0.6, 2, 100)[..., None])
 
 
-def _denim(rng: np.random.Generator) -> Image:
-    return _gray(0.62 + 0.08 * fractal(rng, 0.5, 3, 120, 3) + 0.08 * fractal(rng, 1.2, 1, 8))
-
-
-def _skin(rng: np.random.Generator) -> Image:
-    return _gray(0.78 + 0.04 * fractal(rng, 1.0, 1, 40), (1.0, 0.8, 0.68))
-
-
 def _keyboard(rng: np.random.Generator) -> Image:
     x, y = _grid()
     u, v = np.mod(x * 16, 1), np.mod(y * 6, 1)
@@ -203,10 +197,6 @@ def _paper(rng: np.random.Generator) -> Image:
     figure = (x > 0.5) & (x < 0.9) & (y > 0.3) & (y < 0.55)
     image[figure] = 0.5 + 0.25 * fractal(rng, 1.2, 2, 40)[figure][:, None] * (0.3, 0.6, 1.0)
     return image
-
-
-def _grass(rng: np.random.Generator) -> Image:
-    return _gray(0.42 + 0.09 * fractal(rng, 0.4, 4, 200) + 0.07 * fractal(rng, 1.0, 1, 12), (0.7, 1.0, 0.45))
 
 
 def _paving(rng: np.random.Generator) -> Image:
@@ -231,10 +221,10 @@ def _cardboard(rng: np.random.Generator) -> Image:
     return image
 
 
-_MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
-    "cloud": _cloud,  # first: the shading kernel uses texture 0 for large-scale variation
+_MAKERS: dict[str, Maker] = {
+    "cloud": _noise(0.5, (0.22, 1.2, 1, 24)),  # first: the shading kernel uses texture 0 for large-scale variation
     "plain": _plain,
-    "plaster": _plaster,
+    "plaster": _noise(0.76, (0.035, 0.7, 2, 60), (0.03, 1.0, 1, 12)),
     "wallpaper": _wallpaper,
     "wood": _wood,
     "parquet": _parquet,
@@ -245,11 +235,11 @@ _MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
     "books": _books,
     "stripes": _stripes,
     "plaid": _plaid,
-    "denim": _denim,
-    "skin": _skin,
+    "denim": _noise(0.62, (0.08, 0.5, 3, 120, 3), (0.08, 1.2, 1, 8)),
+    "skin": _noise(0.78, (0.04, 1.0, 1, 40), color=(1.0, 0.8, 0.68)),
     "keyboard": _keyboard,
     "paper": _paper,
-    "grass": _grass,
+    "grass": _noise(0.42, (0.09, 0.4, 4, 200), (0.07, 1.0, 1, 12), color=(0.7, 1.0, 0.45)),
     "paving": _paving,
     "cardboard": _cardboard,
 }

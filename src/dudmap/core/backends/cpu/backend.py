@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu import (
     color_registration,
     filtering,
-    integration,
+    fusion,
     raycasting,
     registration,
     sampling,
-    visibility,
 )
+from dudmap.core.backends.cpu.fusion import BANDS, MAX_FOUND
 from dudmap.core.backends.cpu.registration import normal_equations
 from dudmap.core.backends.cpu.teams import run_team
+from dudmap.core.backends.cpu.visibility import TILE
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.mirror import Mirror, on_host
 from dudmap.core.backends.parameters import (
@@ -27,12 +28,13 @@ from dudmap.core.backends.parameters import (
     DepthTiles,
     DepthView,
     FilterParameters,
+    FreeSpace,
     FusedBlocks,
     FusionParameters,
     MapSample,
     NormalEquations,
     RegistrationParameters,
-    SensorNoise,
+    TouchedBlocks,
     VoxelGrid,
     single,
 )
@@ -40,20 +42,9 @@ from dudmap.core.backends.threads import bands, run_bands
 
 FILTER_ROWS = 120
 """Image rows of one band of the filter."""
-PIXEL_ROWS = 60
-"""Image rows of one band of loops over pixels that are cheaper."""
-TILE_ROWS = 15
-"""Rows of tiles, or of strided pixels, of one band."""
 PIXELS_PER_BAND = 9600
 """Pixels of one band of a linearisation; the coarsest level is one band."""
-BLOCKS_PER_BAND = 256
-"""Blocks of one band of the fusion."""
-CANDIDATES_PER_BAND = 2048
-"""Blocks of one band of the test for visibility."""
-PLANES_PER_BAND = 8
-"""Visited planes of the window of one band of the free-space observations."""
-MAX_FOUND = 1 << 16
-"""Most cells that one band may find."""
+_NO_VOXELS = np.empty(0, dtype=np.int32)
 
 
 class CpuBackend:
@@ -139,155 +130,89 @@ class CpuBackend:
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 
-    def view(
-        self,
-        depth: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        T_camera_world: NDArray[np.float32],
-    ) -> DepthView:
-        """See ``Backend.view``."""
-        shape = -(-depth.shape[0] // visibility.TILE), -(-depth.shape[1] // visibility.TILE)
-        tiles = DepthTiles(*(np.empty(shape, dtype=np.float32) for _ in range(3)))
-        run_bands(
-            lambda start, stop: visibility.tile_ranges(start, stop, depth, *tiles),
-            bands(shape[0], TILE_ROWS),
-        )
-        return DepthView(depth, tiles, intrinsics, T_grid_camera, T_camera_world)
-
-    def reading_weights(
-        self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
-    ) -> NDArray[np.uint8]:
-        """See ``Backend.reading_weights``."""
-        weights, noise = np.ones(depth.shape, dtype=np.uint8), single(noise)
-        run_bands(
-            lambda start, stop: integration.observation_weights(
-                start, stop, depth, intrinsics, noise, np.float32(best), weights
-            ),
-            bands(depth.shape[0], PIXEL_ROWS),
-        )
-        return weights
-
-    def touched_cells(
+    def touch(
         self,
         grid: VoxelGrid,
         view: DepthView,
         stamps: NDArray[np.int32],
-        stride: int,
         free_after: int,
         frame_number: int,
         parameters: FusionParameters,
-    ) -> NDArray[np.int32]:
-        """See ``Backend.touched_cells``."""
-        window = on_host(grid.window)
-        p, depth = single(parameters), view.depth
-        T_blocks_camera = view.T_grid_camera / np.float32(BLOCK)
-        ranges = bands(-(-depth.shape[0] // stride), TILE_ROWS)
-        found = [np.empty(MAX_FOUND, dtype=np.int32) for _ in ranges]
-        counts = run_bands(
-            lambda start, stop, out: visibility.mark_blocks(
-                stride * start, min(stride * stop, depth.shape[0]), stride, depth, view.intrinsics, T_blocks_camera,
-                grid.shape, window, grid.free_count, free_after, frame_number, stamps, p.band,
-                np.float32(BLOCK) * p.voxel_size, out,
-            ),
-            ranges, found,
+    ) -> TouchedBlocks:
+        """See ``Backend.touch``."""
+        p, size = single(parameters), view.depth.shape
+        tiles = DepthTiles(*np.empty((3, -(-size[0] // TILE), -(-size[1] // TILE)), dtype=np.float32))
+        depth, given = np.empty(size, np.float32), view.weights is not None
+        weights = np.ones(size, np.uint8) if view.weights is None else view.weights
+        found, counts = np.empty((BANDS, MAX_FOUND), dtype=np.int32), np.zeros(BANDS, dtype=np.int64)
+        run_team(
+            fusion.touch, BANDS, np.ascontiguousarray(view.depth, np.float32), np.ascontiguousarray(view.used), given,
+            view.T_grid_camera / np.float32(BLOCK), view.intrinsics, grid.shape, on_host(grid.window), grid.free_count,
+            free_after, frame_number, stamps, p, depth, *tiles, weights, found, counts,
+            np.empty(BANDS, dtype=np.float32),
         )  # fmt: skip
-        return np.unique(_concatenated(found, counts))
+        return TouchedBlocks(np.unique(_concatenated(found, counts)), depth, weights, tiles)
 
     def fuse(
         self,
         grid: VoxelGrid,
         view: DepthView,
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8],
+        touched: TouchedBlocks,
         candidates: NDArray[np.int32],
         fused: NDArray[np.uint8],
         turn: int,
         count: int,
+        free_space: FreeSpace | None,
         parameters: FusionParameters,
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
-        p, depth, mirrors = single(parameters), view.depth, (grid.geometry, grid.colors)
-        grid = grid.on_host()
-        slots, repeats = self._visible(grid, view, candidates, fused, turn, count, p)
-        pixels, rgb = self._pixel_buffer(depth.size + 1), np.ascontiguousarray(color)
-        run_bands(
-            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, p, pixels),
-            bands(depth.shape[0], PIXEL_ROWS),
-        )
-        words, size = pixels.reshape(-1), np.array(depth.shape, dtype=np.int64)
-        occupied = np.empty(len(slots), dtype=np.int32)
-        run_bands(
-            lambda start, stop: integration.integrate_blocks(
-                start, stop, slots, repeats, grid.slot_coords, view.T_camera_world, view.intrinsics, size, words,
-                grid.geometry.reshape(-1), grid.colors.reshape(-1), p, occupied,
-            ),
-            bands(len(slots), BLOCKS_PER_BAND),
-        )  # fmt: skip
+        mirrors = grid.geometry, grid.colors
+        blocks, *_ = self._fused(grid.on_host(), view, touched, candidates, fused, turn, count, free_space, parameters)
         for mirror in mirrors:
             if isinstance(mirror, Mirror):
-                mirror.wrote(slots)
-        return FusedBlocks(slots, occupied)
+                mirror.wrote(blocks.slots)
+        return blocks
 
-    def _visible(
+    def _fused(
         self,
         grid: VoxelGrid,
         view: DepthView,
+        touched: TouchedBlocks,
         candidates: NDArray[np.int32],
         fused: NDArray[np.uint8],
         turn: int,
         count: int,
-        p: FusionParameters,
-    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Slots (n,) of the blocks to update, and the number of frames that this one stands for in each of them."""
-        slots = np.empty(len(candidates), dtype=np.int32)
-        repeats = np.empty(len(candidates), dtype=np.float32)
-        size = np.array(view.depth.shape, dtype=np.int64)
-        ranges = bands(len(candidates), CANDIDATES_PER_BAND)
-        counts = run_bands(
-            lambda start, stop: visibility.visible_slots(
-                start, stop, candidates, grid.slot_coords, fused, turn, view.T_camera_world, view.intrinsics, size,
-                np.float32(BLOCK) * p.voxel_size, view.tiles.farthest, p.band, p.depth_min, p.depth_max, slots, repeats,
-            ),
-            ranges,
-        )  # fmt: skip
-        starts = [start for start, _ in ranges]
-        written = [np.s_[start : start + n] for start, n in zip(starts, counts, strict=True)]
-        repeats = np.concatenate([repeats[part] for part in written])
-        repeats *= count
-        return np.concatenate([slots[part] for part in written]), repeats
-
-    def _pixel_buffer(self, size: int) -> NDArray[np.int32]:
-        """Words (size, 2) of the pixels; the last row, of a voxel without a pixel, is 0."""
-        if len(self._pixels) != size:
-            self._pixels = np.zeros((size, 2), dtype=np.int32)
-        return self._pixels
-
-    def observe_free(
-        self,
-        grid: VoxelGrid,
-        view: DepthView,
-        parity: int,
-        count: int,
-        free_after: int,
+        free_space: FreeSpace | None,
         parameters: FusionParameters,
-    ) -> NDArray[np.int32]:
-        """See ``Backend.observe_free``."""
-        window = on_host(grid.window)
-        p, size = single(parameters), np.array(view.depth.shape, dtype=np.int64)
-        nearest = view.tiles.nearest[np.isfinite(view.tiles.nearest)]
-        far = min(p.depth_max, nearest.max(initial=0))  # nothing farther lies in front of all readings
-        ranges = bands(int(grid.shape[0]) // 2, PLANES_PER_BAND)
-        found = [np.empty(MAX_FOUND, dtype=np.int32) for _ in ranges]
-        counts = run_bands(
-            lambda start, stop, out: visibility.observe_free(
-                2 * start + parity, 2 * stop + parity, 2, window, grid.shape, grid.origin, view.T_camera_world,
-                view.intrinsics, size, np.float32(BLOCK) * p.voxel_size, view.tiles.nearest, view.tiles.valid, p.band,
-                far, grid.free_count, count, free_after, out,
-            ),
-            ranges, found,
+        *,
+        averages: bool = True,
+    ) -> tuple[FusedBlocks, NDArray[np.float32], NDArray[np.int32]]:
+        """The blocks in view, the number of frames (n,) that this one stands for in each, and the packed pixels; see
+        ``Backend.fuse``.
+
+        Without ``averages`` the voxels, which another device then changes, stay as they are.
+        """
+        n, parity, after = len(candidates), *((-1, 0) if free_space is None else free_space)
+        slots, repeats, occupied = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.int32)
+        visible, counts = np.zeros(BANDS + 1, dtype=np.int64), np.zeros(BANDS, dtype=np.int64)
+        found, pixels = np.empty((BANDS, MAX_FOUND), dtype=np.int32), self._pixel_buffer(view.depth.shape)
+        geometry, colors = (array.reshape(-1) if averages else _NO_VOXELS for array in (grid.geometry, grid.colors))
+        run_team(
+            fusion.fuse, BANDS, candidates, fused, turn, count, averages, view.T_camera_world, view.intrinsics,
+            np.array(view.depth.shape, dtype=np.int64), grid.slot_coords, touched.depth,
+            np.ascontiguousarray(view.color), touched.weights, *touched.tiles, pixels, pixels.reshape(-1),
+            geometry, colors, single(parameters), parity, on_host(grid.window), grid.shape, grid.origin,
+            grid.free_count, after, slots, repeats, visible, occupied, found, counts,
         )  # fmt: skip
-        return _concatenated(found, counts)
+        total = visible[BANDS]
+        return FusedBlocks(slots[:total], occupied[:total], _concatenated(found, counts)), repeats[:total], pixels
+
+    def _pixel_buffer(self, size: tuple[int, ...]) -> NDArray[np.int32]:
+        """Words (H * W + 1, 2) of the pixels; the last row, of a voxel without a pixel, is 0."""
+        rows = size[0] * size[1] + 1
+        if len(self._pixels) != rows:
+            self._pixels = np.zeros((rows, 2), dtype=np.int32)
+        return self._pixels
 
     # -- read the map ------------------------------------------------------------------------------------------------
 
@@ -387,6 +312,6 @@ class CpuBackend:
         return out
 
 
-def _concatenated(found: list[NDArray[np.int32]], counts: list[int]) -> NDArray[np.int32]:
+def _concatenated(found: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.int32]:
     """The first ``counts[n]`` entries of each array, as one."""
     return np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)])

@@ -5,21 +5,29 @@ import numpy as np
 from dudmap.core.backends.cpu.gathers import load_pairs
 from dudmap.core.backends.cpu.memory import prefetch
 from dudmap.core.backends.cpu.vectors import wide_vectors
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import scalar
 from dudmap.core.formulas.pixel import band_behind, free_depth, project, ray, reading_weight
 from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, is_occupied, pack_pixel_color, pack_reading
 
 
-@kernel
-def used_readings(depth, used, farthest, out):
-    """Readings of ``depth`` (H, W) up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0."""
-    source, chosen, target = depth.reshape(-1), used.reshape(-1), out.reshape(-1)
-    for n in range(source.size):
-        z = source[n]
-        target[n] = z if (z > np.float32(0)) & (z <= farthest) & chosen[n] else np.float32(0)
+@scalar
+def used_readings(row_start, row_stop, depth, used, farthest, out):
+    """Readings of ``depth`` (H, W) up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0.
+
+    Returns the largest of those in the rows from ``row_start`` up to ``row_stop``.
+    """
+    largest = np.float32(0)
+    for v in range(row_start, row_stop):
+        source, chosen, target = depth[v], used[v], out[v]
+        for u in range(depth.shape[1]):
+            z = source[u]
+            kept = z if (z > np.float32(0)) & (z <= farthest) & chosen[u] else np.float32(0)
+            target[u] = kept
+            largest = max(largest, kept)
+    return largest
 
 
-@kernel
+@scalar
 def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
     """Pack what the fusion reads of each pixel into two words (``core/formulas/voxel.py``), so that it loads little.
 
@@ -59,7 +67,7 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
             row[np.uintp(2 * u)], row[np.uintp(2 * u + 1)] = first[u], second[u]
 
 
-@kernel
+@scalar
 def integrate_blocks(
     start, stop, slots, repeats, coords, T, intrinsics, size, pixels, map_geometry, map_colors, parameters, occupied
 ):
@@ -160,7 +168,7 @@ def integrate_blocks(
             colors[n] = fuse_color(colors[n], words[2 * n + 1], known[1, n])
 
 
-@kernel
+@scalar
 def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out):
     """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal one at 1 m gets ``best``.
 

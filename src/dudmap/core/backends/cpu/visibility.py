@@ -3,7 +3,7 @@
 import numpy as np
 
 from dudmap.core.backends.cpu.vectors import wide_vectors
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import scalar
 from dudmap.core.formulas.pixel import band_behind, band_front, elements, project, ray, sigma, transform
 
 TILE = 8
@@ -14,7 +14,7 @@ REACH = np.float32(0.8661)
 """Radius of the sphere around a block over its edge: half of the space diagonal."""
 
 
-@kernel
+@scalar
 def mark_blocks(
     row_start, row_stop, stride, depth, intrinsics, T, shape, window, free_count, free_after, frame_number, stamps,
     band, block_size, found,
@@ -85,7 +85,7 @@ def mark_blocks(
     return count
 
 
-@kernel
+@scalar
 def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
     """Nearest and farthest reading and share of pixels with one, per tile of the depth image.
 
@@ -117,7 +117,7 @@ def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
             valid[ty, tx] = readings / np.float32((right - left) * (last - first))
 
 
-@kernel
+@scalar
 def visible_slots(
     start, stop, slots, coords, fused, turn, T, intrinsics, size, block_size, farthest, band, depth_min, depth_max,
     out, repeats,
@@ -186,7 +186,7 @@ def visible_slots(
     return count - start
 
 
-@kernel
+@scalar
 def observe_free(
     x_start, x_stop, x_step, window, shape, origin, T, intrinsics, size, block_size, nearest, valid, band, depth_max,
     counts, repeats, free_after, found,

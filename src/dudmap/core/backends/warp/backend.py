@@ -22,6 +22,7 @@ from dudmap.core.backends.parameters import (
     BLOCK,
     DepthView,
     FilterParameters,
+    FreeSpace,
     FusedBlocks,
     FusionParameters,
     MapSample,
@@ -29,8 +30,8 @@ from dudmap.core.backends.parameters import (
     RaycastParameters,
     RaycastResult,
     RegistrationParameters,
+    TouchedBlocks,
     VoxelGrid,
-    single,
     to_lattice,
 )
 from dudmap.core.backends.warp import faults
@@ -103,31 +104,29 @@ class WarpBackend(CpuBackend):
         self,
         grid: VoxelGrid,
         view: DepthView,
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8],
+        touched: TouchedBlocks,
         candidates: NDArray[np.int32],
         fused: NDArray[np.uint8],
         turn: int,
         count: int,
+        free_space: FreeSpace | None,
         parameters: FusionParameters,
     ) -> FusedBlocks:
-        """See ``Backend.fuse``; the CPU finds the blocks in view."""
-        slots, repeats = self._visible(grid, view, candidates, fused, turn, count, single(parameters))
+        """See ``Backend.fuse``; the CPU packs the pixels, finds the blocks in view, and observes free space."""
+        arguments = view, touched, candidates, fused, turn, count, free_space, parameters
+        (slots, _, empty), repeats, pixels = self._fused(grid, *arguments, averages=False)
         p, (height, width) = struct(parameters), view.depth.shape
         with self._using():
             geometry, colors = resident(grid.geometry, self.device), resident(grid.colors, self.device)
-            pixels = self._empty((height * width, 2), wp.int32)
-            readings = self._up(view.depth), self._up(color), self._up(weights)
-            self._launch(fusion.pack_pixels, view.depth.shape, *readings, p, pixels)
             occupied = wp.zeros(len(slots), dtype=wp.int32, device=in_warp(self.device))
             self._launch(
                 fusion.integrate, (len(slots), BLOCK**3), self._up(slots), self._up(repeats),
                 self._up(grid.slot_coords[slots]), motion_of(view.T_camera_world), camera_of(view.intrinsics), height,
-                width, pixels, geometry, colors, p, occupied,
+                width, self._up(pixels), geometry, colors, p, occupied,
             )  # fmt: skip
             for array in (grid.geometry, grid.colors):
                 wrote(array, slots)
-            return FusedBlocks(slots, down(occupied))
+            return FusedBlocks(slots, down(occupied), empty)
 
     # -- read the map ------------------------------------------------------------------------------------------------
 

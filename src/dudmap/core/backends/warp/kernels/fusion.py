@@ -7,43 +7,17 @@ import warp as wp
 
 from dudmap.core.backends.warp.kernels.formulas import (
     Motion,
-    free_depth,
     fuse_color,
     fuse_voxel,
     is_occupied,
-    pack_pixel_color,
-    pack_reading,
     project,
     transform,
 )
-from dudmap.core.backends.warp.kernels.images import Image
 from dudmap.core.backends.warp.kernels.structs import Camera, FusionParameters
 
 wp.set_module_options({"enable_backward": False})
 
-FAR = wp.constant(wp.float32(1.0e9))
-Bytes = wp.array2d(dtype=wp.uint8)
 Indices = wp.array(dtype=wp.int32)
-
-
-@wp.kernel
-def pack_pixels(
-    depth: Image, rgb: wp.array3d(dtype=wp.uint8), weights: Bytes, p: FusionParameters,
-    pixels: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
-    """Two words per pixel: see ``integration.pack_pixels``."""
-    v, u = wp.tid()
-    h, w = depth.shape[0], depth.shape[1]
-    near = float(FAR)
-    for y in range(max(v - 1, 0), min(v + 2, h)):
-        for x in range(max(u - 1, 0), min(u + 2, w)):
-            q = depth[y, x]
-            if q > wp.float32(0.0):
-                near = min(near, q)
-    z = depth[v, u]
-    n = v * w + u
-    pixels[n, 0] = pack_reading(z, free_depth(z, near, p.band), wp.float32(1.0) / p.depth_unit)
-    pixels[n, 1] = pack_pixel_color(rgb[v, u, 0], rgb[v, u, 1], rgb[v, u, 2], weights[v, u])
 
 
 @wp.kernel

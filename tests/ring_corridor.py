@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.lab.synthetic.furniture import CARDBOARD, WOOD, plant, poster, shelf, table
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.rooms import CARDBOARD, WOOD, plant, poster, shelf, table
 from dudmap.lab.synthetic.scene import Light, Material, Primitive, Scene, box, cylinder, look_at, pose
 
 WIDTH, HEIGHT = 2.4, 2.5
@@ -28,13 +28,8 @@ def ring_corridor(
 ) -> SyntheticSequence:  # fmt: skip
     """Recording of a walk once round a corridor and on, so that the beginning is seen again.
 
-    Args:
-        length: Of the walk until it is where it began, metres; at least 40.
-        speed: Of the camera, m/s.
-        fps: Frames per second.
-        beyond: Length of the walk after that, metres.
-        camera: Intrinsics.
-        seed: Of the furniture, the sway of the camera and the noise.
+    The walk is where it began after ``length`` (at least 40) metres and ends ``beyond`` metres later; the speed is in
+    m/s. The seed is that of the furniture, the sway of the camera and the noise.
     """
     side = (length + (8 - 2 * np.pi) * CORNER) / 6  # the block is twice as long as wide
     corners = np.array([(0, 0), (2 * side, 0), (2 * side, side), (0, side)])
