@@ -50,5 +50,5 @@ def slam(monkeypatch):
     module = types.ModuleType("dudmap.core.slam")
     module.Slam = fake
     monkeypatch.setitem(sys.modules, "dudmap.core.slam", module)
-    monkeypatch.setattr("dudmap.app.state.checkpoints.Checkpoints.take", lambda *args, **options: None)
+    monkeypatch.setattr("dudmap.app.pipeline.storing.RunStore.take", lambda *args, **options: None)
     return fake

@@ -29,7 +29,7 @@ def _compare(a, b, one, two, place, out):
                 if not _same(one.arrays[a[key]], two.arrays[b[key]]):
                     out.append(where)
             elif key == "records":
-                if one.records[a[key]] != two.records[b[key]]:
+                if one.arrays[a[key]] != two.arrays[b[key]]:
                     out.append(where)
             else:
                 _compare(a[key], b[key], one, two, where, out)

@@ -10,9 +10,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from dudmap.errors import DudmapError
 from dudmap.own_folder import OwnFolder
 
-__all__ = ["UNFINISHED", "atomic_file", "atomic_path", "bring_to_disk", "put_in_place", "write_bytes", "write_text"]
+__all__ = [
+    "UNFINISHED",
+    "atomic_file",
+    "atomic_path",
+    "bring_to_disk",
+    "put_in_place",
+    "write_bytes",
+    "write_text",
+    "writing",
+]
 
 UNFINISHED = r"\..+\.\d+\.part(\.\w+)?"
 """Regular expression of the temporary names, under which a process that is killed leaves what it was writing."""
@@ -66,6 +76,19 @@ def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
     temporary.replace(path)
     if sync and os.name == "posix":  # a folder is no file elsewhere
         bring_to_disk(path.parent)
+
+
+@contextmanager
+def writing(what: object) -> Iterator[None]:
+    """Turn any error of the operating system into one sentence on what cannot be written.
+
+    Raises:
+        DudmapError: Instead of it.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DudmapError(f"cannot write {what}: {error.strerror or error}") from error
 
 
 def write_bytes(path: str | Path, content: bytes, *, sync: bool = True, own: bool = False) -> None:

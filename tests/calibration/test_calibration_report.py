@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dudmap import Config
-from dudmap.app.pipeline.calibration import calibrate_start
-from dudmap.app.pipeline.calibration_report import findings
+from dudmap.app.pipeline.calibration import calibrate_start, findings
 from dudmap.core.calibration.estimator import GROUPS, Estimate
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
@@ -48,5 +47,5 @@ def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
             return 5
 
     said = []
-    assert calibrate_start(Short(), Config(), notice=said.append) is None
+    assert calibrate_start(Short(), Config(), len(Short()), said.append, lambda done, total: None) is None
     assert said == ["colour camera: assumed as given, not tested: that takes 90 frames"]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.live import run_live
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import CameraError
@@ -46,7 +46,7 @@ def test_a_live_run_on_it(slam, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(slam, "process", loading)
-        metrics = run_live(camera, Config(), tmp_path / "out", record=file, progress=False).metrics
+        metrics = run(camera, Config(), tmp_path / "out", record=file, progress=False).metrics
     assert metrics["sequence"] == "realsense"
     assert metrics["frames"] >= 2
     assert metrics["frames"] + metrics["dropped"] >= 8

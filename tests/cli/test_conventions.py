@@ -93,7 +93,7 @@ def test_json_is_one_object_on_stdout(slam, where, monkeypatch, words):
 
 FAKED = {
     "warmup": (["warmup"], {"dudmap.lab.warmup.steps": lambda: [("part", lambda: None)]}),
-    "merge": (["merge", "a", "b"], {"dudmap.fleet.two_runs.merge_runs": lambda *_: merged()}),
+    "merge": (["merge", "a", "b"], {"dudmap.fleet.merge.merge_runs": lambda *_: merged()}),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
     "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
     "benchmark gate": (
@@ -365,3 +365,4 @@ def test_help_of_run_is_grouped():
     groups = re.findall(r"^╭─ (.*?) ─", text, flags=re.MULTILINE)
     assert groups[2:] == ["Input", "Output", "Map", "Calibration", "Live and viewing", "Advanced"]
     assert groups[:2] == ["Arguments", "Options"]  # the latter holds --help alone
+    assert "timings.csv and report.html into the run folder" in text  # wrapped as the terminal is wide

@@ -34,6 +34,7 @@ def test_a_replay_is_processed_and_recorded(slam, tmp_path):
         (["--camera", "webcam"], "dudmap: there is no camera 'webcam'; expected one of realsense"),
         (["--camera", "replay"], "expected --camera replay:PATH"),
         (["--camera", "replay:/nowhere"], "there is no folder or file /nowhere"),
+        (["--map", "/nowhere"], "/nowhere"),
     ],
 )
 def test_what_is_wrong_is_one_sentence(slam, arguments, sentence):

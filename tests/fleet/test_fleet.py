@@ -23,13 +23,10 @@ from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.evaluation.surface import Surface
 from dudmap.fleet import fusion
-from dudmap.fleet.fused_range import FusedRange, joined
-from dudmap.fleet.fusion import PlacedRun, fuse_range, planned_ranges
-from dudmap.fleet.inputs import MapHeader, check_runs
-from dudmap.fleet.map_fusion import fuse_maps
-from dudmap.fleet.merge import load_part, merge_fleet, read_world
-from dudmap.fleet.tiles import T_GLTF_MAP, write_tile, write_tileset, write_tree
-from dudmap.fleet.workers import Workers
+from dudmap.fleet.fusion import T_GLTF_MAP, PlacedRun, fuse_range, planned_ranges, write_tile, write_tileset, write_tree
+from dudmap.fleet.map_fusion import FusedRange, fuse_maps, joined
+from dudmap.fleet.merge import merge_fleet
+from dudmap.fleet.workers import MapHeader, Workers, check_runs
 from rendered_places import record, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -185,16 +182,14 @@ def test_runs_become_a_world_and_a_run_elsewhere_is_named(places, tmp_path):
     runs, T = places
     report = merge_fleet(runs, tmp_path / "world")
     assert report.sentences == ["1 run(s) overlap no other and are left out: desk"]
-    tree = read_world(tmp_path / "world")
+    tree = json.loads((tmp_path / "world/world.json").read_text())
     assert [Path(run["folder"]).name for run in tree["runs"]] == ["room", "other"]
     error = se3.inverse(T) @ np.array(tree["runs"][1]["T_world_run"])
     assert np.linalg.norm(error[:3, 3]) < 0.01
     second = Trajectory.load(tmp_path / "world" / tree["runs"][1]["trajectories"][0])
     np.testing.assert_allclose(second.Ts_world_camera[1], tree["runs"][1]["T_world_run"], atol=1e-6)
-    part = load_part(tmp_path / "world", np.full(3, -100.0), np.full(3, 100.0))
-    assert part.has_voxels.sum() == tree["map_blocks"]
-    with pytest.raises(MapError, match="nothing of the world"):
-        load_part(tmp_path / "world", np.full(3, 100.0), np.full(3, 101.0))
+    parts = [TsdfVolume.load(tmp_path / "world" / one["file"]) for one in tree["ranges"]]
+    assert sum(part.num_blocks for part in parts) == tree["map_blocks"]
     assert (tmp_path / "world" / "tileset.json").is_file()
     assert not (tmp_path / "world" / ".work").exists()
     again = merge_fleet(runs[::2], tmp_path / "world")

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from dudmap.core.geometry import se3
-from dudmap.fleet import rounds
+from dudmap.fleet import registration
 from dudmap.fleet.agreement import Agreement
-from dudmap.fleet.map_merging import NOT_RECOGNISED, MapPair
-from dudmap.fleet.registration import RegisteredPair
-from dudmap.fleet.relative_pose import Hypothesis
-from dudmap.fleet.rounds import predicted_overlap, registered_runs
+from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair
+from dudmap.fleet.registration import RegisteredPair, predicted_overlap, registered_runs
 from dudmap.fleet.sdf_alignment import SdfAlignment
 from dudmap.fleet.workers import Workers
 
@@ -47,7 +45,7 @@ class Oracle:
 
     def decided(self, a, b, guess):
         T = se3.inverse(TRUE[a]) @ TRUE[b]
-        alignment = SdfAlignment(T, True, 0.004, 0.1, (1.0, 0.0), np.zeros(3))
+        alignment = SdfAlignment(T, True, 0.004, 0.1, np.zeros(3))
         if (a, b) in self.false:
             return MapPair(np.eye(4), "", Hypothesis(np.eye(4), 3, 99), alignment, AGREED)
         if b - a == 1 or (b - a == RUNS - 1 and guess is not None):
@@ -58,10 +56,10 @@ class Oracle:
 
 
 def register(patch, oracle, similar):
-    patch.setattr(rounds, "PARTNERS", 2)
-    patch.setattr(rounds, "similar_runs", lambda runs, workers: similar)
-    patch.setattr(rounds, "register_pairs", oracle)
-    patch.setattr(rounds, "_block_centers", lambda run: box_points((-1, -2, -1), (1, 2, 1)))
+    patch.setattr(registration, "PARTNERS", 2)
+    patch.setattr(registration, "similar_runs", lambda runs, workers: similar)
+    patch.setattr(registration, "register_pairs", oracle)
+    patch.setattr(registration, "_block_centers", lambda run: box_points((-1, -2, -1), (1, 2, 1)))
     with Workers(1) as crew:
         return registered_runs([Path(str(run)) for run in range(RUNS)], crew, lambda text: None)
 

@@ -152,7 +152,6 @@ def run_folder(folder):
 
 def load_run_folder(path):
     from dudmap.app.viewing.run_files import RunFiles
-    from dudmap.app.viewing.stored_view import frames_of
     from dudmap.evaluation.files import tracked_share
     from dudmap.io.exporting.run_content import RunContent
 
@@ -162,7 +161,14 @@ def load_run_folder(path):
 
     def viewed():
         run = RunFiles.load(path)
-        return frames_of(run), run.stages, [run.column(stage) for stage in run.stages]
+        return (
+            run.figures(),
+            run.mesh,
+            run.thumbnails,
+            run.config,
+            run.stages,
+            [run.column(stage) for stage in run.stages],
+        )
 
     for read in (viewed, content, lambda: tracked_share(3, path, None)):
         try:
@@ -175,7 +181,7 @@ def write_into_run_folder(path):
     """What a run does with a folder that exists, and what going on with a run does."""
     from dudmap.app.pipeline.run_folder import locked, prepare_run_folder, save_mask
     from dudmap.app.pipeline.storing import stored_options
-    from dudmap.app.viewing.thumbnails import Thumbnails
+    from dudmap.app.viewing.report import Thumbnails
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DudmapError
 

@@ -43,7 +43,6 @@ LOADERS = {
     "run folder": Loader(files.run_folder, files.load_run_folder),
     "run folder to write": Loader(files.run_folder, files.write_into_run_folder, owns=True),
     "merged folder": Loader(maps.merged_folder, maps.load_merged_folder),
-    "world": Loader(maps.world, maps.load_world),
     "world to replace": Loader(maps.world, maps.replace_world, owns=True),
 }  # fmt: skip
 """All loaders by name."""

@@ -131,7 +131,7 @@ def merged_folder(folder):
 def load_merged_folder(path):
     from file_loaders import load_run_folder
 
-    from dudmap.fleet.two_runs import save_trajectories
+    from dudmap.fleet.merge import save_trajectories
 
     load_run_folder(path)
     with tempfile.TemporaryDirectory() as out:
@@ -152,12 +152,6 @@ def world(folder):
     (made / "world.json").write_text(json.dumps(tree))
     (made / "tileset.json").write_text("{}")
     return made
-
-
-def load_world(path):
-    from dudmap.fleet.merge import load_part
-
-    load_part(path, np.full(3, -1.0), np.full(3, 1.0))
 
 
 def replace_world(path):

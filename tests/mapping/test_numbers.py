@@ -20,7 +20,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
-from dudmap.fleet.block_sums import MAX_COUNT, BlockSums, fused
+from dudmap.fleet.map_fusion import MAX_COUNT, BlockSums, fused
 from dudmap.lab import synthetic
 
 CONFIG = Config().override(["volume.voxel_size=0.02"])

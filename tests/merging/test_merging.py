@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from dudmap.app.viewing.report import write_report
 from dudmap.app.viewing.run_files import RunFiles
-from dudmap.app.viewing.stored_view import frames_of
 from dudmap.config import Config, VolumeConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -17,13 +16,12 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
-from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.errors import DudmapError, MapError
 from dudmap.fleet.agreement import agreement
-from dudmap.fleet.block_sums import BlockSums, block_sums, fused
-from dudmap.fleet.map_fusion import fuse_maps
+from dudmap.fleet.map_fusion import BlockSums, block_sums, fuse_maps, fused
 from dudmap.fleet.map_merging import compare_maps
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, surface_points
-from dudmap.fleet.two_runs import merge_runs
+from dudmap.fleet.merge import merge_runs
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -160,11 +158,6 @@ def test_what_stood_in_one_run_and_was_gone_in_the_other_leaves_the_map():
     np.testing.assert_allclose(behind.sdf[2], 0, atol=2e-3)
 
 
-def test_other_voxel_sizes_are_refused():
-    with pytest.raises(ConfigError, match=r"voxels of 0\.02 and 0\.05 m cannot be merged"):
-        fuse_maps([wall(), wall(config=VolumeConfig(voxel_size=0.05))], [np.eye(4)] * 2)
-
-
 @pytest.fixture(scope="module")
 def room():
     return true_map(record("room", 1))
@@ -250,7 +243,7 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, same_roo
     assert json.loads((out / "merge.json").read_text()) == tree
     np.testing.assert_allclose(Trajectory.load(out / "trajectory-2.txt").Ts_world_camera[1], tree["T_a_b"], atol=1e-6)
     shown = RunFiles.load(out)
-    assert [frame.timestamp for frame in frames_of(shown)] == [0.0, 1.0]
+    assert [frame.timestamp for frame in shown.figures()] == [0.0, 1.0]
     assert len(shown.mesh.faces) == tree["mesh_triangles"]
     assert "5 of 5 frames were tracked" in write_report(out, tmp_path / "report.html").read_text()
     merged = SavedMap.load(out)

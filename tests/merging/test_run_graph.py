@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
-from dudmap.fleet.run_graph import SIGMA_DISTANCE, Join, consistent, drift_covariance, solve, supported
-from dudmap.fleet.smallest_cuts import best_cut
+from dudmap.fleet.run_graph import SIGMA_DISTANCE, Join, best_cut, consistent, drift_covariance, solve, supported
 
 RUNS = 24
 
@@ -63,7 +62,7 @@ def test_a_tree_is_kept_and_runs_without_joins_stay_alone(world):
 
 def test_runs_of_one_place_are_proposed():
     pytest.importorskip("faiss")
-    from dudmap.fleet.place_index import most_similar, similarity
+    from dudmap.fleet.registration import most_similar, similarity
 
     rng = np.random.default_rng(0)
     views = rng.normal(size=(40, 64)).astype(np.float32)  # run k sees the views k and k + 1 of a long corridor

@@ -6,7 +6,7 @@ import time
 from rich.console import Console
 
 from dudmap import Config
-from dudmap.app.kernel_cache import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING, compiled_kernels
 from dudmap.app.pipeline.progress import RunProgress, summary
 from dudmap.app.pipeline.run import run
 from dudmap.app.terminal import counted

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.focal_check import focal_error
+from dudmap.app.pipeline.image_checks import focal_error
 from dudmap.app.pipeline.inspection import inspect
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.live import run_live
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import CameraError, DudmapError, FrameError
 from dudmap.io.cameras import CameraFrame, LiveCamera
@@ -33,7 +33,7 @@ def slowed(slam, monkeypatch, seconds):
 
 
 def test_a_run_in_time_drops_nothing(slam, sequence, tmp_path, capsys):
-    report = run_live(ReplayCamera(sequence), Config(), tmp_path / "out", progress=False)
+    report = run(ReplayCamera(sequence), Config(), tmp_path / "out", progress=False)
     assert (report.metrics["frames"], report.metrics["dropped"]) == (8, 0)
     assert report.metrics["complete"]
     assert len(report.trajectory) == 8
@@ -44,7 +44,7 @@ def test_a_run_in_time_drops_nothing(slam, sequence, tmp_path, capsys):
 def test_all_frames_are_recorded_while_some_are_dropped(slam, sequence, tmp_path, capsys, monkeypatch):
     slowed(slam, monkeypatch, 0.5)
     file = tmp_path / "walk.mcap"
-    report = run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
+    report = run(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
     assert report.metrics["dropped"] >= 3
     assert report.metrics["frames"] + report.metrics["dropped"] == 8
     with (tmp_path / "out/timings.csv").open() as opened:
@@ -70,13 +70,13 @@ def test_the_recording_is_complete_though_the_run_folder_cannot_be_written(slam,
     monkeypatch.setattr("dudmap.app.pipeline.run.write_run_folder", full)
     file = tmp_path / "walk.mcap"
     with pytest.raises(DudmapError, match="no space left"):
-        run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
+        run(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
     assert len(open_sequence(file)) >= 7, "a busy machine may be late with one"
 
 
 def test_ctrl_c_ends_a_run_and_writes_the_results(slam, sequence, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(slam, "script", {4: KeyboardInterrupt()})
-    report = run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)
+    report = run(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)
     assert report.metrics["frames"] == 4
     assert report.metrics["complete"]
     assert json.loads((tmp_path / "out/metrics.json").read_text())["frames"] == 4
@@ -86,7 +86,7 @@ def test_ctrl_c_ends_a_run_and_writes_the_results(slam, sequence, tmp_path, caps
 
 def test_a_number_of_frames_ends_a_run(slam, sequence, tmp_path):
     start = time.perf_counter()
-    report = run_live(ReplayCamera(sequence), Config(), tmp_path / "out", max_frames=3, progress=False)
+    report = run(ReplayCamera(sequence), Config(), tmp_path / "out", max_frames=3, progress=False)
     assert report.metrics["frames"] == 3
     assert time.perf_counter() - start < 5
 
@@ -117,21 +117,21 @@ class FragileCamera(LiveCamera):
 
 def test_frames_that_the_driver_lost_are_counted(slam, sequence, tmp_path):
     camera = FragileCamera(sequence, [100, 101, 104, 105])
-    metrics = run_live(camera, Config(), tmp_path / "out", progress=False).metrics
+    metrics = run(camera, Config(), tmp_path / "out", progress=False).metrics
     assert (metrics["frames"], metrics["dropped"]) == (4, 2)
     assert camera.closed
 
 
 def test_a_depth_image_that_comes_twice_is_taken_once(slam, sequence, tmp_path):
     camera = FragileCamera(sequence, [100, 101, 101, 103])
-    metrics = run_live(camera, Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False).metrics
+    metrics = run(camera, Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False).metrics
     assert (metrics["frames"], metrics["dropped"]) == (3, 1)
     assert len(open_sequence(tmp_path / "walk.mcap")) == 3
 
 
 def test_a_frame_that_cannot_be_read_is_skipped(slam, sequence, tmp_path, capsys):
     camera = FragileCamera(sequence, [100, 101, 102, 103])
-    metrics = run_live(camera, Config(), tmp_path / "out", progress=False).metrics
+    metrics = run(camera, Config(), tmp_path / "out", progress=False).metrics
     assert (metrics["tracked"], metrics["unreadable"]) == (3, 1)
     assert "skipped: frame 102 is damaged" in capsys.readouterr().err
 
@@ -139,7 +139,7 @@ def test_a_frame_that_cannot_be_read_is_skipped(slam, sequence, tmp_path, capsys
 def test_a_camera_that_breaks_leaves_its_results(slam, sequence, tmp_path):
     camera = FragileCamera(sequence, [100, 101], CameraError("it was unplugged"))
     with pytest.raises(CameraError, match=r"it was unplugged; the trajectory and the map up to there are in .*out"):
-        run_live(camera, Config(), tmp_path / "out", progress=False)
+        run(camera, Config(), tmp_path / "out", progress=False)
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert (metrics["frames"], metrics["complete"]) == (2, False)
     assert camera.closed
@@ -147,10 +147,10 @@ def test_a_camera_that_breaks_leaves_its_results(slam, sequence, tmp_path):
 
 def test_no_frame_at_all_is_one_sentence(slam, sequence, tmp_path):
     with pytest.raises(CameraError, match="no frame of the camera fragile was processed"):
-        run_live(FragileCamera(sequence, []), Config(), tmp_path / "out", progress=False)
+        run(FragileCamera(sequence, []), Config(), tmp_path / "out", progress=False)
 
 
 def test_recording_over_a_file_is_refused_before_the_start(slam, sequence, tmp_path):
     (tmp_path / "walk.mcap").write_bytes(b"old")
     with pytest.raises(DudmapError, match="exists; name another file"):
-        run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)
+        run(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)

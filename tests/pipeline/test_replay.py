@@ -8,47 +8,49 @@ import time
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.frame_source import SourceFrame
-from dudmap.app.pipeline.replay import FrameQueue, in_real_time, replay
+from dudmap.app.pipeline.frame_source import FrameQueue, SourceFrame, arriving
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
+from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import open_sequence
 from fake_slam import FakeSlam
 from recordings import cut, write_recording
 
 
-class StageTimer:
-    """Time that passes only where somebody waits or works."""
+class FakeSequence:
+    """Frames at given times, each of which takes a while to read."""
 
-    def __init__(self):
-        self.time = 50.0
+    name, camera, calibration, ground_truth = "stand-in", Camera(60, 60, 31.5, 23.5, 64, 48), None, None
 
-    def now(self):
-        return self.time
+    def __init__(self, timestamps, reading_s=0.0, error=None):
+        self.timestamps, self.reading_s, self.error = np.asarray(timestamps, float), reading_s, error
 
-    def wait(self, seconds):
-        self.time += seconds
-        return False
+    def __len__(self):
+        return len(self.timestamps)
+
+    def __getitem__(self, index):
+        if self.error:
+            raise self.error
+        time.sleep(self.reading_s)
+        depth, color = np.ones((48, 64), np.float32), np.zeros((48, 64, 3), np.uint8)
+        return Frame(float(self.timestamps[index]), depth, color)
+
+    def mask(self, index):
+        return None
+
+
+def in_real_time(timestamps, idle=lambda: False, **options):
+    return arriving(ReplayCamera(FakeSequence(timestamps, **options)), idle=idle)
 
 
 def replayed(timestamps, reading_s):
     """Numbers and times of the frames that a sensor with so slow a reader offers."""
-    clock, offered = StageTimer(), []
-
-    def read(index):
-        clock.time += reading_s
-        return f"frame {index}"
-
-    replay(np.asarray(timestamps), read, offered.append, clock.wait, clock.now)
-    assert all(arrival.read == f"frame {arrival.number}" for arrival in offered)
-    return [arrival.number for arrival in offered], [arrival.arrival - 50 for arrival in offered]
-
-
-def test_frames_arrive_when_their_times_tell():
-    indices, times = replayed([7.0, 7.1, 7.2, 9.0], 0.01)
-    assert indices == [0, 1, 2, 3]
-    np.testing.assert_allclose(times, [0, 0.1, 0.2, 2.0], atol=1e-9)
+    camera = ReplayCamera(FakeSequence(timestamps, reading_s))
+    offered = list(iter(camera.read, None))
+    return [frame.number for frame in offered], [frame.time - offered[0].time for frame in offered]
 
 
 def test_a_reader_that_is_late_for_a_moment_leaves_none_out():
@@ -59,12 +61,6 @@ def test_a_reader_that_is_too_slow_leaves_frames_out():
     indices, times = replayed(3 + 0.1 * np.arange(10), 0.24)
     assert indices == [0, 2, 4, 7, 9]  # free again at 0.24, 0.48, 0.72, 0.96
     np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
-
-
-def test_a_replay_ends_when_told():
-    offered = []
-    replay(np.arange(5.0), lambda index: index, offered.append, lambda seconds: True)
-    assert [arrival.number for arrival in offered] == [0]
 
 
 def test_only_frames_of_the_last_moment_wait():
@@ -90,7 +86,7 @@ def test_a_consumer_waits_for_the_next():
 
 def test_a_frame_that_takes_twice_as_long_drops_none():
     numbers = []
-    for arrival in in_real_time(0.05 * np.arange(8), str):
+    for arrival in in_real_time(0.05 * np.arange(8)):
         numbers.append(arrival.number)
         time.sleep(0.1 if arrival.number == 3 else 0)
     assert numbers == list(range(8))
@@ -98,7 +94,7 @@ def test_a_frame_that_takes_twice_as_long_drops_none():
 
 def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
     arrivals = []
-    for arrival in in_real_time(0.01 * np.arange(30), str):
+    for arrival in in_real_time(0.01 * np.arange(30)):
         arrivals.append(arrival)
         if arrival.number < 20:
             time.sleep(0.035)
@@ -118,7 +114,7 @@ def test_other_work_is_done_while_no_frame_waits():
         return bool(left and left.pop())
 
     arrived = []
-    for arrival in in_real_time(np.array([0.0, 0.2, 0.26, 0.3]), str, idle):
+    for arrival in in_real_time(np.array([0.0, 0.2, 0.26, 0.3]), idle):
         arrived.append(arrival.number)
         time.sleep(0.2 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
     assert arrived == [0, 1, 2, 3]
@@ -128,18 +124,15 @@ def test_other_work_is_done_while_no_frame_waits():
 
 def test_stopping_early_stops_the_sensor():
     before = threading.active_count()
-    frames = in_real_time(np.array([0.0, 60.0]), str)
-    assert next(frames).read == "0"
+    frames = in_real_time(np.array([0.0, 60.0]))
+    assert next(frames).number == 0
     frames.close()
     assert threading.active_count() == before
 
 
 def test_an_error_of_the_reader_reaches_the_consumer():
-    def read(index):
-        raise DatasetError("the disk is gone")
-
     with pytest.raises(DatasetError, match="the disk is gone"):
-        list(in_real_time(np.arange(3.0), read))
+        list(in_real_time(np.arange(3.0), error=DatasetError("the disk is gone")))
 
 
 @pytest.fixture

@@ -84,7 +84,7 @@ def test_frames_arrive_in_order_and_no_more_than_wanted(slam, recording, tmp_pat
     assert report.metrics["frames"] == 6
     for ahead in (0, 1, 4, 20):
         readings = read_ahead(open_sequence(recording), 5, ahead)
-        np.testing.assert_allclose([reading.frame.timestamp for reading in readings], 100 + 0.1 * np.arange(5))
+        np.testing.assert_allclose([reading.read.frame.timestamp for reading in readings], 100 + 0.1 * np.arange(5))
     assert list(read_ahead(open_sequence(recording), 0)) == []
     with pytest.raises(DatasetError, match="desk has 8 frames and 0 are wanted"):
         go(recording, tmp_path / "none", max_frames=0)

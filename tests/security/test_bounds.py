@@ -15,7 +15,7 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.errors import DatasetError, DudmapError
-from dudmap.fleet.two_runs import save_trajectories
+from dudmap.fleet.merge import save_trajectories
 from dudmap.input_files import DEEPEST, LARGEST_COUNT, inflated, parse_json, parse_toml
 from dudmap.io.sequences import open_sequence
 
@@ -124,19 +124,6 @@ def test_merge_json_names_trajectories_of_its_folder_only(names, tmp_path):
     (tmp_path / "merge.json").write_text(json.dumps({"trajectories": names}))
     with pytest.raises(DudmapError, match=r"merge\.json"):
         save_trajectories(tmp_path / "out", [(tmp_path, np.eye(4))])
-
-
-@pytest.mark.parametrize("file", ["/etc/passwd", "../../map.npz", "map/../../x.npz", 7, "map/0000000000001.npy"])
-def test_world_json_names_maps_of_its_folder_only(file, tmp_path):
-    from dudmap.fleet.merge import FORMAT, read_world
-
-    one = {"file": file, "low_m": [0, 0, 0], "high_m": [1, 1, 1]}
-    (tmp_path / "world.json").write_text(json.dumps({"format": FORMAT, "ranges": [one]}))
-    with pytest.raises(DudmapError, match="holds no world of"):
-        read_world(tmp_path)
-    one["file"] = "map/0000000000001.npz"
-    (tmp_path / "world.json").write_text(json.dumps({"format": FORMAT, "ranges": [one]}))
-    assert read_world(tmp_path)["ranges"] == [one]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links as POSIX has them")

@@ -109,7 +109,7 @@ def test_a_row_that_is_larger_than_memory(path):
 
 def store(path, tree, arrays=()):
     """Replace the tree of a database."""
-    packed = zlib.compress(json.dumps({"tree": tree, "arrays": list(arrays), "records": []}).encode())
+    packed = zlib.compress(json.dumps({"tree": tree, "arrays": list(arrays)}).encode())
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE state SET crc = ?, tree = ?", (zlib.crc32(packed), packed))
 
@@ -175,15 +175,13 @@ def test_one_part_that_stands_in_many_arrays(path):
 
 def test_what_is_missing_in_the_state_of_a_run(tmp_path):
     """A tree that is one, but not that of a run."""
-    from types import SimpleNamespace
-
-    from dudmap.app.pipeline.storing import restored
+    from dudmap.app.pipeline.metrics import RunRecord
+    from dudmap.app.pipeline.storing import RunState
 
     made = StateDatabase(tmp_path / "state.db")
     made.write(take_snapshot({"numbers": np.arange(10.0)}, made), {"next": 1})
-    store, slam = SimpleNamespace(database=None), SimpleNamespace(device="cpu")
     with pytest.raises(StateError, match="found dict; expected RunState"):
-        restored(StateReader(tmp_path / "state.db"), store, slam, slam)
+        restore(StateReader(tmp_path / "state.db"), RunState(None, RunRecord()))
 
 
 def test_the_annotations_of_all_classes_of_a_state_are_known():

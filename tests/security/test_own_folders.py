@@ -8,10 +8,9 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
-from dudmap.app.pipeline.run_folder import WRITTEN
+from dudmap.app.pipeline.run_folder import LOCK, WRITTEN, run_lock
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.run_lock import NAME, RunLock
-from dudmap.app.viewing.thumbnails import Thumbnails
+from dudmap.app.viewing.report import Thumbnails
 from dudmap.atomic_file import atomic_file, atomic_path, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError
@@ -58,7 +57,7 @@ def test_a_link_in_a_run_folder_leads_nowhere(name, act, slam, elsewhere, tmp_pa
 @posix
 @pytest.mark.parametrize("kind", ["hard link", "pipe", "folder"])
 def test_a_lock_that_is_no_file_of_its_own(kind, elsewhere, tmp_path):
-    lock = tmp_path / NAME
+    lock = tmp_path / LOCK
     if kind == "hard link":
         os.link(elsewhere / "file", lock)
     elif kind == "pipe":
@@ -66,7 +65,8 @@ def test_a_lock_that_is_no_file_of_its_own(kind, elsewhere, tmp_path):
     else:
         lock.mkdir()
     with pytest.raises(OSError, match="no plain file") as error:
-        RunLock(tmp_path)
+        with run_lock(tmp_path):
+            pass
     assert error.value.filename == str(lock)
 
 

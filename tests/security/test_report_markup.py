@@ -7,8 +7,7 @@ from html.parser import HTMLParser
 import pytest
 from hostile_runs import MARKUP, places, with_markup, write_hostile_run
 
-from dudmap.app.viewing.markup import Html, html, joined, script_source
-from dudmap.app.viewing.report import write_report
+from dudmap.app.viewing.report import Html, html, joined, script_source, write_report
 from dudmap.errors import DudmapError
 from run_folders import write_run
 

@@ -12,7 +12,7 @@ from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
 from dudmap.app.pipeline.storing import Storing
-from dudmap.app.viewing.thumbnails import Thumbnails
+from dudmap.app.viewing.report import Thumbnails
 from dudmap.config import Config
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.saved_map import SavedMap

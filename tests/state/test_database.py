@@ -267,7 +267,7 @@ def test_no_class_from_elsewhere_is_made():
         "dudmap.core.slam:np",
         "os:system",
     ):
-        reader = SimpleNamespace(state=lambda name=name: ({"object": name, "id": 0, "attributes": {}}, [], []))
+        reader = SimpleNamespace(state=lambda name=name: ({"object": name, "id": 0, "attributes": {}}, []))
         with pytest.raises(StateError, match="does not know"):
             TreeReader(reader).restore(None)
 

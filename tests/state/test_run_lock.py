@@ -12,10 +12,10 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.run_folder import LOCK, run_lock
 from dudmap.app.pipeline.storing import RunOptions, Storing
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.identity import code_fingerprint, recording_fingerprint
-from dudmap.app.state.run_lock import NAME, RunLock
+from dudmap.app.state.system import code_fingerprint, recording_fingerprint
 from dudmap.config import Config
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.errors import DudmapError, StateError
@@ -25,8 +25,8 @@ from recordings import write_recording
 HOLD = """
 import sys, time
 from pathlib import Path
-from dudmap.app.state.run_lock import RunLock
-with RunLock(Path(sys.argv[1])):
+from dudmap.app.pipeline.run_folder import run_lock
+with run_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -37,16 +37,19 @@ def test_the_holder_is_named_and_a_killed_one_holds_nothing(tmp_path):
     try:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(DudmapError, match=f"in use by process {other.pid} on {socket.gethostname()} since 20"):
-            RunLock(tmp_path)
+            with run_lock(tmp_path):
+                pass
     finally:
         other.send_signal(signal.SIGKILL)
         other.communicate()
-    with RunLock(tmp_path):
-        assert json.loads((tmp_path / NAME).read_text())["pid"] == os.getpid()
+    with run_lock(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
         with pytest.raises(DudmapError, match=f"in use by process {os.getpid()} "):
-            RunLock(tmp_path)
-    assert not (tmp_path / NAME).exists()
-    RunLock(tmp_path).close()
+            with run_lock(tmp_path):
+                pass
+    assert not (tmp_path / LOCK).exists()
+    with run_lock(tmp_path):
+        pass
 
 
 def test_neither_a_second_run_nor_a_resume_enters_a_folder_in_use(slam, tmp_path):
@@ -54,7 +57,7 @@ def test_neither_a_second_run_nor_a_resume_enters_a_folder_in_use(slam, tmp_path
     out = tmp_path / "out"
     out.mkdir()
     (out / "trajectory.txt").write_text("of the other")
-    with RunLock(out):
+    with run_lock(out):
         with pytest.raises(DudmapError, match="in use by process"):
             run(sequence, Config(), out, progress=False)
         with pytest.raises(DudmapError, match="in use by process"):

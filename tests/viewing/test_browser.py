@@ -149,7 +149,7 @@ def test_a_browser_without_webgl_is_told_so_and_sees_the_rest(driver, folder):
 @pytest.fixture(scope="module")
 def window(folder):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    from dudmap.app.viewing.stored_view import show_run
+    from dudmap.app.viewing.live_view import show_run
     from dudmap.app.viewing.window import Window
 
     with socket.socket() as free:

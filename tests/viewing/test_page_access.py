@@ -72,7 +72,7 @@ def window(request, tmp_path):
     pytest.importorskip("viser")
     import socket
 
-    from dudmap.app.viewing.stored_view import open_run
+    from dudmap.app.viewing.live_view import open_run
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

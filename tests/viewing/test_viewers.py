@@ -11,9 +11,8 @@ from typer.testing import CliRunner
 
 from dudmap.app.viewing.live_view import LiveView
 from dudmap.app.viewing.mesh_feed import MeshFeed
-from dudmap.app.viewing.picking import first_hit
 from dudmap.app.viewing.snapshot import RESIDUAL_RANGE, FrameImages, depth_colors, mask_overlay, residual_colors
-from dudmap.app.viewing.window import Window
+from dudmap.app.viewing.window import Window, first_hit
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError

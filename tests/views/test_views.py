@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from dudmap.app.views.background import BackgroundRenderer, continued, exposure_gain
 from dudmap.app.views.cleaning import clean_recording, unlike, with_shadow
-from dudmap.app.views.rendering import looking_at, orbit, render_run
-from dudmap.app.views.video import VideoWriter
+from dudmap.app.views.rendering import looking_at, orbit, render_run, video_file
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
@@ -263,6 +262,6 @@ def test_bad_targets_are_one_sentence(made, run, tmp_path):
     assert done.exit_code == 1
     assert "name either a --trajectory or --orbit" in done.stderr
     with pytest.raises(ConfigError, match=r"the ending must be one of \.mp4, \.avi"):
-        VideoWriter(tmp_path / "a.mov", (64, 48), 30)
+        video_file(tmp_path / "a.mov", (64, 48), 30).__enter__()
     with pytest.raises(DatasetError, match="exists and is not an empty folder"):
         render_run(run, Trajectory(np.array([0.0]), np.eye(4)[None]), where)

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Literal
 
 from dudmap import __version__
-from dudmap.app.kernel_cache import compiled_kernels, kernel_cache
 from dudmap.extras import install
+
+COMPILING = "compiling the kernels (once, about a minute; dudmap warmup does it in advance)"
+"""What is said before a first frame where none is compiled."""
 
 PYTHON = ((3, 11), (3, 14))
 """First version of Python that is supported, and the first that is not."""
@@ -25,6 +27,17 @@ FEATURES = ("avx2", "fma")
 FREE_BYTES = 2**31
 """Space below which a folder counts as nearly full: a map and the results of a long run."""
 State = Literal["good", "note", "bad"]
+
+
+def kernel_cache() -> Path:
+    """Folder in which Numba keeps the compiled kernels, as far as it can be known without compiling."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(given) if given else Path(__file__).parents[1] / "core" / "backends" / "cpu" / "__pycache__"
+
+
+def compiled_kernels() -> int:
+    """Number of kernels in the cache; 0 where there is no cache yet."""
+    return sum(1 for _ in kernel_cache().rglob("*.nbi"))
 
 
 @dataclass(frozen=True)
@@ -51,8 +64,7 @@ def checks() -> Iterator[Check]:
     yield _processor()
     yield _threads()
     yield _gpu()
-    yield _kernel_cache()
-    yield _archive_cache()
+    yield from _caches()
     yield from _extras()
     yield _port()
 
@@ -120,26 +132,24 @@ def _gpu() -> Check:
     return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, correct this")
 
 
-def _kernel_cache() -> Check:
-    folder = kernel_cache()
-    problem = not_writable(folder)
-    if problem:
-        mend = "set NUMBA_CACHE_DIR to a folder that you can write, or every start compiles for a minute"
-        return Check("kernel cache", "note", f"{folder}: {problem}", mend)
-    count = compiled_kernels()
-    if not count:
-        return Check("kernel cache", "note", f"{folder} is empty", "dudmap warmup compiles all kernels in advance")
-    return Check("kernel cache", "good", f"{folder}, {count} kernels")
-
-
-def _archive_cache() -> Check:
+def _caches() -> Iterator[Check]:
     from dudmap.io.sequences.archive import cache_folder
 
-    folder = cache_folder()
+    count = compiled_kernels()
+    if count:
+        kernels = Check("kernel cache", "good", f"{kernel_cache()}, {count} kernels")
+    else:
+        mend = "dudmap warmup compiles all kernels in advance"
+        kernels = Check("kernel cache", "note", f"{kernel_cache()} is empty", mend)
+    yield _writable(kernels, kernel_cache(), "NUMBA_CACHE_DIR", ", or every start compiles for a minute")
+    yield _writable(Check("archive cache", "good", str(cache_folder())), cache_folder(), "DUDMAP_CACHE")
+
+
+def _writable(check: Check, folder: Path, variable: str, why: str = "") -> Check:
+    """The check of a folder, or that it cannot be written."""
     problem = not_writable(folder)
-    if problem:
-        return Check("archive cache", "note", f"{folder}: {problem}", "set DUDMAP_CACHE to a folder that you can write")
-    return Check("archive cache", "good", str(folder))
+    mend = f"set {variable} to a folder that you can write{why}"
+    return Check(check.name, "note", f"{folder}: {problem}", mend) if problem else check
 
 
 def _extras() -> Iterator[Check]:

@@ -69,7 +69,7 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     import numpy as np
     from rich.table import Table
 
-    from dudmap.app.pipeline.calibration_report import UNITS, kind_of
+    from dudmap.app.pipeline.calibration import UNITS, kind_of
     from dudmap.core.geometry.calibration import PARAMETERS
 
     out = Table("parameter", "change", "sigma", "unit", "")
@@ -89,7 +89,7 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
 
 def remarks(estimate: "Estimate") -> list[str]:
     """Sentences on what was decided and why."""
-    from dudmap.app.pipeline.calibration_report import findings
+    from dudmap.app.pipeline.calibration import findings
 
     return [
         *findings(estimate),

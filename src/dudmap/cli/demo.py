@@ -74,7 +74,7 @@ class MostDynamicFrame(RunObserver):
 
     def save_picture(self, out: Path, camera: "Camera") -> None:
         """Write demo.png into the run folder ``out``, from the map it holds."""
-        from dudmap.app.pipeline.contact_sheet import save_sheet
+        from dudmap.app.viewing.snapshot import save_sheet
         from dudmap.core.map.volume import TsdfVolume
 
         if self._kept is None:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from dudmap.app.terminal import say
-from dudmap.atomic_file import write_text
+from dudmap.atomic_file import write_text, writing
 from dudmap.cli import options as o
 from dudmap.cli.output import DefaultGroup
-from dudmap.errors import DatasetError, DudmapError
+from dudmap.errors import DatasetError
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
@@ -218,20 +218,16 @@ def _plot_trajectory(
 
 def _output_folder(out: Path | None, default: Path) -> Path:
     target = out or default
-    try:
+    with writing(f"into the folder {target}"):
         target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DudmapError(f"cannot make the folder {target}: {error.strerror or error}") from error
     return target
 
 
 def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool, title: str) -> None:
     """Write the figures as JSON and print them."""
     text = json.dumps(figures, allow_nan=False)
-    try:
+    with writing(file):
         write_text(file, text + "\n")
-    except OSError as error:
-        raise DudmapError(f"cannot write {file}: {error.strerror or error}; name a folder with --out") from error
     if as_json:
         say(text)
         return

@@ -38,9 +38,9 @@ def info(
 
     from rich.table import Table
 
-    from dudmap.app.pipeline.contact_sheet import save_overview
     from dudmap.app.pipeline.inspection import inspect, repeats, sample
     from dudmap.app.terminal import plain_console
+    from dudmap.app.viewing.snapshot import save_overview
     from dudmap.io.sequences import open_sequence
 
     recording = open_sequence(path, camera, fps, depth_unit, color=color, depth=depth, topics=topics)

@@ -34,7 +34,7 @@ def merge(
     Tiles), world.json and the trajectories; it needs dudmap[fleet].
     """
     if len(runs) == 2 and not world:
-        from dudmap.fleet.two_runs import merge_runs
+        from dudmap.fleet.merge import merge_runs
 
         folder = out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}")
         found = merge_runs(runs[0], runs[1], folder)

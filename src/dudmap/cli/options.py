@@ -100,6 +100,17 @@ JobsOption = Annotated[
     int, typer.Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
+MapOption = Annotated[
+    Path | None,
+    map_option("--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"),
+]
+LocalizeOption = Annotated[
+    bool, map_option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
+]
+MaxMemoryOption = Annotated[
+    str | None,
+    map_option(help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"),
+]
 SaveMasksOption = Annotated[bool, output_option("--save-masks", help="Write the dynamic mask of every frame.")]
 ReportOption = Annotated[
     bool, output_option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
@@ -158,10 +169,12 @@ def image_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def memory_size(text: str) -> int:
+def memory_size(text: str | None) -> int | None:
     """Number of bytes of a text such as 1GB or 800MB."""
     from pydantic import ByteSize, TypeAdapter, ValidationError
 
+    if text is None:
+        return None
     try:
         return int(TypeAdapter(ByteSize).validate_python(text))
     except ValidationError:

@@ -43,24 +43,12 @@ def run(
     log: o.LogOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
-    saved: Annotated[
-        Path | None,
-        o.map_option(
-            "--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"
-        ),
-    ] = None,
-    localize: Annotated[
-        bool, o.map_option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
-    ] = False,
+    saved: o.MapOption = None,
+    localize: o.LocalizeOption = False,
     passes: Annotated[
         int, o.map_option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="1|2")
     ] = 1,
-    max_memory: Annotated[
-        str | None,
-        o.map_option(
-            help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"
-        ),
-    ] = None,
+    max_memory: o.MaxMemoryOption = None,
     calibration: Annotated[
         str,
         o.calibration_option(
@@ -101,10 +89,8 @@ def run(
     """
     from dudmap.app.pipeline.inspection import inspect
     from dudmap.app.pipeline.resume import resume as resume_run
-    from dudmap.app.pipeline.resume import wants_report
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.pipeline.storing import Storing
-    from dudmap.core.backends.device import resolve
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.sequences import open_sequence
 
@@ -112,17 +98,13 @@ def run(
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
-        with observers(report=wants_report(resume), page=page, rerun=rerun, log=log) as watching:
+        with observers(report=False, page=page, rerun=rerun, log=log) as watching:
             done = resume_run(resume, device=device, progress=not quiet, observers=watching)
             print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
-    if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
-        config = saved / "config.toml"
-    parameters = o.read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
-    resolve(parameters.device, adaptive=parameters.volume.adaptive)  # refused before anything takes time
-    saved_map = None if saved is None else read_saved_map(saved, parameters, out)
+    parameters, saved_map = run_parameters(config, preset, assignments, device, saved, out)
     recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     warnings = inspect(recording).warnings
     for warning in warnings:
@@ -137,21 +119,34 @@ def run(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
             calibration=given, calibrate=calibration == "auto" and not live,
-            saved_map=saved_map, localize=localize,
-            max_memory=None if max_memory is None else o.memory_size(max_memory), observers=watching, storing=storing,
-            warnings=warnings,
+            saved_map=saved_map, localize=localize, max_memory=o.memory_size(max_memory), observers=watching,
+            storing=storing, warnings=warnings,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
-def read_saved_map(folder: Path, config: "Config", out: Path | None) -> "SavedMap":
-    """Map of a run folder for a run with this configuration."""
+def run_parameters(
+    file: Path | None,
+    preset: str | None,
+    assignments: list[str] | None,
+    device: str | None,
+    saved: Path | None,
+    out: Path | None,
+) -> "tuple[Config, SavedMap | None]":
+    """Configuration of a run, by default that of the run whose map it goes on in, and this map."""
+    from dudmap.core.backends.device import resolve
     from dudmap.core.places.saved_map import SavedMap
 
-    if out is not None and out.resolve() == folder.resolve():
+    if saved is not None and file is None and preset is None and (saved / "config.toml").is_file():
+        file = saved / "config.toml"
+    config = o.read_config(file, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
+    resolve(config.device, adaptive=config.volume.adaptive)  # refused before anything takes time
+    if saved is None:
+        return config, None
+    if out is not None and out.resolve() == saved.resolve():
         raise ConfigError(
             f"the map to go on in lies in the run folder {out}, which is emptied; name another with --out"
         )
     if not config.relocalization.enabled:
         raise ConfigError("the camera is found in a saved map by relocalisation; drop relocalization.enabled=false")
-    return SavedMap.load(folder, config.volume.voxel_size)
+    return config, SavedMap.load(saved, config.volume.voxel_size)

@@ -27,7 +27,7 @@ def view(
     token: o.TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
-    from dudmap.app.viewing.stored_view import open_run
+    from dudmap.app.viewing.live_view import open_run
 
     window = open_run(run, host, port, token)
     say(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)
@@ -45,8 +45,7 @@ def observers(
     An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
     until ctrl-C, unless nobody sits at the terminal.
     """
-    from dudmap.app.pipeline.crash_report import report_crash
-    from dudmap.app.pipeline.event_log import EventLog
+    from dudmap.app.pipeline.observer import EventLog, report_crash
 
     events = EventLog(log)
     with ExitStack() as stack:

@@ -87,13 +87,7 @@ class Agreement:
 def agreement(
     a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
 ) -> Agreement:
-    """Compare two maps at a relative pose ``T_a_b`` (4, 4).
-
-    Args:
-        a, b: The maps.
-        of_a, of_b: Points on their surfaces.
-        T_a_b: World of b to world of a.
-    """
+    """Compare two maps, by points on their surfaces, at a relative pose ``T_a_b`` (4, 4), world of b to world of a."""
     common_b, denied_b, color_a = _compared(a, of_a, of_b, T_a_b)
     common_a, denied_a, color_b = _compared(b, of_b, of_a, se3.inverse(T_a_b))
     area = (common_b.sum() * of_b.area_each + common_a.sum() * of_a.area_each) / 2
@@ -115,9 +109,8 @@ def _compared(
     volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
     """Which points (n,) of a surface a map, with a surface of its own, confirms and which it denies, and its colours
-    (m, 3) at those it confirms.
-
-    A point behind the surface of the map is neither: both sides of a thin plate cannot be in one map.
+    (m, 3) at those it confirms; behind the surface of the map it is neither: both sides of a thin plate cannot be in
+    one map.
     """
     points = transformed(T, surface.points)
     samples = sample_map(volume, points)

@@ -1,27 +1,39 @@
-"""Fusion of many maps into one on disk, a range of space at a time.
+"""Fusion of many maps into one on disk, a range of space at a time, and its surface as 3D Tiles 1.1 (OGC 22-025r4).
 
 The world is cut into cells of 16x16x16 blocks, which are octree nodes and so have consecutive Morton codes. A range is
 a sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses a range by itself: it adds the maps
 that reach into it one after the other, writes the blocks as a map file and the surface of every cell as a tile. Blocks
 of other ranges that touch the range are fused along with it, for the triangles at its border, and left out of the file.
+
+The tiles are a tree of GLB files with levels of detail, whose leaves are the cells with their full surface. The surface
+of an inner tile is that of its children with the vertices in cubes of twice the size joined, so that all tiles have
+about as many triangles; a browser replaces a tile by its children when it comes near (refinement REPLACE).
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.geometry.mesh import Mesh, joined
+from dudmap.core.geometry.mesh_simplification import clustered
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.fleet.fused_range import FusedRange
-from dudmap.fleet.inputs import MapHeader
-from dudmap.fleet.map_fusion import RangeFusion, ReachedBlocks
-from dudmap.fleet.open_maps import open_map, reached_blocks
-from dudmap.fleet.tiles import Tile, write_tile
-from dudmap.fleet.workers import Workers
+from dudmap.fleet.map_fusion import FusedRange, ReachedBlocks, fused_blocks
+from dudmap.fleet.workers import MapHeader, Workers, open_map, reached_blocks
+from dudmap.io.exporting.mesh_files import encoded
+
+TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
+T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn: a tile then has the axes of the map, x to
+the right and y down. The tileset, which is z up, is turned by the same matrix."""
+BITS_PER_LEVEL = 3
 
 CELL_BITS = 12
 """Bits of the code of a block within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""
@@ -30,6 +42,114 @@ RANGE_BLOCKS = 6000
 MAP_FOLDER = "map"
 """Folder of the map files of the ranges."""
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """A tile that was written.
+
+    Attributes:
+        name: Its file is tiles/<name>.glb.
+        height: Levels below it, 0 of a leaf.
+        low, high: (3,) corners of its surface, metres, world frame.
+        triangles: Their number.
+        children: Tiles that replace it.
+    """
+
+    name: str
+    height: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    triangles: int
+    children: tuple["Tile", ...] = ()
+
+
+def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
+    """Write the GLB file of a tile, and its mesh for its parent."""
+    write_bytes(out / TILE_FOLDER / f"{name}.glb", encoded(mesh, T_GLTF_MAP))
+    mesh.save(work / f"{name}.ply")
+    low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
+    for child in children:  # joined vertices are means and lie inside, but for rounding
+        low, high = np.minimum(low, child.low), np.maximum(high, child.high)
+    return Tile(name, height, low, high, len(mesh.faces), children)
+
+
+def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path, workers: Workers) -> Tile:
+    """Write all inner tiles above some leaves, whose names are the hexadecimal codes of their cells; returns the
+    root."""
+    done = {leaf.name: leaf for leaf in leaves}
+    inner = _inner_nodes(sorted(int(leaf.name, 16) for leaf in leaves))
+    for height in sorted({height for height, _, _ in inner}):
+        parents = [(name, tuple(done[c] for c in children)) for level, name, children in inner if level == height]
+        for tile in workers.map(partial(_write_parent, voxel_size, out, work), parents):
+            done[tile.name] = tile
+    return done[inner[-1][1]] if inner else leaves[0]
+
+
+def error_of(height: int, voxel_size: float) -> float:
+    """Geometric error of a tile, metres: how far joining moved its vertices at most.
+
+    A vertex moves by less than the diagonal of its cube, ``sqrt(3) s 2^h``; the errors of all levels below together are
+    less than this again.
+    """
+    return 0.0 if height == 0 else 2 * np.sqrt(3) * voxel_size * 2**height
+
+
+def write_tileset(root: Tile, voxel_size: float, out: Path) -> None:
+    """Write tileset.json."""
+    top = _tile_tree(root, voxel_size)
+    top["transform"] = T_GLTF_MAP.T.reshape(-1).tolist()
+    whole = max(float(np.linalg.norm(root.high - root.low)), 2 * top["geometricError"])
+    tree = {"asset": {"version": "1.1", "generator": "dudmap"}, "geometricError": whole, "root": top}
+    write_text(out / TILESET_FILE, json.dumps(tree, indent=1) + "\n")
+
+
+def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:
+    middle, half = (tile.low + tile.high) / 2, (tile.high - tile.low) / 2
+    out: dict[str, Any] = {
+        "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).reshape(-1).tolist()]},
+        "geometricError": error_of(tile.height, voxel_size),
+        "refine": "REPLACE",
+        "content": {"uri": f"{TILE_FOLDER}/{tile.name}.glb"},
+    }
+    if tile.children:
+        out["children"] = [_tile_tree(child, voxel_size) for child in tile.children]
+    return out
+
+
+def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
+    """Inner nodes of the octree above cells, as height, name and names of the children; children come first. A node
+    with a single child is left out.
+    """
+    out: list[tuple[int, str, list[str]]] = []
+
+    def node(part: list[int]) -> tuple[int, str]:
+        if len(part) == 1:
+            return 0, f"{part[0]:013x}"
+        level = 1
+        while part[0] >> (BITS_PER_LEVEL * level) != part[-1] >> (BITS_PER_LEVEL * level):
+            level += 1
+        groups: dict[int, list[int]] = {}
+        for cell in part:
+            groups.setdefault(cell >> (BITS_PER_LEVEL * (level - 1)), []).append(cell)
+        below = [node(group) for group in groups.values()]
+        height, name = 1 + max(height for height, _ in below), f"{part[0]:013x}-{level}"
+        out.append((height, name, [child for _, child in below]))
+        return height, name
+
+    node(cells)
+    return out
+
+
+def _write_parent(voxel_size: float, out: Path, work: Path, parent: tuple[str, tuple[Tile, ...]]) -> Tile:
+    """Write an inner tile of a name and children."""
+    name, children = parent
+    height = 1 + max(child.height for child in children)
+    whole = joined([Mesh.load(work / f"{child.name}.ply") for child in children])
+    mesh = clustered(whole, voxel_size * 2**height)
+    if len(mesh.faces) == 0:  # all of it is smaller than a cube
+        mesh = whole
+    return write_tile(mesh, name, height, out, work, children)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +196,10 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
 
 
 def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
-    """Fuse a range, write its map file and the tiles of its cells.
+    """Fuse a range, write its map file and the tiles of its cells, and for the tiles' parents their meshes into
+    ``work``.
 
-    Args:
-        like: Parameters of the result.
-        out: Folder of the world.
-        work: Folder of files that are needed until the merge ends.
-        cells: The range.
-
-    Returns:
-        The entry of the range in world.json, and the tiles.
+    The parameters of the result are those of ``like``. Returns the entry of the range in world.json, and the tiles.
     """
     empty_map = like.volume()
     low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS
@@ -95,13 +209,14 @@ def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tupl
     empty = np.setdiff1d(_union([one.empty for one in inside]), near)
     touching = np.setdiff1d(np.unique(_with_neighbours(near, 0)), near)
     halo = np.intersect1d(touching[(touching < low) | (touching >= high)], _union([one.near for one in reached]))
-    fusion = RangeFusion(np.union1d(near, halo), empty, empty_map)
     wanted = _union([near, halo, empty])
-    for run, one in zip(cells.runs, reached, strict=True):
-        part = ReachedBlocks(np.intersect1d(one.near, wanted), np.intersect1d(one.empty, wanted))
-        if len(part.near) or len(part.empty):
-            fusion.add(open_map(run.folder), run.T_world_run, part)
-    fused = fusion.fused()
+    parts = [ReachedBlocks(*(np.intersect1d(codes, wanted) for codes in (one.near, one.empty))) for one in reached]
+    maps = (
+        (open_map(run.folder), run.T_world_run, part)
+        for run, part in zip(cells.runs, parts, strict=True)
+        if len(part.near) or len(part.empty)
+    )
+    fused = fused_blocks(np.union1d(near, halo), empty, empty_map, maps)
     own = fused.chosen((fused.codes >= low) & (fused.codes < high))
     name = f"{MAP_FOLDER}/{cells.first:013x}.npz"
     own.volume(empty_map).save(out / name)

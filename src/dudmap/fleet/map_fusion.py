@@ -1,28 +1,246 @@
-"""Fusion of maps with known relative poses, a range of blocks at a time.
+"""Fusion of maps with known relative poses, a range of blocks at a time: sums of integers, divided and rounded once.
 
-A range is all blocks whose Morton codes lie between two numbers. It is fused on its own, from sums to which the maps
-are added one after the other in any order, so that neither all maps nor the whole result need to be in memory.
+The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, and a weighted mean of several maps is the
+quotient of two sums: ``sdf = sum(w_i sdf_i) / sum(w_i)``. The sums are integers, so that any order and any grouping of
+the maps give the same voxels. A range is all blocks whose Morton codes lie between two numbers; neither all maps nor
+the whole result need to be in memory.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.backends.cpu.points import COLUMNS, EMPTY, INTENSITY, OBSERVED, RED, SDF, UNSEEN, WEIGHT, sample_points
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.voxel_blocks import BLOCK
-from dudmap.errors import ConfigError
-from dudmap.fleet.block_sums import MAX_COUNT, PROBES, VOXELS, BlockSums, block_sums, empty_counts, fused
-from dudmap.fleet.fused_range import FusedRange, joined
+from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
+VOXELS = BLOCK**3
+MAX_COUNT = 255
+"""Largest weight of a voxel and number of observations of emptiness of a block."""
+MAX_STEPS = 32767
+"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
+_LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
+PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+"""Points (27, 3) of a block, in voxels."""
 RANGE_BLOCKS = 4096
 """Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
 BATCH = 512
 """Blocks of a map that are sampled at a time: about 50 MB of samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class FusedRange:
+    """Blocks of the result.
+
+    Attributes:
+        codes: (n,) int64 Morton codes.
+        has_voxels: (n,) bool; the others were seen to be empty.
+        free_count: (n,) uint8 observations of emptiness.
+        geometry, colors: (m, 512) int32 packed voxels of the blocks that have some, in the same order.
+    """
+
+    codes: NDArray[np.int64]
+    has_voxels: NDArray[np.bool_]
+    free_count: NDArray[np.uint8]
+    geometry: NDArray[np.int32]
+    colors: NDArray[np.int32]
+
+    def chosen(self, keep: NDArray[np.bool_]) -> "FusedRange":
+        """Some of the blocks (n,)."""
+        rows = keep[self.has_voxels]
+        return FusedRange(
+            self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
+        )
+
+    @classmethod
+    def of(cls, volume: TsdfVolume) -> "FusedRange":
+        """All blocks of a map."""
+        blocks, n = volume.blocks, volume.blocks.num_entries
+        has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
+        codes = morton.encode(blocks.coords[:n])
+        return cls(codes, has_voxels, blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots])
+
+    def volume(self, like: TsdfVolume) -> TsdfVolume:
+        """The blocks as a map with the camera and the parameters of another."""
+        out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
+        entries = np.flatnonzero(self.has_voxels).astype(np.int32)
+        coords = morton.decode(self.codes)
+        out.blocks = VoxelBlocks.restored(coords, self.free_count, entries, self.geometry, self.colors)
+        return out
+
+
+def joined(parts: Sequence[FusedRange]) -> FusedRange:
+    """Blocks of several ranges, which have none in common."""
+    names = FusedRange.__dataclass_fields__
+    return FusedRange(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSums:
+    """Sums over maps of the content of n blocks.
+
+    Attributes:
+        coords: (n, 3) int32 coordinates of the blocks.
+        weight, distance: (n, 512) int64, sum of the weights, and of weight times distance in steps.
+        shade_weight, shade: (n, 512) int64, the same of the intensities 1..255.
+        color_weight, color: (n, 512) and (n, 512, 3) int64, the same of the colours in quarters of a grey level.
+        free: (n,) int64, observations of emptiness of maps in which the block has no voxels.
+    """
+
+    coords: NDArray[np.int32]
+    weight: NDArray[np.int64]
+    distance: NDArray[np.int64]
+    shade_weight: NDArray[np.int64]
+    shade: NDArray[np.int64]
+    color_weight: NDArray[np.int64]
+    color: NDArray[np.int64]
+    free: NDArray[np.int64]
+
+    @classmethod
+    def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
+        """Sums over no map."""
+        n = len(coords)
+        shapes = *[(n, VOXELS)] * 5, (n, VOXELS, 3), (n,)
+        return cls(coords, *(np.zeros(shape, np.int64) for shape in shapes))
+
+    def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
+        """Sums over some of the blocks."""
+        return BlockSums(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def add(self, rows: NDArray[np.intp], other: "BlockSums") -> None:
+        """Add sums over the same blocks as ``rows`` (k,) of these."""
+        assert np.array_equal(self.coords[rows], other.coords)
+        for name in list(self.__dataclass_fields__)[1:]:
+            getattr(self, name)[rows] += getattr(other, name)
+
+
+def block_sums(
+    volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None, sdf_unit: float
+) -> BlockSums:
+    """Content of one map at blocks (n, 3) of a grid with voxels of the same size, distances in steps of ``sdf_unit``
+    metres.
+
+    ``T_volume_grid`` (4, 4) brings the world of the grid to that of the map, whose content is interpolated trilinearly;
+    None if the grid is that of the map, whose words are taken as they are.
+    """
+    if T_volume_grid is None:
+        return _exact_sums(volume, coords)
+    voxels = (coords[:, None].astype(np.float64) * BLOCK + _LOCAL).reshape(-1, 3)
+    rows, states = _samples(volume, voxels, T_volume_grid)
+    states, rows = states.reshape(-1, VOXELS), rows.reshape(-1, VOXELS, COLUMNS)
+    known = (states != UNSEEN) & np.any(states == OBSERVED, axis=1)[:, None]
+    weight = np.where(known, np.minimum(np.rint(rows[..., WEIGHT]), MAX_COUNT), 0).astype(np.int32)
+    distance = np.rint(rows[..., SDF] * np.float32(volume.sdf_unit / sdf_unit)).astype(np.int32)
+    shade = np.rint(rows[..., INTENSITY]).astype(np.int32)
+    color = np.rint(rows[..., RED : RED + 3]).astype(np.int32)
+    return _sums(coords, weight, distance, shade, color, _least_emptiness(volume, rows, states))
+
+
+def empty_counts(
+    volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None
+) -> NDArray[np.int64]:
+    """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``.
+
+    On another grid a block is empty if ``PROBES`` of it are: a part of it that the map never saw can be missed if it is
+    smaller than half a block.
+    """
+    if T_volume_grid is None:
+        entries = hashing.find_all(volume.blocks.table, volume.blocks.coords, coords)
+        return np.where(entries >= 0, volume.blocks.free_count[np.maximum(entries, 0)], 0).astype(np.int64)
+    rows, states = _samples(volume, (coords[:, None].astype(np.float64) * BLOCK + PROBES).reshape(-1, 3), T_volume_grid)
+    return _least_emptiness(volume, rows.reshape(len(coords), -1, COLUMNS), states.reshape(len(coords), -1))
+
+
+def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
+    """Content of blocks (n, 3) of a map as it is."""
+    blocks, slots = volume.blocks, volume.slots_at(coords)
+    held = slots >= 0
+    words = np.where(held[:, None], blocks.geometry[np.maximum(slots, 0)], 0)
+    colors = np.where(held[:, None], blocks.colors[np.maximum(slots, 0)], 0)
+    channels = np.stack([(colors >> shift) & 0x3FF for shift in (20, 10, 0)], axis=-1)
+    free = np.where(held, 0, empty_counts(volume, coords, None))
+    return _sums(coords, (words >> 8) & 0xFF, words >> 16, words & 0xFF, channels, free)
+
+
+def _samples(
+    volume: TsdfVolume, voxels: NDArray[np.float64], T_volume_grid: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """``sample_points`` of a map at voxels (n, 3) of a grid."""
+    blocks, motion = volume.blocks, T_volume_grid[:3].copy()
+    motion[:, 3] /= volume.voxel_size
+    return sample_points(
+        blocks.table, blocks.coords, blocks.slot_of, blocks.free_count, blocks.geometry, blocks.colors, voxels, motion,
+        volume.truncation / volume.sdf_unit, float(volume.config.carve_rate),
+    )  # fmt: skip
+
+
+def _least_emptiness(volume: TsdfVolume, rows: NDArray[np.float32], states: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Observations of emptiness (n,) of blocks of whose points (n, k) all lie in blocks without voxels, 0 of others."""
+    empty = np.all(states == EMPTY, axis=1)
+    least = np.rint(rows[..., WEIGHT].min(axis=1) / volume.config.carve_rate)
+    return np.where(empty, least, 0).astype(np.int64)
+
+
+def _sums(
+    coords: NDArray[np.int32],
+    weight: NDArray[np.int32],
+    distance: NDArray[np.int32],
+    shade: NDArray[np.int32],
+    color: NDArray[np.int32],
+    free: NDArray[np.int64],
+) -> BlockSums:
+    """Sums of a single map from its values; an intensity or colour of 0 is unknown."""
+    wide = weight.astype(np.int64)
+    shade_weight = wide * (shade > 0)
+    color_weight = wide * np.any(color > 0, axis=-1)
+    return BlockSums(
+        coords, wide, wide * distance, shade_weight, shade_weight * shade, color_weight,
+        color_weight[..., None] * color, free,
+    )  # fmt: skip
+
+
+def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
+    """Divide the sums once.
+
+    Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps``, the
+    truncation distance in steps, with the weight ``carve_rate`` per observation, so that what stood in one run and was
+    gone in the others leaves the map. A block that is then empty everywhere, by ``free_after`` observations, loses its
+    voxels.
+    """
+    held = np.any(sums.weight > 0, axis=1)
+    emptiness = (carve_rate * sums.free * held)[:, None]
+    weight = sums.weight.astype(np.int64) + emptiness
+    distance = _rounded(sums.distance + free_steps * emptiness, weight)
+    shade = _rounded(sums.shade, sums.shade_weight)
+    channels = _rounded(sums.color, sums.color_weight[..., None])
+    distance = np.clip(distance, -MAX_STEPS, MAX_STEPS)
+    packed = (distance << 16) | (np.minimum(weight, MAX_COUNT) << 8) | shade
+    colors = (channels[..., 0] << 20) | (channels[..., 1] << 10) | channels[..., 2]
+    least = weight.min(axis=1) // carve_rate
+    empty = held & (least >= free_after) & np.all(distance * 10 >= 9 * free_steps, axis=1)
+    count = np.where(held, np.where(empty, least, 0), sums.free)
+    has_voxels = held & ~empty
+    known = (weight > 0)[has_voxels]
+    return FusedRange(
+        morton.encode(sums.coords),
+        has_voxels,
+        np.minimum(count, MAX_COUNT).astype(np.uint8),
+        np.where(known, packed[has_voxels], 0).astype(np.int32),
+        np.where(known, colors[has_voxels], 0).astype(np.int32),
+    )
+
+
+def _rounded(total: NDArray, weight: NDArray) -> NDArray:
+    """``total / weight`` to the nearest whole number, halves up; 0 without weight."""
+    weight = np.broadcast_to(weight, total.shape)
+    divisor = np.where(weight > 0, weight, 1)
+    return np.where(weight > 0, (2 * total + divisor) // (2 * divisor), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,57 +282,45 @@ class ReachedBlocks:
         return ReachedBlocks(*(part[slice(*np.searchsorted(part, [low, high]))] for part in (self.near, self.empty)))
 
 
-class RangeFusion:
-    """Sums over maps in some blocks; any order of the maps gives the same result.
+def fused_blocks(
+    near: NDArray[np.int64],
+    empty: NDArray[np.int64],
+    like: TsdfVolume,
+    maps: Iterable[tuple[TsdfVolume, NDArray[np.float64], ReachedBlocks]],
+) -> FusedRange:
+    """Fusion of maps, one after the other in any order, in some blocks by their Morton codes.
 
-    Args:
-        near: (n,) Morton codes of blocks that voxels of at least one map reach into.
-        empty: (m,) those of other blocks that are empty in at least one map.
-        like: Map whose camera and parameters the result has.
+    Voxels of at least one map reach into the blocks ``near`` (n,); the other blocks ``empty`` (m,) are empty in at
+    least one. The result has camera and parameters of the map ``like``. Each of the ``maps`` comes with its pose
+    (4, 4), and enters by trilinear interpolation unless the voxels are the same.
     """
-
-    def __init__(self, near: NDArray[np.int64], empty: NDArray[np.int64], like: TsdfVolume) -> None:
-        self._near, self._empty, self._like = near, empty, like
-        self._sums = BlockSums.zeros(morton.decode(near))
-        self._free = np.zeros(len(empty), np.int64)
-
-    def add(self, volume: TsdfVolume, T_world_volume: NDArray[np.float64], reached: ReachedBlocks) -> None:
-        """Add a map at a pose (4, 4), by trilinear interpolation unless the voxels are the same."""
-        motion = _grid_motion(volume, self._like, T_world_volume)
-        rows = np.flatnonzero(np.isin(self._near, np.union1d(reached.near, reached.empty), assume_unique=True))
+    sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
+    for volume, T, reached in maps:
+        same = np.array_equal(T, np.eye(4)) and volume.sdf_unit == like.sdf_unit
+        motion = None if same else se3.inverse(T)
+        rows = np.flatnonzero(np.isin(near, np.union1d(reached.near, reached.empty), assume_unique=True))
         for part in _batches(rows):
-            self._sums.add(part, block_sums(volume, self._sums.coords[part], motion, self._like.sdf_unit))
-        rows = np.flatnonzero(np.isin(self._empty, reached.empty, assume_unique=True))
+            sums.add(part, block_sums(volume, sums.coords[part], motion, like.sdf_unit))
+        rows = np.flatnonzero(np.isin(empty, reached.empty, assume_unique=True))
         for part in _batches(rows):
-            self._free[part] += empty_counts(volume, morton.decode(self._empty[part]), motion)
-
-    def fused(self) -> FusedRange:
-        """Divide the sums."""
-        like = self._like
-        free_steps = round(like.truncation / like.sdf_unit)
-        parts = [
-            fused(self._sums.rows(part), free_steps, like.config.carve_rate, like.config.free_after)
-            for part in _batches(np.arange(len(self._near)))
-        ]
-        none, free = np.zeros((0, VOXELS), np.int32), np.minimum(self._free, MAX_COUNT).astype(np.uint8)
-        out = joined([*parts, FusedRange(self._empty, np.zeros(len(self._empty), bool), free, none, none)])
-        return out.chosen(out.has_voxels | (out.free_count > 0))
+            free[part] += empty_counts(volume, morton.decode(empty[part]), motion)
+    free_steps = round(like.truncation / like.sdf_unit)
+    parts = [
+        fused(sums.rows(part), free_steps, like.config.carve_rate, like.config.free_after)
+        for part in _batches(np.arange(len(near)))
+    ]
+    none, counts = np.zeros((0, VOXELS), np.int32), np.minimum(free, MAX_COUNT).astype(np.uint8)
+    out = joined([*parts, FusedRange(empty, np.zeros(len(empty), bool), counts, none, none)])
+    return out.chosen(out.has_voxels | (out.free_count > 0))
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """One map of several, on the grid of the first.
+    """One map of several with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the
+    first.
 
     A map whose pose is the identity enters voxel by voxel, others by trilinear interpolation. The sums are exact: on
     the same grid any order gives the same voxels.
-
-    Args:
-        volumes: The maps; the result has the camera and the parameters of the first.
-        Ts_world_volume: Pose (4, 4) of each in the world of the result.
-
-    Raises:
-        ConfigError: The voxels differ in size.
     """
-    check_voxel_sizes(volumes)
     reached = [ReachedBlocks.of_volume(*one) for one in zip(volumes, Ts_world_volume, strict=True)]
     near = np.unique(np.concatenate([one.near for one in reached]))
     borders = [0, *near[RANGE_BLOCKS::RANGE_BLOCKS].tolist(), np.iinfo(np.int64).max]
@@ -123,32 +329,9 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
         inside = [one.within(low, high) for one in reached]
         here = near[slice(*np.searchsorted(near, [low, high]))]
         empty = np.setdiff1d(np.concatenate([one.empty for one in inside]), here)
-        fusion = RangeFusion(here, empty, volumes[0])
-        for volume, T, one in zip(volumes, Ts_world_volume, inside, strict=True):
-            fusion.add(volume, T, one)
-        parts.append(fusion.fused())
+        parts.append(fused_blocks(here, empty, volumes[0], zip(volumes, Ts_world_volume, inside, strict=True)))
     return joined(parts).volume(volumes[0])
-
-
-def check_voxel_sizes(volumes: Sequence[TsdfVolume]) -> None:
-    """Maps with voxels of different sizes have no common grid.
-
-    Raises:
-        ConfigError: They differ.
-    """
-    sizes = sorted({round(volume.voxel_size, 9) for volume in volumes})
-    if len(sizes) > 1:
-        found = " and ".join(f"{size:g}" for size in sizes)
-        raise ConfigError(f"maps with voxels of {found} m cannot be merged; repeat one run with the other's voxel_size")
 
 
 def _batches(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     return [rows[start : start + BATCH] for start in range(0, len(rows), BATCH)]
-
-
-def _grid_motion(
-    volume: TsdfVolume, like: TsdfVolume, T_world_volume: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """World of the result to that of a map (4, 4); None where the voxels are the same."""
-    same = np.array_equal(T_world_volume, np.eye(4)) and volume.sdf_unit == like.sdf_unit
-    return None if same else se3.inverse(T_world_volume)

@@ -84,14 +84,10 @@ class SurfacePoints:
         return len(self.points)
 
 
-def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int, seed: int = 1) -> SurfacePoints:
+def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int) -> SurfacePoints:
     """At most ``count`` random vertices of the mesh of a map, which lie about evenly on its surface.
 
-    Args:
-        volume: The map.
-        cameras: (k, 3) positions of its keyframes, metres.
-        count: Largest number of points.
-        seed: Of the choice.
+    ``cameras`` (k, 3) are the positions of its keyframes, metres.
 
     Raises:
         MapError: The map is empty.
@@ -99,7 +95,7 @@ def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int,
     mesh = volume.extract_mesh()
     chosen = np.arange(len(mesh.vertices))
     if len(chosen) > count:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(chosen), count, replace=False))
+        chosen = np.sort(np.random.default_rng(1).choice(len(chosen), count, replace=False))
     points = mesh.vertices[chosen].astype(np.float64)
     samples = sample_map(volume, points)
     distances = KDTree(cameras).query(points)[0] if len(cameras) else np.full(len(points), np.inf)

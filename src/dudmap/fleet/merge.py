@@ -1,11 +1,11 @@
-"""Merging of many run folders into worlds: maps by range, tiles, trajectories, and a report."""
+"""Merging of run folders: two maps of one place into a run folder, many into worlds of map parts and tiles."""
 
 import json
 import re
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,24 +13,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
+from dudmap.app.pipeline.environment import machine, versions
+from dudmap.app.pipeline.run_folder import locked, prepare_run_folder
+from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map import morton
-from dudmap.core.map.volume import TsdfVolume
-from dudmap.errors import DudmapError, MapError
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+from dudmap.errors import DatasetError, DudmapError, MapError
 from dudmap.extras import need
-from dudmap.fleet.block_sums import MAX_COUNT, VOXELS
-from dudmap.fleet.fused_range import FusedRange, joined
-from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, fuse_range, planned_ranges
-from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.fusion import (
+    MAP_FOLDER,
+    TILE_FOLDER,
+    TILESET_FILE,
+    PlacedRun,
+    fuse_range,
+    planned_ranges,
+    write_tileset,
+    write_tree,
+)
+from dudmap.fleet.map_fusion import MAX_COUNT, VOXELS, FusedRange
+from dudmap.fleet.map_merging import compare_maps, merged_map
 from dudmap.fleet.map_samples import sample_map
-from dudmap.fleet.registration import RegisteredPair
-from dudmap.fleet.rounds import registered_runs
+from dudmap.fleet.registration import RegisteredPair, registered_runs
 from dudmap.fleet.run_graph import RunGraph
-from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
-from dudmap.fleet.two_runs import save_trajectories
-from dudmap.fleet.workers import Workers
-from dudmap.input_files import DAMAGE, describe, read_json
+from dudmap.fleet.workers import MapHeader, Workers, check_runs
+from dudmap.input_files import damaged, read_bytes, read_json
 from dudmap.own_folder import remove_files
+
+MERGE_FILE = "merge.json"
 
 WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
 WORK_FOLDER = ".work"
@@ -39,6 +49,74 @@ WRITTEN = {
     MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
 }  # fmt: skip
 """Names of all files of a world by sub-folder, as regular expressions. They are removed before the next merge."""
+
+
+def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
+    """Join the maps of two run folders into a new run folder, in the world frame of the first.
+
+    The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
+    runs in the common world frame (trajectory.txt, trajectory-2.txt, ...), merge.json: the runs, the relative pose
+    and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is
+    written if the maps are not to be joined.
+
+    Returns:
+        Content of merge.json.
+
+    Raises:
+        MapError: The maps are not to be joined; the message says why.
+        DudmapError: As of ``check_runs``, or ``out`` cannot be written.
+    """
+    a, b, out = Path(a), Path(b), Path(out)
+    check_runs([a, b], out)
+    maps = SavedMap.load(a), SavedMap.load(b)
+    pair = compare_maps(*maps)
+    if pair.T_a_b is None:
+        raise MapError(f"{a} and {b} are not merged: {pair.reason}")
+    merged = merged_map(*maps, pair.T_a_b)
+    with locked(out):
+        prepare_run_folder(out, None, save_masks=False)
+        of_a, of_b = save_trajectories(out, [(a, np.eye(4)), (b, pair.T_a_b)])
+        merged.volume.save(out / MAP_FILE)
+        merged.save_keyframes(out / KEYFRAME_FILE)
+        mesh = merged.volume.extract_mesh()
+        mesh.save(out / "mesh.ply")
+        if (a / "config.toml").is_file():
+            write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
+        tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": of_a + of_b} | pair.tree()
+        sizes = {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
+        sizes |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
+        finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
+        tree |= sizes | {"finer_blocks_left_out": sum(finer)}
+        poses = sum(len(Trajectory.load(out / name)) for name in tree["trajectories"])
+        metrics: dict[str, Any] = {"sequence": f"{a.name} and {b.name}", "complete": True}
+        metrics |= {"frames": poses, "tracked": poses}
+        metrics |= sizes | {"camera": asdict(merged.volume.camera), "versions": versions(), "machine": machine()}
+        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+        write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
+    return tree
+
+
+def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]]) -> list[list[str]]:
+    """Write the trajectories of runs, moved by the poses (4, 4) of their worlds, as trajectory.txt, trajectory-2.txt,
+    ...; names of the files of each run, since a merged run has several.
+
+    Raises:
+        DatasetError: A trajectory, or the list of them in merge.json, is damaged.
+    """
+    names: list[list[str]] = []
+    for folder, T in runs:
+        known = ["trajectory.txt"]
+        if (folder / MERGE_FILE).is_file():
+            with damaged(DatasetError, folder / MERGE_FILE):
+                known = read_json(folder / MERGE_FILE)["trajectories"]
+                if not all(re.fullmatch(r"trajectory(-\d+)?\.txt", name) for name in known):
+                    raise ValueError(f"it names {known} as its trajectories")
+        first = 1 + sum(map(len, names))
+        names.append([f"trajectory-{n}.txt" if n > 1 else "trajectory.txt" for n in range(first, first + len(known))])
+        for source, name in zip(known, names[-1], strict=True):
+            found = Trajectory.load(folder / source)
+            Trajectory(found.timestamps, T @ found.Ts_world_camera).save(out / name)
+    return names
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,56 +182,12 @@ def merge_fleet(
             if number == 1:
                 tree = world
             else:
-                _write_json(folder / WORLD_FILE, world)
+                write_text(folder / WORLD_FILE, json.dumps(world, indent=1) + "\n")
         times["total_s"] = round(time.perf_counter() - started, 2)
         tree |= {"compared_pairs": len(pairs), "workers": workers, "cpu_s": round(crew.cpu_s, 1)} | times
         tree["peak_rss_mb"] = sorted(crew.peak_rss_mb.values(), reverse=True)
-        _write_json(out / WORLD_FILE, tree)
+        write_text(out / WORLD_FILE, json.dumps(tree, indent=1) + "\n")
     return FleetReport(out, tree, pairs, graph, _sentences(graph, folders))
-
-
-def load_part(world: str | Path, low: NDArray[np.float64], high: NDArray[np.float64]) -> FusedRange:
-    """Blocks of a world in all ranges that touch a box, in order.
-
-    ``FusedRange.volume`` makes a map of them.
-
-    Args:
-        world: Folder of a world.
-        low, high: (3,) corners, metres.
-
-    Raises:
-        MapError: The folder holds no world, or nothing of it lies in the box.
-    """
-    tree = read_world(world)
-    touching = [
-        one
-        for one in tree["ranges"]
-        if np.all(np.array(one["low_m"]) <= high) and np.all(np.array(one["high_m"]) >= low)
-    ]
-    if not touching:
-        raise MapError(f"nothing of the world {world} lies in the box from {low.tolist()} to {high.tolist()} m")
-    return joined([FusedRange.of(TsdfVolume.load(Path(world) / one["file"])) for one in touching])
-
-
-def read_world(world: str | Path) -> dict[str, Any]:
-    """Content of world.json.
-
-    Raises:
-        MapError: It is missing, damaged or of another version, or names files that are not its own.
-    """
-    path = Path(world) / WORLD_FILE
-    try:
-        tree = read_json(path)
-        if tree.get("format") != FORMAT:
-            raise MapError(f"{path} has the format {tree.get('format')!r}; this version reads {FORMAT!r}")
-        for one in tree["ranges"]:
-            if not re.fullmatch(f"{MAP_FOLDER}/{WRITTEN[MAP_FOLDER]}", one["file"]):
-                raise ValueError(f"it names a map file {one['file']!r}; expected one of the folder {MAP_FOLDER}")
-            if np.array([one["low_m"], one["high_m"]], float).shape != (2, 3):
-                raise ValueError(f"the corners of {one['file']} are no two points")
-    except DAMAGE as error:
-        raise MapError(f"{world} holds no world of `dudmap merge`: {describe(error)}") from error
-    return tree
 
 
 def _write_world(
@@ -186,11 +220,7 @@ def _write_world(
 
 
 def _check_out(out: Path) -> None:
-    """Remove the world that a folder holds.
-
-    Raises:
-        DudmapError: It holds anything else, or cannot be written.
-    """
+    """Remove the world that a folder holds; a ``DudmapError`` if it holds anything else, or cannot be written."""
     try:
         if out.exists() and any(out.iterdir()):
             if not (out / WORLD_FILE).is_file():
@@ -242,8 +272,3 @@ def _sentences(graph: RunGraph, folders: Sequence[Path]) -> list[str]:
         names = ", ".join(f"{folders[join.a].name} and {folders[join.b].name}" for join in graph.rejected)
         out.append(f"{len(graph.rejected)} relative pose(s) contradict others and are not used: {names}")
     return out
-
-
-def _write_json(path: Path, tree: dict[str, Any]) -> None:
-    with atomic_file(path) as file:
-        file.write((json.dumps(tree, indent=1) + "\n").encode())

@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from dudmap.core.geometry import se3
 from dudmap.extras import extra
-from dudmap.fleet.smallest_cuts import best_cut
+
+Pair = tuple[int, int]
 
 SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
 """Standard deviation of a relative pose of two runs at the middle of their common surface (m, deg), per axis: drift
@@ -27,9 +30,49 @@ HALF = 0.5
 CHI_SQUARE = 22.46
 """99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, and
 of a relative pose, in standard deviations."""
-
 HUBER = 1.345
 """Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
+
+
+def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
+    """Edges that separate at least as many pairs ``apart`` as they are; of all minimum cuts the one with most pairs per
+    edge.
+
+    The minimum cut between two nodes is found by a maximum flow with one unit per edge (Ford and Fulkerson 1956), the
+    cut nearest to each of the two. No edge stands twice in ``edges``. Empty if there is none.
+    """
+    if not edges or not apart:
+        return set()
+    names, ends = np.unique(np.array([*edges, *apart]), return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    inside, outside = ends[: len(edges)], ends[len(edges) :]
+    capacity = _matrix(np.concatenate([inside, inside[:, ::-1]]), len(names))
+    connected = _labels(inside, len(names))
+    best, worth = set[int](), 0.0
+    for a, b in outside:
+        if connected[a] != connected[b]:
+            continue
+        left = csr_array(capacity - maximum_flow(capacity, a, b).flow)
+        left.eliminate_zeros()
+        for start, reached in ((a, left), (b, csr_array(left.T))):
+            side = np.zeros(len(names), bool)
+            side[breadth_first_order(reached, start, return_predecessors=False)] = True
+            cut = side[inside[:, 0]] != side[inside[:, 1]]
+            after = _labels(inside[~cut], len(names))
+            separated = np.sum((connected[outside[:, 0]] == connected[outside[:, 1]])
+                               & (after[outside[:, 0]] != after[outside[:, 1]]))  # fmt: skip
+            if separated >= cut.sum() and separated / cut.sum() > worth:
+                best, worth = set(np.flatnonzero(cut).tolist()), separated / cut.sum()
+    return best
+
+
+def _matrix(ends: np.ndarray, count: int) -> csr_array:
+    return csr_array((np.ones(len(ends), np.int32), (ends[:, 0], ends[:, 1])), shape=(count, count))
+
+
+def _labels(ends: np.ndarray, count: int) -> np.ndarray:
+    """Number of the component of each node."""
+    return connected_components(_matrix(ends, count), directed=False)[1]
 
 
 def drift_covariance(
@@ -97,12 +140,8 @@ class RunGraph:
 
 
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
-    """Poses of ``count`` runs.
-
-    Args:
-        count: Number of runs.
-        joins: Relative poses of pairs of them.
-        denied: Pairs of runs that disagree where these joins put them (``supported``).
+    """Poses of ``count`` runs from relative poses of pairs; ``denied`` pairs disagree where these put them
+    (``supported``).
 
     Raises:
         MissingExtraError: GTSAM is not installed.

@@ -41,7 +41,6 @@ class SdfAlignment:
         converged: Whether the last step was short and enough points lie on the surface of the other map.
         residual: Root mean square distance of the points, weighted as in the refinement, metres.
         stiffness: Least opposed direction over most opposed one, 0..1; see ``MIN_STIFFNESS``.
-        exposure: Gain and offset that bring the intensities of b to those of a.
         center: (3,) middle of the common surface in the world of a, metres.
     """
 
@@ -49,7 +48,6 @@ class SdfAlignment:
     converged: bool
     residual: float
     stiffness: float
-    exposure: tuple[float, float]
     center: NDArray[np.float64]
 
 
@@ -58,20 +56,16 @@ def align_maps(
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
-    Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a scale ``c`` that shrinks from step to step (as in
-    graduated non-convexity, Yang et al. 2020), intensities Huber weights.
-
-    Args:
-        a, b: The maps.
-        of_a, of_b: Points on their surfaces.
-        T_a_b: Initial pose, closer than the truncation distance.
+    It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
+    scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities Huber
+    weights.
     """
     exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
     center, scale = np.zeros(3), a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
         if len(rows.distance) < MIN_POINTS:
-            return SdfAlignment(T_a_b, False, residual, 0.0, exposure, center)
+            return SdfAlignment(T_a_b, False, residual, 0.0, center)
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
         weights = 1 / np.square(1 + np.square(rows.distance / scale))
         H, g = _normal_equations(rows.J_distance, rows.distance, weights)
@@ -89,7 +83,7 @@ def align_maps(
         if scale <= SCALE * a.voxel_size and at_points < STOP and np.linalg.norm(step[3:]) < STOP:
             converged = True
             break
-    return SdfAlignment(T_a_b, converged, residual, stiffness, exposure, center)
+    return SdfAlignment(T_a_b, converged, residual, stiffness, center)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,30 +1,155 @@
-"""Worker processes that do the jobs of a merge, and what they needed."""
+"""The runs of a merge: what is checked before anything is computed, the processes, and what each keeps of them."""
 
 import multiprocessing
 import os
 import time
+import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from types import TracebackType
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dudmap.app.pipeline.environment import peak_rss_mb
-from dudmap.errors import DudmapError
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.map_file import read_parameters
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.place_recognition import Keyframe
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap, load_keyframes
+from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.fleet.map_fusion import ReachedBlocks
+from dudmap.fleet.map_merging import MapSurface
+from dudmap.fleet.map_samples import SurfacePoints
+from dudmap.input_files import DAMAGE, open_arrays
+
+TRAJECTORY_FILE = "trajectory.txt"
+MAX_RUNS = 8000
+"""Largest number of runs: the sums of the fusion have 32 bits (``BlockSums``)."""
+
+OPEN_MAPS = 2
+"""Whole maps in memory: the two of a pair."""
+SMALL_PARTS = 32
+"""Runs whose keyframes (some MB), surface points (1 MB) or lists of blocks (some MB) are in memory."""
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
+@dataclass(frozen=True, eq=False)
+class MapHeader:
+    """What a map file says without its voxels.
+
+    Attributes:
+        camera, config, sensor, depth_max: Parameters of the volume.
+        coords: (n, 3) coordinates of its blocks.
+        has_voxels: (n,) bool, blocks that own voxels; the others are known to be empty.
+    """
+
+    camera: Camera
+    config: VolumeConfig
+    sensor: SensorConfig
+    depth_max: float
+    coords: NDArray[np.int32]
+    has_voxels: NDArray[np.bool_]
+
+    @classmethod
+    def read(cls, path: Path, *, blocks: bool = True) -> "MapHeader":
+        """Read a map file, whose voxels are not decompressed, with or without which ``blocks`` there are.
+
+        Raises:
+            MapError: The file is damaged or not a map of this version.
+        """
+        try:
+            with open_arrays(path) as data:
+                coords = data["coords"] if blocks else np.zeros((0, 3), np.int32)
+                has_voxels = np.zeros(len(coords), bool)
+                if blocks:
+                    has_voxels[data["entries"]] = True
+                return cls(*read_parameters(data, path), coords, has_voxels)
+        except DAMAGE as error:
+            raise MapError(f"{path} is not a readable map file: {error}") from error
+
+    def volume(self) -> TsdfVolume:
+        """Empty map with these parameters."""
+        return TsdfVolume(self.camera, self.config, self.sensor, self.depth_max)
+
+
+def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
+    """Check run folders that are to be merged, without reading their voxels; returns the parameters of the first map.
+
+    Raises:
+        ConfigError: There are too few or too many runs, one is named twice, or their voxels differ in size.
+        MapError: A run folder is incomplete or damaged.
+        DudmapError: ``out`` is one of the runs.
+    """
+    if not 2 <= len(runs) <= MAX_RUNS:
+        raise ConfigError(f"found {len(runs)} run folder(s) to merge; expected 2 to {MAX_RUNS}")
+    twice = [path for path, count in Counter(path.resolve() for path in runs).items() if count > 1]
+    if twice:
+        raise ConfigError(f"the run folder {twice[0]} is named twice; name every run once")
+    if out.resolve() in [path.resolve() for path in runs]:
+        raise DudmapError(f"{out} is one of the runs to be merged; name another folder")
+    for path in runs:
+        missing = [name for name in (MAP_FILE, KEYFRAME_FILE, TRAJECTORY_FILE) if not (path / name).is_file()]
+        if missing:
+            raise MapError(f"{path} holds no {' and no '.join(missing)}; name a complete run folder")
+        damaged = [name for name in (MAP_FILE, KEYFRAME_FILE) if not zipfile.is_zipfile(path / name)]
+        if damaged:
+            raise MapError(f"{path / damaged[0]} is cut off or damaged; repeat the run")
+    headers = [MapHeader.read(path / MAP_FILE, blocks=False) for path in runs]
+    sizes = [header.config.voxel_size for header in headers]
+    for path, size in zip(runs, sizes, strict=True):
+        if not np.isclose(size, sizes[0]):
+            raise ConfigError(
+                f"{runs[0]} has voxels of {sizes[0]:g} m and {path} of {size:g} m; repeat one with the other's "
+                "volume.voxel_size"
+            )
+    return headers[0]
+
+
+@lru_cache(maxsize=OPEN_MAPS)
+def open_map(run: Path) -> TsdfVolume:
+    """Map of a run."""
+    return TsdfVolume.load(run / MAP_FILE)
+
+
+@lru_cache(maxsize=SMALL_PARTS)
+def keyframes_of(run: Path) -> list[Keyframe]:
+    """Keyframes of a run."""
+    return load_keyframes(run / KEYFRAME_FILE)[0]
+
+
+def surface_of(run: Path) -> MapSurface:
+    """Map of a run with points on its surface."""
+    points = _points(run)  # opens the map if they are not known yet
+    return MapSurface(open_map(run), points)
+
+
+@lru_cache(maxsize=SMALL_PARTS)
+def _points(run: Path) -> SurfacePoints:
+    return MapSurface.of(SavedMap(open_map(run), keyframes_of(run))).points
+
+
+@lru_cache(maxsize=SMALL_PARTS)
+def reached_blocks(run: Path, pose: bytes) -> ReachedBlocks:
+    """Blocks of the world that a run reaches; ``pose`` are the 128 bytes of its pose (4, 4)."""
+    header = MapHeader.read(run / MAP_FILE)
+    T = np.frombuffer(pose).reshape(4, 4)
+    return ReachedBlocks.of(header.coords, header.has_voxels, T, header.volume().block_size)
+
+
 class Workers:
     """Processes with one thread each; a single one is this process.
 
-    Args:
-        count: Number of processes.
-
-    Attributes:
-        peak_rss_mb: Peak memory of each process so far, by its id; empty on Windows.
-        cpu_s: Processor time of all jobs.
+    ``peak_rss_mb`` is the peak memory of each so far, by its id, empty on Windows; ``cpu_s`` the processor time of all
+    jobs.
     """
 
     def __init__(self, count: int) -> None:
@@ -37,9 +162,7 @@ class Workers:
     def __enter__(self) -> "Workers":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 

@@ -1,4 +1,4 @@
-"""Calibration of a whole recording."""
+"""Calibration of a whole recording, and what is known of its colour camera, in sentences."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -7,16 +7,23 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from dudmap.app.pipeline.calibration_report import ASSUMED, findings
 from dudmap.app.pipeline.frame_source import read_ahead
 from dudmap.config import Config
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.threads import num_threads
-from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate, mask_of
+from dudmap.core.calibration.estimator import (
+    EVIDENCE,
+    GROUPS,
+    MIN_PAIRS,
+    TRANSLATION,
+    CalibrationEstimator,
+    Estimate,
+    mask_of,
+)
 from dudmap.core.calibration.keyframes import KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.pyramid import HALVING_BAND
-from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.calibration import PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import is_timed
@@ -26,13 +33,26 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from dudmap.core.calibration.estimator import Estimate
     from dudmap.io.sequences import Sequence
 
+UNITS = {
+    "translation": ("mm", 1000.0),
+    "rotation": ("deg", 57.29578),
+    "log_focal": ("%", 100.0),
+    "center": ("px", 1.0),
+    "k1": ("", 1.0),
+    "k2": ("", 1.0),
+    "delay": ("ms", 1000.0),
+    "readout": ("ms", 1000.0),
+}
+"""Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
+ASSUMED = "assumed as given, not tested"
+"""What is said of a colour camera that no image was asked about."""
 
 START_FRAMES, MIN_FRAMES = 300, 90
 """Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
 estimator compares pairs of keyframes from both halves of the time."""
-
 WIDTH, INTERVAL = 320, 1 / 30
 """Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
 at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
@@ -46,25 +66,62 @@ VOXEL_SIZE = 0.02
 """Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
 
 
+def kind_of(parameter: str) -> str:
+    """The kind of a parameter, a key of ``UNITS``: all axes of a translation are one kind."""
+    return parameter.rpartition("_")[0] if parameter[-2:] in ("_x", "_y", "_z") else parameter
+
+
+def findings(estimate: "Estimate") -> list[str]:
+    """One sentence per group of parameters: estimated, tested and kept, or assumed, and the standard deviations."""
+    out = []
+    for name, members in GROUPS.items():
+        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, name)
+        if np.isnan(evidence):
+            said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+        elif members[0] in estimate.calibration.estimated:
+            said = f"estimated; other images fit {evidence:.1f} standard errors better; standard deviations {known}"
+        elif evidence >= EVIDENCE:
+            said = (
+                f"assumed as given; tested: other values fit {evidence:.1f} standard errors better, but by too small a "
+                f"share to be used; standard deviations {known}"
+            )
+        else:
+            said = (
+                f"assumed as given; tested: other values are not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} "
+                f"are needed); standard deviations, if they are nearly right, {known}"
+            )
+        out.append(f"colour camera, {name}: {said}")
+    return out
+
+
+def _sigma(calibration: Calibration, group: str) -> str:
+    """Standard deviations of the parameters of a group, of several axes the largest, as text."""
+    largest: dict[str, float] = {}
+    for name, sigma in zip(PARAMETERS, calibration.sigma, strict=True):
+        if name in GROUPS[group] or (group == "geometry" and name in TRANSLATION):
+            largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), float(sigma))
+    said = []
+    for kind, sigma in largest.items():
+        unit, factor = UNITS[kind]
+        value = f"{factor * sigma:.2g} {unit}".strip() if np.isfinite(sigma) else "unknown"
+        said.append(f"{kind.replace('log_focal', 'focal length')} {value}")
+    return ", ".join(said)
+
+
 def calibrate_start(
     sequence: "Sequence",
     config: Config,
-    max_frames: int | None = None,
-    notice: "Callable[[str], None]" = lambda text: None,
-    progress: "Callable[[int, int], None]" = lambda done, total: None,
+    max_frames: int,
+    notice: "Callable[[str], None]",
+    progress: "Callable[[int, int], None]",
 ) -> Calibration | None:
-    """Calibration estimated from the start of a recording; None where none was made.
+    """Calibration estimated from the first frames of a recording; None where none was made, with the reason as a
+    notice.
 
-    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated.
-
-    Args:
-        sequence: The recording.
-        config: All parameters.
-        max_frames: Number of frames that will be processed; None for all.
-        notice: Receives sentences on what is being done, what was found, and what is assumed.
-        progress: Receives the number of frames tracked for it, and of all that will be.
+    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated. ``notice`` receives
+    sentences on what is done and found, ``progress`` the numbers of frames tracked and of all.
     """
-    count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
+    count = min(len(sequence), START_FRAMES, max_frames)
     if config.preset == "thesis" or count < MIN_FRAMES:
         thesis, short = "preset thesis takes the images as they are", f"that takes {MIN_FRAMES} frames"
         notice(f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else short}")
@@ -91,15 +148,8 @@ def calibrate_sequence(
 ) -> Estimate:
     """Track a recording quickly with the calibration as given, and estimate a better one.
 
-    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do.
-
-    Args:
-        sequence: The recording.
-        config: All parameters.
-        given: The calibration to start from.
-        max_frames: Use only so many frames.
-        notice: Receives a sentence on what is being done.
-        progress: Receives the number of frames tracked so far, and of all that will be.
+    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do. For
+    ``notice`` and ``progress`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -112,7 +162,7 @@ def calibrate_sequence(
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
     collector, submap = KeyframeCollector(small.calibration.camera, GAP * small.interval), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
-        for number, read in enumerate(frames, start=1):
+        for number, (_, read, *_) in enumerate(frames, start=1):
             progress(number, len(small))
             if isinstance(read.frame, FrameError) or read.prepared is None:
                 continue
@@ -146,13 +196,8 @@ def _quick(config: Config, halvings: int) -> Config:
 
 
 class _Excerpt:
-    """Frames of a recording around its keyframes, at an ``INTERVAL``, with images halved some times by 2x2 blocks.
-
-    Attributes:
-        camera: Of its depth images.
-        calibration: Of its colour images.
-        interval: Usual time between neighbours, seconds.
-    """
+    """Frames of a recording around its keyframes, at an ``INTERVAL`` (usually ``interval`` seconds), with images halved
+    some times by 2x2 blocks."""
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL

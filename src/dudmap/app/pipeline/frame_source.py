@@ -1,22 +1,27 @@
-"""Frames and masks of a recording, read ahead in order."""
+"""Frames and masks of a recording, read ahead in order, or of a camera as they arrive."""
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
-from dudmap.errors import FrameError
+from dudmap.errors import ConfigError, FrameError
+from dudmap.io.cameras import MAX_WAIT
+from dudmap.io.sequences.images import MaskFolder
 
 if TYPE_CHECKING:
     from dudmap.core.slam import Slam
     from dudmap.core.tracking.frame_view import FrameView
+    from dudmap.io.cameras import LiveCamera
+    from dudmap.io.cameras.recorder import Recorder
     from dudmap.io.sequences import Sequence
-    from dudmap.io.sequences.images import MaskFolder
 
 AHEAD = 4
 """Number of frames of a recording on disk that are read ahead of the processed one."""
@@ -28,7 +33,7 @@ class FrameRead(NamedTuple):
     Attributes:
         frame: The frame.
         true_mask: (H, W) true dynamic mask, None if unknown.
-        ms: Reading time of the frame, milliseconds.
+        ms: Reading time of the frame, milliseconds; 0 for a camera.
         given_mask: (H, W) external dynamic mask, None if there is none.
         prepared: The preprocessed frame, None unless the reader prepares frames.
     """
@@ -63,59 +68,140 @@ def read_ahead(
     masks: "MaskFolder | None" = None,
     slam: "Slam | None" = None,
     start: int = 0,
-) -> "Generator[FrameRead]":
-    """Frames ``start`` to ``count`` - 1 in order; one thread reads and prepares them, up to ``ahead`` frames ahead."""
+) -> Generator[SourceFrame]:
+    """Frames ``start`` to ``count`` - 1 in order; one thread reads, and with ``slam`` prepares them, up to ``ahead``
+    frames ahead."""
+
+    def read(index: int) -> SourceFrame:
+        begin = time.perf_counter()
+        try:
+            frame: Frame | FrameError = sequence[index]
+        except FrameError as error:
+            frame = error
+        ms = 1000 * (time.perf_counter() - begin)
+        return SourceFrame(index, _with_masks(frame, index, sequence, masks, slam if ahead else None, ms))
+
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
-    pending: deque[Future[FrameRead]] = deque()
+    pending: deque[Future[SourceFrame]] = deque()
     try:
         for index in range(start, count + ahead):
             if index < count:
-                pending.append(reader.submit(read_frame, sequence, index, masks, slam))
+                pending.append(reader.submit(read, index))
             if index >= start + ahead:
                 yield pending.popleft().result()
     finally:
         reader.shutdown(cancel_futures=True)
 
 
-def in_order(
-    sequence: "Sequence", count: int, ahead: int, masks: "MaskFolder | None", slam: "Slam", start: int = 0
-) -> "Generator[SourceFrame]":
-    """Frames of a recording in order, from number ``start`` on; none is dropped."""
-    frames = read_ahead(sequence, count, ahead, masks, slam if ahead else None, start)
-    for index, read in enumerate(frames, start):
-        yield SourceFrame(index, read)
+class FrameQueue:
+    """Thread-safe queue between a camera and its consumer: of the newest item and those at most ``MAX_WAIT`` older."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._held: list[SourceFrame] = []
+        self._closed = False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no item waits."""
+        return not self._held
+
+    def put(self, item: SourceFrame) -> None:
+        """Store a newer item; never blocks."""
+        with self._changed:
+            self._held = [held for held in self._held if item.arrival - held.arrival <= MAX_WAIT] + [item]
+            self._changed.notify()
+
+    def take(self) -> SourceFrame | None:
+        """Oldest item; waits for one that was not taken yet. None once the queue is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._held or self._closed)
+            return self._held.pop(0) if self._held else None
+
+    def close(self) -> None:
+        """Declare the end of the stream; stored items can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
 
 
-def load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
-    """Compile or load all kernels by processing the first frames with a system that is discarded afterwards."""
-    for index in range(min(count, 3)):
-        frame = read_frame(sequence, index).frame
-        if not isinstance(frame, FrameError):
-            slam.process(frame)
+def arriving(
+    camera: "LiveCamera",
+    slam: "Slam | None" = None,
+    masks: "MaskFolder | None" = None,
+    recorder: "Recorder | None" = None,
+    idle: Callable[[], bool] = lambda: False,
+) -> Generator[SourceFrame]:
+    """Frames of a camera, taken and prepared by a thread of their own; those for which the consumer leaves no room
+    (``FrameQueue``) are dropped and counted in the next one. The camera is closed at the end.
+
+    The ``recorder`` receives all frames, dropped or not. ``idle`` is called while no frame waits: it does a few
+    milliseconds of other work and returns True, or has none.
+
+    Raises:
+        CameraError: The camera stopped to deliver frames.
+    """
+    queue, stopping, last = FrameQueue(), threading.Event(), -1
+
+    def deliver() -> None:
+        first, latest = None, -np.inf
+        try:
+            while not stopping.is_set() and (arrived := camera.read()) is not None:
+                first = arrived.number if first is None else first
+                if isinstance(arrived.frame, Frame):
+                    if arrived.frame.timestamp <= latest:  # a driver may deliver a depth image twice
+                        continue
+                    latest = arrived.frame.timestamp
+                    if recorder is not None:
+                        recorder.put(arrived.frame)
+                read = _with_masks(arrived.frame, arrived.number, camera, masks, slam)
+                queue.put(SourceFrame(arrived.number - first, read, arrival=arrived.time))
+        finally:
+            queue.close()
+
+    with ThreadPoolExecutor(1, thread_name_prefix="dudmap-camera") as thread:
+        future = thread.submit(deliver)
+        try:
+            while True:
+                while queue.is_empty and idle():
+                    pass
+                if (frame := queue.take()) is None:
+                    break
+                yield frame._replace(dropped=frame.number - last - 1)
+                last = frame.number
+            future.result()
+        finally:
+            stopping.set()
+            camera.close()
 
 
-def prepared(frame: Frame | FrameError, slam: "Slam | None", ms: float = 0.0) -> FrameRead:
-    """A frame that took ``ms`` milliseconds to read, prepared for processing where there is a system."""
+def open_masks(folder: str | Path | None, sequence: "Sequence | LiveCamera") -> "MaskFolder | None":
+    """The external masks of a run, if there are any."""
+    if folder is None:
+        return None
+    times = getattr(sequence, "timestamps", None)
+    if times is None:
+        raise ConfigError("masks belong to the frames of a recording; a camera has none")
+    return MaskFolder(folder, times, sequence.camera)
+
+
+def _with_masks(
+    frame: Frame | FrameError,
+    index: int,
+    source: "Sequence | LiveCamera",
+    masks: "MaskFolder | None",
+    slam: "Slam | None",
+    ms: float = 0.0,
+) -> FrameRead:
+    """A frame with its masks, prepared for processing where there is a system."""
     try:
         view = None if slam is None or isinstance(frame, FrameError) else slam.prepare(frame)
     except FrameError as error:
-        return FrameRead(error, None, ms)
-    return FrameRead(frame, None, ms, prepared=view)
-
-
-def read_frame(
-    sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None
-) -> FrameRead:
-    """A frame of a recording with its masks, prepared for processing where there is a system."""
-    start = time.perf_counter()
-    try:
-        frame: Frame | FrameError = sequence[index]
-    except FrameError as error:
-        return FrameRead(error, None, 1000 * (time.perf_counter() - start))
-    read = prepared(frame, slam, 1000 * (time.perf_counter() - start))
-    return read._replace(
-        true_mask=_or_error(sequence.mask, index), given_mask=masks and _or_error(masks.__getitem__, index)
-    )
+        frame, view = error, None
+    if isinstance(frame, FrameError):
+        return FrameRead(frame, None, ms)
+    given = masks and _or_error(masks.__getitem__, index)
+    return FrameRead(frame, _or_error(source.mask, index), ms, given, view)
 
 
 def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:

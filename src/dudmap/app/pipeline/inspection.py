@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.pipeline.focal_check import WRONG, focal_error
-from dudmap.app.pipeline.image_checks import image_warnings
+from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
 from dudmap.io.sequences.intrinsics import BY_NAME
 
@@ -140,13 +139,7 @@ def repeats(sequence: "Sequence") -> dict[str, float]:
 def inspect(
     sequence: "Sequence", frames: "list[tuple[int, Frame]] | None" = None, unreadable: list[str] | None = None
 ) -> Inspection:
-    """Describe a recording and name what looks wrong.
-
-    Args:
-        sequence: The recording.
-        frames: Numbers and frames as ``sample`` returns them; None samples.
-        unreadable: Reasons of the sampled frames that cannot be read.
-    """
+    """Describe a recording and name what looks wrong; ``frames`` and ``unreadable`` are as ``sample`` returns them."""
     if frames is None:
         frames, unreadable = sample(sequence)
     depths = [frame.depth[frame.depth > 0] for _, frame in frames]

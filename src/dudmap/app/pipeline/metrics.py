@@ -83,15 +83,10 @@ class RunRecord:
         mask: NDArray[np.bool_] | None,
         **delays: float,
     ) -> None:
-        """Add one processed frame.
+        """Add one processed frame, which took so many milliseconds, with its true dynamic mask (H, W) if known.
 
-        Args:
-            result: Result of the frame.
-            total_ms: Processing time.
-            reading_ms: Reading time.
-            mask: True dynamic mask (H, W), if known.
-            delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
-                arrival to the result, ms.
+        In a live run ``delays`` are the number of frames ``dropped`` before this one, and the ``latency`` from its
+        arrival to the result, ms.
         """
         frame = {"timestamp": f"{result.timestamp:.6f}", "state": result.state}
         times = {"reading": reading_ms, "total": total_ms} | delays | result.timings

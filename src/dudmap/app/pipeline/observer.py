@@ -1,12 +1,26 @@
-"""What watches a run without taking part in it: viewers, logs, pictures."""
+"""What watches a run without taking part in it: the base of viewers, the log of events, and the report of a crash."""
 
+import json
+import platform
+import re
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
+
+from dudmap.atomic_file import write_bytes, writing
+from dudmap.errors import InternalError
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.frame_source import FrameRead
     from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
+
+RECENT = 50
+"""Last events that are kept in memory: of a second or two, most of them frames."""
 
 
 class RunObserver:
@@ -30,3 +44,109 @@ class RunObserver:
 
     def finish(self, out: Path) -> None:
         """The run is over, also by an error or an interrupt, and its run folder is written."""
+
+
+class EventLog(RunObserver):
+    """Writes one JSON object per line and event; each is on its way to the file before the next frame begins.
+
+    Every object has ``time`` (seconds since 1970) and ``event``; docs/reliability.md lists the events and their keys.
+
+    Args:
+        path: The file, which is replaced; None only keeps the last events.
+
+    Attributes:
+        recent: The last ``RECENT`` events.
+        out: The run folder, None before a run has begun.
+
+    Raises:
+        DudmapError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT)
+        self.out: Path | None = None
+        self._file: TextIO | None = None
+        if path is not None:
+            with writing(f"the log {path}"):
+                self._file = path.open("w", encoding="utf-8", buffering=1)
+        self._slam: Slam | None = None
+        self._state = "tracked"
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """A pass begins."""
+        self._slam, self.out, self._state = slam, out, "tracked"
+        self.event("start", folder=str(out), frames=count)
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """One event for the frame, and one for what else happened with it."""
+        assert self._slam is not None
+        place: dict[str, Any] = {"frame": index, "timestamp": result.timestamp}
+        figures = {"ms": round(ms, 2), "dynamic_share": round(float(result.dynamic_share), 4), "submap": result.submap}
+        if result.state == "lost":
+            self.event("lost", **place, **figures, reason=result.lost_reason, first=self._state != "lost")
+        else:
+            assert result.T_world_camera is not None
+            position = [round(float(x), 4) for x in result.T_world_camera[:3, 3]]
+            self.event(result.state, **place, **figures, fused=result.fused, position=position)
+        if result.relocalized:
+            self.event("relocalized", **place, submap=result.submap)
+        if result.corrected:
+            self.event("loop", **place, submap=result.submap)
+        if result.calibrated:
+            self.event("calibration", **place, estimated=list(self._slam.calibration.estimated))
+        for kind, sentence in (("uncertain", result.uncertain), ("blind", "no contrast" if result.blind else "")):
+            if sentence:
+                self.event("warning", **place, kind=kind, reason=sentence)
+        self._state = result.state
+
+    def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
+        """Write an event."""
+        row = {"time": round(time.time(), 3), "event": name} | values
+        self.recent.append(row)
+        if self._file is not None:
+            self._file.write(json.dumps(row) + "\n")
+
+    def finish(self, out: Path) -> None:
+        """The run folder is written."""
+        self.event("finish", folder=str(out))
+
+    def close(self) -> None:
+        """End the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, Any]] = ()) -> InternalError:
+    """Write ``crash-<date>.txt`` into a folder, with the last events of the run, and return the error that says so."""
+    path = folder / f"crash-{time.strftime('%Y%m%d-%H%M%S')}.txt"
+    what = f"{type(error).__name__}: {error}"
+    try:
+        write_bytes(path, report_text(error, events).encode("utf-8", "backslashreplace"))
+        where = f"{path} says where; please report it with this file"
+    except OSError as problem:
+        where = f"no report could be written ({problem}); please repeat it with another folder and report it"
+    return InternalError(f"this is a defect of dudmap, not of your data or settings ({what}); {where}")
+
+
+def report_text(error: BaseException, events: Iterable[dict[str, Any]]) -> str:
+    """Content of the report."""
+    command = re.sub(r"(--token[= ])\S+", r"\1...", " ".join(sys.argv))
+    parts = [
+        f"dudmap stopped by a defect of its own, {time.strftime('%Y-%m-%d %H:%M:%S %z')}",
+        f"command: {command}",
+        f"versions: {json.dumps(_versions())}",
+        "".join(traceback.format_exception(error)),
+        "last events of the run, newest at the end:",
+        *(json.dumps(event) for event in events),
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _versions() -> dict[str, Any]:
+    """Versions and machine; less where the installation itself is broken."""
+    from dudmap.app.pipeline.environment import machine, versions
+
+    try:
+        return versions() | machine()
+    except (ImportError, OSError) as error:
+        return {"python": platform.python_version(), "os": platform.platform(), "missing": str(error)}

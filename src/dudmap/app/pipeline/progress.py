@@ -2,14 +2,13 @@
 
 import time
 from collections import deque
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from dudmap.app.kernel_cache import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING, compiled_kernels
 from dudmap.app.terminal import plain_console
 
 if TYPE_CHECKING:
@@ -40,13 +39,10 @@ NOT_FUSED = {
 
 
 class RunProgress:
-    """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
+    """Progress bar on stderr, if that is a terminal, with frame number, frames per second, dynamic share and state.
 
-    Losses of tracking and unreadable frames are reported, once per gap, even without the bar.
-
-    Args:
-        total: Number of frames, None if it is not known.
-        bar: Show the bar if stderr is a terminal.
+    Losses of tracking and unreadable frames are reported, once per gap, even without the bar. The ``total`` is None if
+    it is not known.
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
@@ -72,9 +68,7 @@ class RunProgress:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
     def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:

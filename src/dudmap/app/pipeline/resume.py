@@ -5,8 +5,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dudmap.app.pipeline.frame_source import open_masks
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run import Job, open_masks, run
+from dudmap.app.pipeline.run import Job, run
 from dudmap.app.pipeline.run_folder import RunReport, locked
 from dudmap.app.pipeline.storing import RunStore, check_recording, stored_options
 from dudmap.app.state.system import on_device
@@ -29,8 +30,8 @@ def resume(
     """Go on with a run that was killed or interrupted, from its last checkpoint to the end.
 
     One that ended while it calibrated the colour camera begins anew. Recording, configuration and options are those the
-    run began with. Results are those of a run that was not interrupted: the same poses, masks, map and mesh, bit for
-    bit.
+    run began with, and a report is written if one was wanted. Results are those of a run that was not interrupted: the
+    same poses, masks, map and mesh, bit for bit.
 
     Args:
         out: The run folder.
@@ -44,6 +45,7 @@ def resume(
             dudmap wrote it, or it is damaged.
         DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
     """
+    from dudmap.app.viewing.report import ReportObserver
     from dudmap.core.places.saved_map import SavedMap
     from dudmap.io.sequences import open_sequence
 
@@ -61,6 +63,8 @@ def resume(
                 sequence = open_sequence(**storing.recording) if sequence is None else sequence
                 options = options.model_copy(update={"config": on_device(options.config, device)})
             check_recording(sequence, stored, out)
+            if storing.report:
+                observers = (*observers, ReportObserver())
             if stored.number is not None:
                 display = RunProgress(count * options.passes, bar=progress)
                 masks = open_masks(options.masks, sequence)
@@ -77,14 +81,3 @@ def resume(
     return run(
         sequence, config, out, saved_map=saved_map, calibrate=True, progress=progress, observers=observers, **others
     )
-
-
-def wants_report(out: Path) -> bool:
-    """Whether the run in a folder was ordered with a report.
-
-    Raises:
-        StateError: The folder holds no run that can be continued.
-    """
-    reader, stored = stored_options(out)
-    reader.close()
-    return stored.options.storing is not None and stored.options.storing.report

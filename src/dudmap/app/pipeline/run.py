@@ -1,23 +1,25 @@
-"""Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
+"""Processing of a recording or of a camera: reads frames, runs the system, records metrics, writes the run folder."""
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, in_order, load_kernels, read_frame
+from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.replay import in_real_time
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
-from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
+from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing
 from dudmap.app.state.database import StateReader
+from dudmap.app.state.system import restore
 from dudmap.app.terminal import counted
 from dudmap.config import Config
 from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
 from dudmap.io.cameras import LiveCamera
+from dudmap.io.cameras.recorder import Recorder
+from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import is_timed
 
 if TYPE_CHECKING:
@@ -28,9 +30,12 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
     from dudmap.io.sequences.images import MaskFolder
 
+PREVIEW = 3
+"""Frames with which the kernels are compiled or loaded before the stream of a camera begins."""
+
 
 def run(
-    sequence: "Sequence",
+    sequence: "Sequence | LiveCamera",
     config: Config,
     out: str | Path,
     *,
@@ -41,6 +46,7 @@ def run(
     progress: bool = True,
     ahead: int = AHEAD,
     live: bool = False,
+    record: str | Path | None = None,
     passes: int = 1,
     calibration: "Calibration | None" = None,
     calibrate: bool = False,
@@ -51,7 +57,7 @@ def run(
     storing: Storing | None = None,
     warnings: Iterable[str] = (),
 ) -> RunReport:
-    """Run the system over a recording and write a run folder.
+    """Run the system over a recording, or on a camera until its stream ends or Ctrl-C, and write a run folder.
 
     The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz and keyframes.npz
     (what a later run needs to go on in the map), config.toml,
@@ -65,7 +71,9 @@ def run(
     state.db until the run is finished, from which ``dudmap.app.pipeline.resume.resume`` continues it.
 
     Args:
-        sequence: The recording; its ground truth and masks are used for evaluation only.
+        sequence: The recording, whose ground truth and masks are used for evaluation only; or a camera, which is closed
+            at the end. Of the frames that arrive while one is processed, those of the last 0.1 s wait; older ones are
+            counted as ``dropped``.
         config: All parameters.
         out: The run folder; created if needed.
         max_frames: Process only this many frames.
@@ -76,12 +84,12 @@ def run(
         progress: Show a progress bar on a terminal.
         ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
             would distort the times. The result does not depend on it.
-        live: Replay the recording in real time once the kernels are loaded; frames for which there is no time are
-            dropped and counted.
+        live: Replay the recording as if it were a camera.
+        record: MCAP file for all frames of a camera that arrive, processed or not.
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
-        calibration: Of the colour camera; None takes that of the recording.
+        calibration: Of the colour camera; None takes that of the recording or the camera.
         calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
@@ -92,21 +100,24 @@ def run(
         warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
 
     Raises:
-        ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
-            ``saved_map``; ``storing`` with ``live``.
+        ConfigError: ``passes`` is not 1 or 2, or 2 with a camera or ``saved_map``; ``localize`` without a
+            ``saved_map``; ``storing`` with a camera.
+        CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
         DudmapError: Another process writes into the folder, it cannot be written, the recording cannot be used, or no
             frame could be tracked.
-        KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
+        KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names what was
+            saved.
     """
-    from dudmap.app.pipeline.calibration import calibrate_start
-    from dudmap.app.pipeline.calibration_report import ASSUMED
+    from dudmap.app.pipeline.calibration import ASSUMED, calibrate_start
 
     out = Path(out)
-    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
-    if count < 1:
-        raise DatasetError(
-            f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
-        )
+    if live and not isinstance(sequence, LiveCamera):
+        sequence = ReplayCamera(sequence)
+    live = isinstance(sequence, LiveCamera)
+    length = sequence.length if isinstance(sequence, LiveCamera) else len(sequence)
+    count = length if max_frames is None else min(max_frames, length or max_frames)
+    if count is not None and count < 1:
+        raise DatasetError(f"{sequence.name} has {length} frames and {max_frames} are wanted; expected one or more")
     if passes not in (1, 2) or (live and passes == 2):
         raise ConfigError(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
@@ -118,41 +129,47 @@ def run(
     if saved_map is not None and passes == 2:
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     if storing is not None and live:
-        raise ConfigError("a live replay cannot be stored: it does not stop for what is missed; drop live or storing")
-    map_folder = None if saved_map is None else saved_map.folder
+        raise ConfigError("a live run cannot be stored: it does not stop for what is missed; drop live or storing")
+    if record is not None and not live:
+        raise ConfigError("only the frames of a camera are recorded; these are on the disk already")
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
-        live=live, passes=passes, saved_map=_resolved(map_folder),
-        localize=localize, max_memory=max_memory, storing=storing,
+        passes=passes, saved_map=_resolved(saved_map and saved_map.folder), localize=localize, max_memory=max_memory,
+        storing=storing,
     )  # fmt: skip
-    with locked(out):
-        record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
-        display = RunProgress(count * passes, bar=progress)
-        job = Job(sequence, out, options, display, open_masks(masks, sequence), observers)
+    figures = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
+    with locked(out), ExitStack() as files:
+        display = RunProgress(count and count * passes, bar=progress)
+        notice = display.note if progress else lambda text: None
         prepare_run_folder(out, masks, save_masks=save_masks)
-        store = None
-        if storing is not None:
+        recorder = store = None
+        if record is not None:
+            recorder = Recorder(Path(record), sequence.camera, sequence.calibration)
+            files.callback(_finish_recording, recorder, display)
+        if isinstance(sequence, LiveCamera):
+            files.callback(sequence.close)
+        job = Job(sequence, out, options, display, open_masks(masks, sequence), observers, recorder)
+        if storing is not None and not isinstance(sequence, LiveCamera):
             store = RunStore(out, storing.every, display.note)
             store.order(sequence, options)
-        notice = display.note if progress else lambda text: None
         if progress:
             display.announce_compilation()
-        if calibrate:
+        if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
                 calibration = calibrate_start(sequence, config, count, notice, counting)
         elif calibration is None and not live:
             notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
         slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
-        state = RunState(slam, record, calibration)
+        state = RunState(slam, figures, calibration)
         if store is not None:
-            store.begin(state)
+            store.take(state, wait=True)
         return job.carry_out(state, store)
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run as it was ordered; for the attributes see ``run``. The frames of a camera are what ``arriving`` gives."""
+    """A run as it was ordered; for the attributes see ``run``."""
 
     sequence: "Sequence | LiveCamera"
     out: Path
@@ -160,7 +177,7 @@ class Job:
     display: RunProgress
     masks: "MaskFolder | None" = None
     observers: "tuple[RunObserver, ...]" = ()
-    arriving: "Callable[[Job, RunState], Generator[SourceFrame]] | None" = None
+    recorder: Recorder | None = None
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
         """A new system for this recording."""
@@ -173,7 +190,8 @@ class Job:
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
-        return restored(reader, store, self.system(), self.system())
+        current = RunState(self.system(), RunRecord(), first_slam=self.system(), first_record=RunRecord())
+        return restore(reader, current, store.database, current.slam.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
@@ -199,7 +217,7 @@ class Job:
                     display.note(f"live: {dropped} of {total} frames were dropped")
             except KeyboardInterrupt:
                 count, of_pass = len(state.record.rows), " of the second pass" if state.first_slam else ""
-                if self.arriving is None:
+                if not isinstance(self.sequence, LiveCamera):
                     stopped = f"interrupted after {count} frames{of_pass}"
                     raise KeyboardInterrupt(f"{stopped}; {_saved(state.first_slam)} in {out}") from None
                 display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
@@ -214,7 +232,7 @@ class Job:
         record, count = state.record, self.options.max_frames or len(state.record.rows)
         if record.rows and not len(report.trajectory):
             raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
-        if not record.rows and self.arriving is not None:
+        if not record.rows and isinstance(self.sequence, LiveCamera):
             raise CameraError(f"no frame of the camera {self.sequence.name} was processed")
         if not record.rows:
             raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
@@ -250,17 +268,15 @@ class Job:
 
     def _frames(self, state: RunState) -> Generator[SourceFrame]:
         """The frames of a pass that are left."""
-        if self.arriving is not None:
-            return self.arriving(self, state)
-        count, sequence, slam = self.options.max_frames, self.sequence, state.slam
-        assert count is not None
-        assert not isinstance(sequence, LiveCamera)
-        if self.options.live:
+        count, source, slam = self.options.max_frames, self.sequence, state.slam
+        if isinstance(source, LiveCamera):
             self.display.working("loading kernels")
-            load_kernels(self._next_system(state), sequence, count)
-            times, idle = sequence.timestamps[:count], state.record.catch_up
-            return in_real_time(times, lambda index: read_frame(sequence, index, self.masks, slam), idle)
-        return in_order(sequence, count, self.options.ahead, self.masks, slam, state.next)
+            first = self._next_system(state)
+            for frame in source.preview(PREVIEW):
+                first.process(frame)
+            return arriving(source, slam, self.masks, self.recorder, state.record.catch_up)
+        assert count is not None
+        return read_ahead(source, count, self.options.ahead, self.masks, slam, state.next)
 
     def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
         """A new system with what is known of the camera; for a second pass with the first."""
@@ -319,11 +335,12 @@ def _saved(first_pass: object) -> str:
     return f"the trajectory and the map {'of the first pass' if first_pass else 'up to there'} are"
 
 
-def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":
-    """The external masks of a run, if there are any."""
-    from dudmap.io.sequences.images import MaskFolder
-
-    return None if folder is None else MaskFolder(folder, sequence.timestamps, sequence.camera)
+def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
+    """Complete the recording and say what is in it."""
+    recorder.close()
+    display.note(f"recorded {recorder.written} frames to {recorder.path}")
+    if recorder.dropped:
+        display.note(f"{recorder.dropped} frames are missing in the recording: the disk is too slow for the camera")
 
 
 def _resolved(path: str | Path | None) -> Path | None:

@@ -1,13 +1,16 @@
-"""The run folder: creation, cleaning and writing of all result files."""
+"""The run folder: its lock, creation, cleaning and writing of all result files."""
 
 import json
+import os
 import re
+import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +18,24 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
-from dudmap.app.state.run_lock import RunLock
-from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text, writing
 from dudmap.config import Config
 from dudmap.core.geometry.mesh_pieces import save_pieces
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import is_recording
-from dudmap.own_folder import make_folder, remove_files
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
 
 if TYPE_CHECKING:
     from dudmap.core.objects.object_map import RigidObject
     from dudmap.core.slam import Slam
     from dudmap.io.cameras import LiveCamera
     from dudmap.io.sequences import Sequence
+
+LOCK = ".lock"
+LOCKED_BYTE = 1 << 20
+"""Place of the locked byte on Windows, behind the text, which others must be able to read."""
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
@@ -48,6 +54,66 @@ WRITTEN = {
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
 }  # fmt: skip
 """Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
+
+
+@contextmanager
+def run_lock(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run folder, which exists; the operating system gives it up when the process ends, however.
+
+    Raises:
+        DudmapError: Another process, or another run of this one, holds the lock; the sentence says which.
+        OSError: The file cannot be written, or is a link or anything but a plain file.
+    """
+    with OwnFolder(folder, linked=True) as own, _locked_file(own) as file:
+        about = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(" ", "seconds")}
+        file.truncate(0)
+        file.write(json.dumps(about).encode())
+        file.flush()
+        try:
+            yield
+        finally:
+            if os.name == "posix":
+                own.remove(LOCK)
+
+
+def _locked_file(folder: OwnFolder) -> IO[bytes]:
+    while True:
+        file = os.fdopen(folder.open(LOCK, os.O_RDWR | os.O_CREAT), "r+b")
+        try:
+            _lock(file)
+        except OSError:
+            holder = file.read(1000).decode(errors="replace")
+            file.close()
+            raise DudmapError(
+                f"{folder.path} is in use by {_described(holder)}; wait for it, end it, or name another folder"
+            ) from None
+        there = folder.status(LOCK)
+        if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
+            return file
+        file.close()  # whoever held it has removed this file in between
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Lock a file for this process; an ``OSError`` if it is locked."""
+    if os.name == "nt":
+        import msvcrt
+
+        file.seek(LOCKED_BYTE)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+        file.seek(0)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _described(holder: str) -> str:
+    """Who holds a lock, from its file."""
+    try:
+        about = json.loads(holder)
+        return f"process {int(about['pid'])} on {about['host']} since {about['since']}"
+    except (ValueError, KeyError, TypeError):
+        return "another process"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,26 +147,12 @@ def locked(out: Path) -> Iterator[None]:
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
     """
-    with _writing_into(out):
-        out.mkdir(parents=True, exist_ok=True)
-        lock = RunLock(out)
-    with lock:
-        with _writing_into(out):
+    with ExitStack() as held:
+        with writing(f"into the run folder {out}"):
+            out.mkdir(parents=True, exist_ok=True)
+            held.enter_context(run_lock(out))
             remove_files(out, dict.fromkeys(WRITTEN, UNFINISHED))
         yield
-
-
-@contextmanager
-def _writing_into(out: Path) -> Iterator[None]:
-    """Say that it is the run folder that cannot be written.
-
-    Raises:
-        DudmapError: Instead of any error of the operating system.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
@@ -115,7 +167,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
         )
     if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
         raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
-    with _writing_into(out):
+    with writing(f"into the run folder {out}"):
         remove_files(out, WRITTEN)
         if save_masks:
             make_folder(out / "masks")

@@ -1,7 +1,10 @@
 """The state of a run in its folder: what is stored, when, and what a continued run finds there."""
 
+import os
 import re
 import sqlite3
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -12,10 +15,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from dudmap.app.pipeline.environment import versions
 from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
-from dudmap.app.state.checkpoints import Checkpoints
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
-from dudmap.app.state.system import check_code, restore
+from dudmap.app.state.system import (
+    check_code,
+    code_fingerprint,
+    frame_fingerprint,
+    images_fingerprint,
+    recording_fingerprint,
+    take_snapshot,
+)
+from dudmap.app.state.tree import NotSettledError, Snapshot
+from dudmap.atomic_file import bring_to_disk
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
 from dudmap.input_files import DAMAGE, read_json
@@ -31,6 +41,15 @@ if TYPE_CHECKING:
 
 DATABASE = "state.db"
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
+SHARE = 0.02
+"""Largest share of the time so far that checkpoints take in processor time, snapshots and writing together, unless an
+interval is given.
+
+What the writing thread takes from the memory bandwidth and the caches of the frames is not measured; the rest of the
+3 % that checkpoints may cost is left for it.
+"""
+FIRST = 5.0
+"""Seconds before the first checkpoint: a run that is shorter is repeated as fast as it is continued."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +78,6 @@ class RunOptions(BaseModel):
     save_map: bool = True
     masks: Path | None = None
     ahead: int = AHEAD
-    live: bool = False
     passes: int = 1
     saved_map: Path | None = None
     localize: bool = False
@@ -106,7 +124,10 @@ class RunState:
 
 
 class RunStore:
-    """Stores the state of a run in its folder.
+    """Stores the state of a run in its folder: checkpoints between two frames, written by a background thread.
+
+    A checkpoint that cannot be written, since the disk is full or fails or by a defect of this program, is announced
+    once and tried again when the next one is due; what is in the database stays as it is.
 
     Args:
         out: The run folder, locked by this process.
@@ -119,18 +140,20 @@ class RunStore:
 
     def __init__(self, out: Path, every: float | None, notice: "Callable[[str], None]") -> None:
         try:
-            self.database = StateDatabase(out / DATABASE)
+            self.database = StateDatabase(out / DATABASE)  # only the writing thread uses it from now on
         except (OSError, sqlite3.Error) as error:
             raise DudmapError(f"the state of the run cannot be stored in {out / DATABASE}: {error}") from error
-        self.checkpoints = Checkpoints(self.database, every, notice)
+        self.written = 0
         self._out, self._every, self._notice = out, every, notice
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="dudmap-state")
+        self._running: Future[float] | None = None
+        self._start = self._last = time.perf_counter()
+        self._cost, self._last_cost = 0.0, 0.0  # seconds, of all checkpoints and of the last
+        self._files: list[Path] = []  # which the next checkpoint counts on: they are brought to the disk before
+        self._failing = False
 
     def order(self, sequence: "Sequence", options: RunOptions) -> None:
-        """Store what the run is, before anything that takes time.
-
-        Raises:
-            DudmapError: It cannot be written.
-        """
+        """Store what the run is, before anything that takes time."""
         about = {"options": options.model_dump(mode="json"), "recording": recording_fingerprint(sequence)}
         about |= {"code": code_fingerprint(), "versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
         try:
@@ -138,28 +161,56 @@ class RunStore:
         except sqlite3.Error as error:
             raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
 
-    def begin(self, state: RunState) -> None:
-        """Store the state before the first frame."""
-        self._take(state, "", wait=True)
-
     def frame(self, state: RunState, frame: "Frame | Exception") -> None:
         """A frame was processed; take a checkpoint if one is due."""
         if not isinstance(frame, Exception):
-            self.checkpoints.add_file(self._out / "masks" / f"{frame.timestamp:.6f}.png")
-        if self.checkpoints.is_due:
-            self._take(state, images_fingerprint(frame))
+            self._files.append(self._out / "masks" / f"{frame.timestamp:.6f}.png")
+        if self.is_due:
+            self.take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:
         """All frames are processed, and the results will be written: store the last state unless the run was short."""
-        if not self.checkpoints.is_short:
-            self._take(state, "", wait=True)
+        if self._every is not None or self.written or time.perf_counter() - self._start >= FIRST:
+            self.take(state, wait=True)
 
-    def _take(self, state: RunState, frame: str, *, wait: bool = False) -> None:
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time for a checkpoint and the last one is written."""
+        if self._running is not None and not self._running.done():
+            return False
+        self._finish()
+        now = time.perf_counter()
+        if self._every is not None:
+            return now - self._last >= self._every
+        return now - self._last >= FIRST and self._cost + self._last_cost <= SHARE * (now - self._start)
+
+    def take(self, state: RunState, frame: str = "", *, wait: bool = False) -> None:
+        """Take a snapshot of the state after a frame of this fingerprint, and have it written.
+
+        It has no effect while something is computed in the background; ``wait`` waits for that, and until it is
+        written.
+        """
+        if wait:
+            self._finish()
+        start, busy = time.perf_counter(), time.thread_time()  # a process that was stopped meanwhile has not been busy
         for record in filter(None, (state.record, state.first_record)):
             record.settle()
         updated = datetime.now().isoformat(" ", "seconds")
         place = {"pass": state.number, "next": state.next, "frame": frame, "updated": updated}
-        self.checkpoints.take(state, place, wait=wait)
+        try:
+            snapshot = take_snapshot(state, self.database, wait=wait)
+        except NotSettledError:
+            return
+        except StateError as error:  # a defect of this program, which is no reason to end the run
+            self._last = start
+            self._warn(error)
+            return
+        files, self._files = self._files, []
+        self._last_cost, self._last = time.thread_time() - busy, start
+        self._cost += self._last_cost
+        self._running = self._thread.submit(self._write, snapshot, place, files)
+        if wait:
+            self._finish()
 
     def reopened(self) -> "RunStore":
         """The same after ``close``, to go on from what is stored."""
@@ -167,9 +218,45 @@ class RunStore:
 
     def close(self, *, finished: bool) -> None:
         """Close the database, and remove it where the run is finished, so that only its results remain."""
-        self.checkpoints.close()
+        self._thread.shutdown()
+        self._finish()
+        self.database.close()
         if finished:
             remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
+
+    def _write(self, snapshot: Snapshot, meta: dict[str, Any], files: list[Path]) -> float:
+        """Seconds of processor time that writing took."""
+        start = time.thread_time()
+        for path in [*files, *{path.parent for path in files}] if os.name == "posix" else files:
+            if path.exists():
+                bring_to_disk(path)
+        self.database.write(snapshot, meta)
+        return time.thread_time() - start
+
+    def _finish(self) -> None:
+        """Wait for the last checkpoint, and take note of how it went."""
+        running, self._running = self._running, None
+        if running is None:
+            return
+        error = running.exception()
+        if error is None:
+            self._cost += running.result()
+            self._last_cost += running.result()
+            self.written += 1
+            if self._failing:
+                self._notice("checkpoints are written again")
+            self._failing = False
+        else:
+            self._warn(error)
+
+    def _warn(self, error: BaseException) -> None:
+        """Say once that no checkpoints are written."""
+        if not self._failing:
+            self._failing = True
+            of_disk = isinstance(error, OSError | sqlite3.Error)
+            what = str(error) if of_disk or isinstance(error, StateError) else repr(error)
+            hint = "; make room on the disk of the run folder" if of_disk else ""
+            self._notice(f"the state of the run cannot be stored: {what}; it goes on in memory and tries again{hint}")
 
 
 def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
@@ -194,32 +281,13 @@ def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
 
 
 def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
-    """Check that a recording is the one that a stored run is of.
-
-    Raises:
-        StateError: It is not.
-    """
+    """Refuse a recording that is not the one that a stored run is of."""
     same = recording_fingerprint(sequence) == stored.recording
     if not same or (stored.frame and frame_fingerprint(sequence, stored.next - 1) != stored.frame):
         raise StateError(
             f"the recording {sequence.name} is not as it was when the run in {out} began; bring the old one back, or "
             "begin anew with dudmap run"
         )
-
-
-def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") -> RunState:
-    """Where a stored run stands.
-
-    Args:
-        reader: Its database.
-        store: Goes on storing there.
-        slam, other: New systems of the same camera and configuration, one for each pass.
-
-    Raises:
-        StateError: The database is damaged.
-    """
-    current = RunState(slam, RunRecord(), first_slam=other, first_record=RunRecord())
-    return restore(reader, current, store.database, slam.device)
 
 
 def _why_nothing(out: Path) -> str:

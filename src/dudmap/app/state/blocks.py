@@ -1,4 +1,4 @@
-"""Blocks of the maps on their way into the database and back: only those that changed are copied and written."""
+"""Blocks of the maps and stored frames on their way into the database and back: only what changed is written."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
+from dudmap.core.places.frame_store import EncodedFrame, FrameStore
 from dudmap.errors import StateError
 
 LARGEST_TABLE = 2**26
@@ -64,12 +65,13 @@ class StoredMaps:
 
     def __init__(self) -> None:
         self.by_id: dict[int, StoredMap] = {}
-        self._promised: dict[int, int] = {}  # numbers of maps that are not in the database yet
+        self._next = 0  # number of the next map that the database lacks
 
     def snapshot(self, volume: TsdfVolume) -> tuple[dict[str, Any], MapSnapshot]:
         """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state."""
         stored, blocks = self.by_id.get(volume.map_id), volume.blocks
-        number = self._free_number(volume.map_id) if stored is None else stored.number
+        number = self._next if stored is None else stored.number
+        self._next = max(self._next, number + 1)
         slots = volume.active_slots if stored is None else volume.written_since(stored.frame)[0]
         used = blocks.entry_of[slots] >= 0
         slots, released = slots[used], slots[~used]
@@ -89,19 +91,12 @@ class StoredMaps:
     def commit(self, maps: list[MapSnapshot]) -> None:
         """The blocks of these maps are in the database, and no other maps."""
         self.by_id = {changed.map_id: StoredMap(changed.number, changed.frame, changed.away) for changed in maps}
-        self._promised = {}
 
     def add(self, volume: TsdfVolume, number: int) -> None:
         """A map has been read from the database."""
         regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
         self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, regions)
-
-    def _free_number(self, map_id: int) -> int:
-        """Number for a map that is not in the database; the same until the next ``commit``."""
-        if map_id not in self._promised:
-            used = {stored.number for stored in self.by_id.values()} | set(self._promised.values())
-            self._promised[map_id] = next(number for number in range(len(used) + 1) if number not in used)
-        return self._promised[map_id]
+        self._next = max(self._next, number + 1)
 
 
 def _index(volume: TsdfVolume) -> dict[str, Any]:
@@ -140,13 +135,8 @@ def restore_map(
     voxels: NDArray[np.int32],
     read_region: Callable[[Region], BlockRecords],
 ) -> None:
-    """Fill a map, whose other attributes are set.
-
-    Args:
-        volume: The map.
-        index: Its part of the tree.
-        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) of all its rows in the database, by slot.
-        read_region: Reads a region from there that has left the memory.
+    """Fill a map, whose other attributes are set, from its index and all its rows in the database, by slot: slots (n,),
+    coordinates (n, 3) and voxels (n, VOXELS). ``read_region`` reads a region that has left the memory.
 
     Raises:
         StateError: The rows do not fit the index.
@@ -168,11 +158,7 @@ def restore_map(
 
 
 def _check_index(index: dict[str, Any]) -> NDArray[np.int64]:
-    """Check that the parts of an index fit each other; slots (n,) that own voxels.
-
-    Raises:
-        StateError: They do not.
-    """
+    """Slots (n,) that own voxels; a ``StateError`` if the parts of an index do not fit each other."""
     n, m = len(index["coords"]), len(index["entry_of"])
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
     owned = np.flatnonzero(index["entry_of"] >= 0)
@@ -203,11 +189,7 @@ def _restore_blocks(blocks: VoxelBlocks, index: dict[str, Any], *, paged: bool) 
 
 
 def _restore_levels(volume: TsdfVolume, indices: list[dict[str, Any]]) -> None:
-    """Fill the finer levels of a map whose coarsest one is complete.
-
-    Raises:
-        StateError: A level does not fit its index or the next coarser one.
-    """
+    """Fill the finer levels of a map whose coarsest one is complete; a ``StateError`` if one does not fit."""
     parents = volume.blocks
     for level, index in zip(volume.levels, indices, strict=True):
         _check_index(index)
@@ -234,3 +216,49 @@ def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, A
     window.near = index["near"]
     if not np.array_equal(np.sort(window.near), np.sort(inside[:count])):
         raise StateError("the stored map is damaged: the blocks around the camera are not those of the map")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSnapshot:
+    """What changed in a frame store since the last checkpoint.
+
+    Attributes:
+        number: Number of the store in the database.
+        frames: The frames that the database lacks, by number: depth, colour and mask as files.
+        gone: Numbers of those that it holds, and the store does not any more.
+        kept: Numbers of the frames whose images are in the store.
+        store: The store.
+    """
+
+    number: int
+    frames: dict[int, EncodedFrame]
+    gone: list[int]
+    kept: set[int]
+    store: FrameStore
+
+
+class StoredFrames:
+    """Knows which frames are in the database."""
+
+    def __init__(self) -> None:
+        self._stores: list[tuple[FrameStore, set[int]]] = []  # the number is the place in the list
+
+    def snapshot(self, store: FrameStore) -> FrameSnapshot:
+        """The frames that the database lacks, and those that it no longer needs; waits until the former are encoded."""
+        number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
+        if number == len(self._stores):
+            self._stores.append((store, set()))
+        stored, kept = self._stores[number][1], set(store.kept)
+        frames = {n: store.encoded(n) for n in store.kept if n not in stored}
+        return FrameSnapshot(number, frames, sorted(stored - kept), kept, store)
+
+    def commit(self, frames: list[FrameSnapshot]) -> None:
+        """What these snapshots hold is in the database."""
+        for changed in frames:
+            self._stores[changed.number] = changed.store, changed.kept
+
+    def add(self, store: FrameStore, number: int) -> None:
+        """The frames of a store come from the database."""
+        while len(self._stores) <= number:
+            self._stores.append((store, set()))
+        self._stores[number] = store, set(store.kept)

@@ -20,8 +20,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
-from dudmap.app.state.frames import FrameSnapshot, StoredFrames
+from dudmap.app.state.blocks import VOXELS, FrameSnapshot, MapSnapshot, StoredFrames, StoredMaps
 from dudmap.app.state.tree import Snapshot
 from dudmap.core.map.block_pager import Region
 from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
@@ -110,14 +109,10 @@ class StateDatabase:
         Raises:
             sqlite3.Error: It cannot be written; the database holds the checkpoint before.
         """
-        texts = ("".join(json.dumps(record) + "\n" for record in records).encode() for records in snapshot.records)
         arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
-        records = [self._described(np.frombuffer(text, np.uint8), constant=False) for text in texts]
-        described = {
-            "tree": snapshot.tree, "arrays": [one for one, _ in arrays], "records": [one for one, _ in records],
-        }  # fmt: skip
-        parts = {key: part for _, found in arrays + records for key, part in found.items()}
-        used = {key for one, _ in arrays + records for key in one["chunks"]}
+        described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays]}
+        parts = {key: part for _, found in arrays for key, part in found.items()}
+        used = {key for one, _ in arrays for key in one["chunks"]}
         tree = zlib.compress(json.dumps(described).encode(), 1)
         self._execute("BEGIN IMMEDIATE")
         try:
@@ -177,8 +172,11 @@ class StateDatabase:
             rows = ((changed.number, serial, *parts) for serial, parts in changed.frames.items())
             self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
 
-    def _described(self, array: NDArray, constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Type, shape and chunks of an array, and the content of the chunks that may be new."""
+    def _described(self, array: NDArray | list[Any], constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Type, shape and chunks of an array, and the content of the chunks that may be new; a list of plain values is
+        the text of lines of JSON."""
+        if isinstance(array, list):
+            array = np.frombuffer("".join(json.dumps(record) + "\n" for record in array).encode(), np.uint8)
         transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
         about = {"dtype": array.dtype.str, "shape": array.shape, "transposed": transposed}
         known = self._constants.get(id(array))
@@ -238,8 +236,8 @@ class StateReader:
         except (ValueError, TypeError, AttributeError) as error:
             raise self._damaged(error) from error
 
-    def state(self) -> tuple[Any, list[NDArray], list[list[Any]]] | None:
-        """Tree, arrays and records of the checkpoint; None if there is none yet."""
+    def state(self) -> tuple[Any, list[NDArray]] | None:
+        """Tree and arrays of the checkpoint; None if there is none yet."""
         rows = list(self._rows("SELECT crc, tree FROM state"))
         if not rows:
             return None
@@ -249,14 +247,11 @@ class StateReader:
                 raise ValueError("its checksum is wrong")
             described = parse_json(inflated(packed, LARGEST_TREE), exact=True)
             chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
-            parts = [key for one in described["arrays"] + described["records"] for key in one["chunks"]]
+            parts = [key for one in described["arrays"] for key in one["chunks"]]
             total, held = sum(len(chunks[key]) for key in parts), sum(map(len, chunks.values()))
             if total > max(RATIO_FREE_BYTES, LARGEST_RATIO * held):  # a part may stand in many arrays
                 raise ValueError(f"its arrays have {total} bytes, and {held} are stored")
-            arrays = [_array(about, chunks) for about in described["arrays"]]
-            texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
-            records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
-            return described["tree"], arrays, records
+            return described["tree"], [_array(about, chunks) for about in described["arrays"]]
         except (*DAMAGE, MemoryError) as error:
             raise self._damaged(error) from error
 
@@ -338,11 +333,7 @@ def _own_tables() -> list[tuple[str, ...]]:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a file that is much larger than what of it is on the disk.
-
-    Raises:
-        StateError: It is.
-    """
+    """Refuse a file that is much larger than what of it is on the disk."""
     status = path.stat()
     stored = 512 * getattr(status, "st_blocks", status.st_size)
     if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):

@@ -62,22 +62,29 @@ core.tracking.quality_monitor:RegistrationHistory,Verdict,QualityMonitor
 core.tracking.tracker:TrackingResult,Minimum,Tracker
 """
 """All classes whose objects may be stored, and made from what is stored: modules of this package and names in them."""
-NOT_STORED = {
-    "Atlas": ("make_volume",),
-    "BlockPager": (
-        "_store", "_executor", "_away", "_writing", "_reading", "_returned", "_archived", "_archive",
-    ),
-    "FrameStore": ("registered", "_first_own", "_file", "_encoder", "_pending", "archived"),
-    "KeyframeDatabase": ("_sift",),
-    "LoopCloser": ("_executor",),
-    "RunRecord": ("_since",),
-    "Observation": ("_halvings", "_recorded_halvings"),
-    "SimilarityTest": ("_sift",),
-    "Slam": ("device",),
-    "TsdfVolume": ("blocks", "window", "levels", "map_id"),
-}  # fmt: skip
+NOT_STORED: dict[str, dict[str, Any]] = {
+    "Atlas": {"make_volume": ...},
+    "BlockPager": {"_store": None, "_executor": None}
+    | dict.fromkeys(("_away", "_writing", "_reading", "_returned", "_archived", "_archive"), ...),
+    "FrameStore": {
+        "registered": None,
+        "_first_own": 0,
+        "_file": None,
+        "_encoder": None,
+        "_pending": deque,
+        "archived": ...,
+    },
+    "KeyframeDatabase": {"_sift": ...},
+    "LoopCloser": {"_executor": None},
+    "RunRecord": {"_since": (0.0, 0.0)},
+    "Observation": {"_halvings": list, "_recorded_halvings": list},
+    "SimilarityTest": {"_sift": ...},
+    "Slam": {"device": ...},
+    "TsdfVolume": dict.fromkeys(("blocks", "window", "levels", "map_id"), ...),
+}
 """Attributes by class that a new object makes itself: connections, threads, files, what has a table of its own, what
-follows from other attributes, and what is of one process or device alone."""
+follows from other attributes, and what is of one process or device alone. An object that is made without its
+constructor gets the value, or what the class makes; ``...`` leaves it to what fills the object."""
 BACKENDS = frozenset({"CpuBackend", "WarpBackend"})
 """Classes of back ends, which hold nothing that is part of the state: a new one may be of another device."""
 EVALUATED = {"FrameView": ("segmentation",), "KeyframeDatabase": ("_unsettled",)}
@@ -111,11 +118,7 @@ def name_of(cls: type) -> str:
 
 
 def class_of(name: object) -> type:
-    """The class of a name.
-
-    Raises:
-        ValueError: It is none whose objects are stored.
-    """
+    """The class of a name; a ``ValueError`` if it is none whose objects are stored."""
     module = _table().get(name) if isinstance(name, str) else None
     if module is None:
         raise ValueError(f"found a {name!r}, which this version does not know")
@@ -125,6 +128,12 @@ def class_of(name: object) -> type:
 def not_stored(cls: type) -> set[str]:
     """Attributes that objects of a class make themselves."""
     return {name for base in cls.__mro__ for name in NOT_STORED.get(base.__name__, ())}
+
+
+def defaults(cls: type) -> dict[str, Any]:
+    """Values of these attributes in an object that is made without its constructor."""
+    named = {name: value for base in cls.__mro__ for name, value in NOT_STORED.get(base.__name__, {}).items()}
+    return {name: value() if callable(value) else value for name, value in named.items() if value is not ...}
 
 
 def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -165,12 +174,7 @@ def _hints(cls: type) -> Mapping[str, Any]:
 
 
 def check_attributes(cls: type, content: object, like: Mapping[str, Any]) -> None:
-    """Check the names of the attributes of an object.
-
-    Args:
-        cls: Its class.
-        content: Its attributes as stored.
-        like: Those of a new object, if there is one.
+    """Check that an object of a class has the attributes that it needs, and no others; ``like`` are those of a new one.
 
     Raises:
         ValueError: There is one too many, or one is missing.

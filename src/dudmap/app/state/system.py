@@ -1,29 +1,76 @@
-"""A system and what belongs to it, from and into a database."""
+"""A system and what belongs to it, from and into a database, and what a stored state fits."""
 
-from dataclasses import asdict
+import hashlib
+from dataclasses import asdict, astuple
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dudmap.app.pipeline.environment import versions
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.identity import code_fingerprint
 from dudmap.app.state.tree import Snapshot, TreeReader, TreeWriter
 from dudmap.config import Config
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import StateError
+from dudmap.errors import FrameError, StateError
 from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
     from dudmap.core.slam import Slam
+    from dudmap.io.sequences import Sequence
+
+CODE = ("config.py", "core", "app/state", "app/pipeline/metrics.py", "app/pipeline/storing.py")
+"""Parts of this package that a state depends on."""
+
+
+@cache
+def code_fingerprint() -> str:
+    """Checksum of the code that computes a state and of the versions of the libraries it uses.
+
+    A state is continued by the code that wrote it and by no other: with any other the result would be that of neither.
+    """
+    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
+    root = Path(str(files("dudmap")))
+    for part in CODE:
+        place = root / part
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def recording_fingerprint(sequence: "Sequence") -> str:
+    """Checksum of the times, the camera and the first readable frame of a recording."""
+    digest = hashlib.sha256(np.ascontiguousarray(sequence.timestamps, np.float64).tobytes())
+    digest.update(repr((astuple(sequence.camera), len(sequence))).encode())
+    digest.update(frame_fingerprint(sequence, 0).encode())
+    return digest.hexdigest()
+
+
+def frame_fingerprint(sequence: "Sequence", index: int) -> str:
+    """Checksum of a frame of a recording; see ``images_fingerprint``."""
+    try:
+        return images_fingerprint(sequence[index])
+    except FrameError as error:
+        return images_fingerprint(error)
+
+
+def images_fingerprint(frame: "Frame | Exception") -> str:
+    """Checksum of the images of a frame, or of the sentence on why it cannot be read."""
+    if isinstance(frame, Exception):
+        return hashlib.sha256(str(frame).encode()).hexdigest()
+    digest = hashlib.sha256(repr((frame.timestamp, frame.color_timestamp)).encode())
+    for image in (frame.depth, frame.color):
+        digest.update(np.ascontiguousarray(image).tobytes())
+    return digest.hexdigest()
 
 
 def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) -> Snapshot:
-    """The state of a value, without what the database holds already.
+    """The state of a value, such as a system, without what the database, in which it will be written, holds already.
 
-    Args:
-        value: A system, or a dictionary that holds one.
-        database: Where it will be written.
-        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
+    Without ``wait`` it raises ``NotSettledError`` while something is computed in the background.
 
     Raises:
         StateError: There is something that cannot be stored.
@@ -32,13 +79,10 @@ def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) 
 
 
 def restore(reader: StateReader, current: object, database: StateDatabase | None = None, device: str = "cpu") -> Any:  # noqa: ANN401
-    """The value that was stored last.
+    """The value that was stored last, made of the objects of a new one of the same kind (``TreeReader.restore``).
 
-    Args:
-        reader: The database, which stays open as long as the system lives: it reads stored frames when it needs them.
-        current: A new value of the same kind; see ``TreeReader.restore``.
-        database: Takes note of what it holds already, where the run goes on in the same database.
-        device: Device of the maps that ``current`` lacks.
+    The reader stays open as long as the system lives: it reads stored frames when it needs them. Where the run goes on
+    in the same database, that takes note of what it holds. ``device`` is that of the maps that ``current`` lacks.
 
     Raises:
         StateError: The database is damaged or of another version, or holds no state yet.
@@ -100,11 +144,7 @@ def on_device(config: Config, device: str | None) -> Config:
 
 
 def check_code(meta: dict[str, Any], path: Path) -> None:
-    """Check that a state was written by this version.
-
-    Raises:
-        StateError: It was not.
-    """
+    """Refuse a state that was written by another version."""
     if meta.get("code") != code_fingerprint():
         raise StateError(
             f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "

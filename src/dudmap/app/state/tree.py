@@ -24,11 +24,11 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import DatasetError, StateError
-from dudmap.input_files import DAMAGE
+from dudmap.input_files import DAMAGE, parse_json
 
 if TYPE_CHECKING:
+    from dudmap.app.state.blocks import FrameSnapshot, StoredFrames
     from dudmap.app.state.database import StateDatabase, StateReader
-    from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 
 Node = Any
 """A tree of plain values, as JSON has them."""
@@ -41,16 +41,14 @@ class Snapshot:
     """The state of a system at one moment, which no later change reaches.
 
     Attributes:
-        tree: The tree; ``arrays`` and ``records`` are referred to by number.
-        arrays: Copies, except of what never changes.
-        records: Lists of plain values.
+        tree: The tree; ``arrays`` are referred to by number.
+        arrays: Copies, except of what never changes; or lists of plain values.
         constant: Numbers of the arrays that never change.
         maps, frames: What changed in the maps and stored frames since the last checkpoint.
     """
 
     tree: Node = None
-    arrays: list[NDArray] = field(default_factory=list)
-    records: list[list[Any]] = field(default_factory=list)
+    arrays: list[NDArray | list[Any]] = field(default_factory=list)
     constant: set[int] = field(default_factory=set)
     maps: list[MapSnapshot] = field(default_factory=list)
     frames: "list[FrameSnapshot]" = field(default_factory=list)
@@ -61,12 +59,8 @@ class NotSettledError(Exception):
 
 
 class TreeWriter:
-    """Takes a snapshot.
-
-    Args:
-        maps, frames: Know what of the maps and of the stored frames is in the database already.
-        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
-    """
+    """Takes a snapshot, without what ``maps`` and ``frames`` know to be in the database; for ``wait`` see
+    ``take_snapshot``."""
 
     def __init__(self, maps: StoredMaps, frames: "StoredFrames", *, wait: bool) -> None:
         self.snapshot = Snapshot()
@@ -74,12 +68,7 @@ class TreeWriter:
         self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
 
     def take(self, value: object) -> Snapshot:
-        """The snapshot of a value and everything that it refers to.
-
-        Raises:
-            StateError: There is something that cannot be stored.
-            NotSettledError: See ``wait``.
-        """
+        """The snapshot of a value and everything that it refers to."""
         self.snapshot.tree = self._node(value, "state")
         return self.snapshot
 
@@ -113,9 +102,8 @@ class TreeWriter:
         if isinstance(value, dict):
             keys, content = list(value), list(value.values())
             return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
-        if isinstance(value, set | frozenset):
-            kind = "frozenset" if isinstance(value, frozenset) else "set"
-            return {kind: self._items(sorted(value), place), "id": number}
+        if isinstance(value, set):
+            return {"set": self._items(sorted(value), place), "id": number}
         return self._object(value, place, number)
 
     def _items(self, items: list[Any], place: str) -> Node:
@@ -151,8 +139,7 @@ class TreeWriter:
         for name, attribute in schema.attributes(value).items():
             where = f"{place}.{name}"
             if name in records:
-                self.snapshot.records.append(list(attribute))
-                content[name] = {"records": len(self.snapshot.records) - 1}
+                content[name] = {"records": self._add(list(attribute))}
             elif name in evaluated:
                 content[name] = {"call": self._node(attribute(), where)}
             else:
@@ -166,7 +153,7 @@ class TreeWriter:
             self.snapshot.constant.add(len(self.snapshot.arrays))
         return self._add(array if constant else array.copy(order="K"))
 
-    def _add(self, array: NDArray) -> int:
+    def _add(self, array: NDArray | list[Any]) -> int:
         self.snapshot.arrays.append(array)
         return len(self.snapshot.arrays) - 1
 
@@ -177,23 +164,14 @@ class TreeWriter:
 
 
 class TreeReader:
-    """Gives a system the state that a database holds.
-
-    Args:
-        reader: The database.
-        database: Takes note of what it holds already, where the run goes on in the same database.
-        device: Device of the back ends that are made where the given system has none in that place.
-
-    Raises:
-        StateError: The database is damaged, or holds no state yet.
-    """
+    """Gives a system the state that a database holds; for the arguments see ``system.restore``."""
 
     def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None, device: str = "cpu") -> None:
         self._reader, self._database, self._device = reader, database, device
         stored = reader.state()
         if stored is None:
             raise StateError(f"{reader.path} holds no checkpoint yet")
-        self._tree, self._arrays, self._records = stored
+        self._tree, self._arrays = stored
         self._made: dict[int, Any] = {}
         self._at: list[str] = []  # where the tree is being read, which an error names
         self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
@@ -202,8 +180,7 @@ class TreeReader:
     def restore(self, current: object) -> Any:  # noqa: ANN401
         """The value that was stored last.
 
-        Args:
-            current: A new value of the same kind, whose objects are used, so that they stay connected.
+        The objects of ``current``, a new value of the same kind, are used, so that they stay connected.
 
         Raises:
             StateError: The state is damaged or of another version.
@@ -233,7 +210,8 @@ class TreeReader:
                     raise ValueError(f"found a {kind} of {type(value).__name__}; expected a number")
                 return kind.type(value)
             case {"records": number}:
-                return self._records[number]
+                lines = self._arrays[number].tobytes().decode().splitlines()
+                return [parse_json(line, exact=True) for line in lines]
             case {"call": result}:
                 made = self._value(result)
                 return lambda: made
@@ -256,8 +234,6 @@ class TreeReader:
                 value = self._tuple(self._items(items), node.get("class"))
             case {"set": items}:
                 value = set(self._items(items))
-            case {"frozenset": items}:
-                value = frozenset(self._items(items))
             case {"list": items, "id": number}:  # this and the next may be part of their own content
                 value = self._made[number] = []
                 value += self._items(items, current)
@@ -328,7 +304,7 @@ class TreeReader:
         content = node["attributes"]
         like = self._new.setdefault(cls, schema.attributes(current)) if usable else self._new.get(cls, {})
         schema.check_attributes(cls, content, like)
-        for name, default in {} if usable else _defaults(cls).items():
+        for name, default in {} if usable else schema.defaults(cls).items():
             object.__setattr__(value, name, default)
         for name, attribute in content.items():
             self._at.append(f".{name}")
@@ -357,18 +333,6 @@ class TreeReader:
         store.continue_from(lambda n: reader.frame(number, n))
         if self._database is not None:
             self._database.frames.add(store, number)
-
-
-def _defaults(cls: type) -> dict[str, Any]:
-    """Values of the attributes that are not stored, of an object that is made without its constructor."""
-    made: dict[str, dict[str, Any]] = {
-        "BlockPager": {"_store": None, "_executor": None},
-        "FrameStore": {"registered": None, "_file": None, "_first_own": 0, "_encoder": None, "_pending": deque()},
-        "LoopCloser": {"_executor": None},
-        "RunRecord": {"_since": (0.0, 0.0)},
-        "Observation": {"_halvings": [], "_recorded_halvings": []},
-    }  # fmt: skip
-    return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
 
 
 def _class_name(value: object, place: str) -> str:

@@ -1,4 +1,4 @@
-"""The page in the browser while a run goes on: its own thread, fed through a slot for one frame."""
+"""What fills the page in the browser: a run while it goes on, or the folder of one."""
 
 import threading
 import time
@@ -9,20 +9,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dudmap.app.pipeline.observer import RunObserver
-from dudmap.app.viewing.mesh_feed import MeshFeed
+from dudmap.app.viewing.mesh_feed import MeshChanges, MeshFeed
+from dudmap.app.viewing.run_files import RunFiles
 from dudmap.app.viewing.snapshot import FrameFigures, FrameImages
-from dudmap.errors import FrameError
+from dudmap.app.viewing.window import Window
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh_simplification import simplified
+from dudmap.errors import DudmapError, FrameError
+from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from dudmap.app.pipeline.frame_source import FrameRead
-    from dudmap.app.viewing.window import Window
     from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
 
 PERIOD = 0.1
 """Shortest time between two updates of the page, seconds."""
+TRIANGLES = 1_000_000
+"""Triangles of a stored mesh that are sent to the browser: 40 MB, which it loads within seconds."""
 
 
 @dataclass
@@ -48,7 +54,7 @@ class LiveView(RunObserver):
         costs: Milliseconds that each frame took in the thread of the run.
     """
 
-    def __init__(self, window: "Window") -> None:
+    def __init__(self, window: Window) -> None:
         self.costs: list[float] = []
         self._window = window
         self._news = _News()
@@ -135,3 +141,34 @@ class LiveView(RunObserver):
                 time.sleep(PERIOD)
         except Exception as error:  # handed to the thread of the run, which raises it in close
             self._error = error
+
+
+def open_run(folder: str | Path, host: str, port: int, token: str | None = None) -> Window:
+    """Window that shows a run folder; the slider stands at the first frame.
+
+    Raises:
+        DudmapError: The folder is no complete run folder, viser is missing, or the port is in use.
+    """
+    run = RunFiles.load(folder)
+    window = Window(host, port, str(run.metrics.get("sequence") or run.folder.name), token)
+    try:
+        show_run(window, run)
+    except DudmapError:
+        window.stop()
+        raise
+    return window
+
+
+def show_run(window: Window, run: RunFiles) -> None:
+    """Fill a window with the results of a run."""
+    if "camera" in run.metrics:
+        with damaged(DudmapError, run.folder / "metrics.json"):
+            values = run.metrics["camera"]
+            window.set_camera(Camera(**values | {"distortion": tuple(values.get("distortion", ()))}))
+    if run.mesh is not None:
+        window.show_mesh(MeshChanges({(0, 0, 0): simplified(run.mesh, TRIANGLES)}))
+    window.stay()
+    window.add_frames(run.figures())
+    for stamp, images in run.thumbnails.items():
+        window.add_images(float(stamp), images)
+    window.show_frame(0)

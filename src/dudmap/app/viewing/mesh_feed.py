@@ -39,9 +39,6 @@ class MeshFeed:
     Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
     the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh
     from the copy.
-
-    Args:
-        budget_ms: Mean time per frame, milliseconds.
     """
 
     def __init__(self, budget_ms: float = BUDGET_MS) -> None:
@@ -51,31 +48,31 @@ class MeshFeed:
         self._mirror: VolumeMirror | None = None
         self._extracted: VolumeMirror | None = None
         self._mesh: IncrementalMesh | None = None
-        self._ready = threading.Condition()
-        self._waiting = False  # a copy waits for its extraction
+        self._free = threading.Event()  # no copy waits for its extraction
+        self._free.set()
 
     @property
     def has_copy(self) -> bool:
         """Whether ``take`` would find something new."""
-        return self._waiting
+        return not self._free.is_set()
 
     def offer(self, volume: "TsdfVolume", *, now: bool = False) -> None:
         """Copy what changed in a volume if budget and receiver allow it; with ``now``, as soon as the receiver does."""
         self._saved += self._budget
-        with self._ready:
-            if now:
-                self._ready.wait_for(lambda: not self._waiting)
-            if self._waiting or (self._saved < min(self._cost, LONGEST_WAIT * self._budget) and not now):
-                return
-            start = time.perf_counter()
-            if self._mirror is None or self._volume is not volume:
-                self._volume, self._mirror = volume, VolumeMirror(volume)
-            self._mirror.update(None if now else BLOCKS)
-            self._cost, self._saved, self._waiting = 1000 * (time.perf_counter() - start), 0.0, True
+        if now:
+            self._free.wait()
+        elif self.has_copy or self._saved < min(self._cost, LONGEST_WAIT * self._budget):
+            return
+        start = time.perf_counter()
+        if self._mirror is None or self._volume is not volume:
+            self._volume, self._mirror = volume, VolumeMirror(volume)
+        self._mirror.update(None if now else BLOCKS)
+        self._cost, self._saved = 1000 * (time.perf_counter() - start), 0.0
+        self._free.clear()
 
     def take(self) -> MeshChanges:
         """What changed since the last call; empty if nothing new was copied."""
-        if not self._waiting or self._mirror is None:
+        if not self.has_copy or self._mirror is None:
             return MeshChanges()
         reset = self._extracted is not self._mirror
         if self._mesh is None or reset:
@@ -84,15 +81,13 @@ class MeshFeed:
             changed = self._mesh.update()
             return MeshChanges({key: self._mesh.chunks.get(key) for key in changed}, reset)
         finally:
-            with self._ready:
-                self._waiting = False
-                self._ready.notify()
+            self._free.set()
 
     def changes(self, volume: "TsdfVolume", *, now: bool = False) -> MeshChanges:
         """``offer`` and ``take`` in one thread, both at the expense of the budget."""
         start = time.perf_counter()
         self.offer(volume, now=now)
-        if not self._waiting:
+        if not self.has_copy:
             return MeshChanges()
         out = self.take()
         self._cost = 1000 * (time.perf_counter() - start)

@@ -1,26 +1,43 @@
-"""The report of a run: one HTML page that needs neither network nor server."""
+"""The report of a run, one HTML page that needs neither network nor server, and the small images that it shows."""
 
 import base64
+import gzip
+import hashlib
 import json
 import re
+import string
+from collections.abc import Iterable
+from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dudmap import __version__
-from dudmap.app.viewing.markup import Html, html, joined, script_source
-from dudmap.app.viewing.packed_mesh import packed
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.pipeline.run_folder import WRITTEN
 from dudmap.app.viewing.plots import plots
-from dudmap.app.viewing.run_files import RunFiles
-from dudmap.app.viewing.thumbnails import Thumbnails
-from dudmap.atomic_file import write_text
+from dudmap.app.viewing.run_files import FOLDER, RunFiles
+from dudmap.app.viewing.snapshot import FrameImages
+from dudmap.atomic_file import write_bytes, write_text, writing
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_simplification import simplified
-from dudmap.errors import DudmapError, printable
+from dudmap.errors import DudmapError, FrameError, printable
 from dudmap.input_files import damaged
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
 
+if TYPE_CHECKING:
+    from dudmap.app.pipeline.frame_source import FrameRead
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
+
+NUMBER = 36
+"""Number of frames that are kept: about 1.5 MB of JPEG files, and a strip that can still be looked through."""
+
+STEPS = 65535
+"""Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
 REPORT = "report.html"
 TRIANGLES = 200_000
 """Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
@@ -42,15 +59,111 @@ CARDS = {
 """Key of metrics.json to label, factor and format of the figures at the top of the page."""
 
 
+class Thumbnails(RunObserver):
+    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames.
+
+    Of a camera, whose number of frames is not known, up to ``2 NUMBER`` are kept: whenever there are more, every second
+    one is removed.
+    """
+
+    def __init__(self) -> None:
+        self._out, self._count, self._next, self._step = Path(), None, 0, 1
+        self._kept: list[list[Path]] = []
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """Remember where the images go and how many frames come."""
+        self._out, self._count, self._next, self._step, self._kept = out / FOLDER, count, 0, 1, []
+        make_folder(self._out)
+        remove_files(out, {FOLDER: WRITTEN[FOLDER]})  # of the first pass, whose timestamps may differ in a live run
+
+    def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
+        """Keep the images of the frames before number ``first``."""
+        self._out, self._count, self._step, self._kept = out / FOLDER, count, 1, []
+        make_folder(self._out)
+        self._next = self._next_after(first - 1)
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """Write the images of the frame if it is the first one of the next of equal parts."""
+        if index < self._next or isinstance(read.frame, FrameError):
+            return
+        paths = []
+        for kind, file in FrameImages.of(read.frame, result).files().items():
+            paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
+            write_bytes(paths[-1], file, sync=False, own=True)
+        self._kept.append(paths)
+        if self._count is None:
+            self._thin()
+            self._next = index + self._step
+        else:
+            self._next = self._next_after(index)
+
+    def _next_after(self, index: int) -> int:
+        """First frame of the next of NUMBER equal parts."""
+        assert self._count is not None
+        return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
+
+    def _thin(self) -> None:
+        """Remove every second frame if there are too many, and keep half as many from now on."""
+        if len(self._kept) <= 2 * NUMBER:
+            return
+        with OwnFolder(self._out) as folder:
+            for path in (path for paths in self._kept[1::2] for path in paths):
+                folder.remove(path.name)
+        self._kept, self._step = self._kept[::2], 2 * self._step
+
+
+class Html(str):
+    """Text that is HTML already: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
+
+    __slots__ = ()
+
+
+class _Escaping(string.Formatter):
+    def format_field(self, value: object, format_spec: str) -> str:
+        return value if isinstance(value, Html) else escape(format(value, format_spec))
+
+
+def html(template: str, /, **values: object) -> Html:
+    """HTML of a template in the syntax of ``str.format``, whose values are escaped."""
+    return Html(_Escaping().vformat(template, (), values))
+
+
+def joined(parts: Iterable[object], between: str = "") -> Html:
+    """Parts one after the other; those that are no HTML are escaped."""
+    return Html(between.join(html("{part}", part=part) for part in parts))
+
+
+def script_source(script: str) -> str:
+    """Source in a content security policy that allows this script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
+    """Description for the page, and the data as base64 text of a gzip stream.
+
+    The stream holds the positions, uint16 (V, 3), from the corner ``low`` (0) to ``high`` (65535) of the bounding box;
+    the colours, uint8 (V, 3); zeros up to a multiple of 4 bytes; and the faces, int32 (F, 3), each index as the
+    difference to the one before it, which compresses well. All little-endian.
+    """
+    low, high = mesh.vertices.min(axis=0).astype(float), mesh.vertices.max(axis=0).astype(float)
+    positions = np.rint((mesh.vertices - low) / np.maximum(high - low, 1e-9) * STEPS).astype("<u2")
+    steps = np.diff(mesh.faces.reshape(-1), prepend=0).astype("<i4")
+    head = positions.tobytes() + mesh.colors.tobytes()
+    data = gzip.compress(head + bytes(-len(head) % 4) + steps.tobytes(), compresslevel=6, mtime=0)
+    about = {
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh.faces),
+        "low": low.round(6).tolist(),
+        "high": high.round(6).tolist(),
+    }
+    return about, base64.b64encode(data).decode("ascii")
+
+
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a run folder and return its path.
+    """Write the report of a run folder, by default report.html in it, and return its path.
 
     The page holds the mesh (at most ``TRIANGLES``, the full one stays in mesh.ply) with trajectory, camera and moving
     objects in 3D, the thumbnails, plots, all figures, the configuration, and what was lost and why.
-
-    Args:
-        folder: The run folder.
-        out: The HTML file; None for report.html in the run folder.
 
     Raises:
         DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
@@ -59,10 +172,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     run = RunFiles.load(folder)
     with damaged(DudmapError, f"the run folder {folder}"):
         page = report_page(run)
-    try:
+    with writing(f"the report {path}"):
         write_text(path, page)
-    except OSError as error:
-        raise DudmapError(f"cannot write the report {path}: {error.strerror or error}") from error
     return path
 
 
@@ -105,7 +216,7 @@ def scene_data(run: RunFiles) -> dict[str, Any]:
     movers = [
         [
             {"id": m.id, "box": m.box.round(3).tolist(), "speed": round(m.speed, 3)}
-            for m in run.movers.get(f"{t:.6f}", [])
+            for m in run.boxes.get(f"{t:.6f}", ())
         ]
         for t in times
     ]

@@ -8,6 +8,7 @@ import numpy as np
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.viewing.mesh_feed import MeshChanges, MeshFeed
 from dudmap.app.viewing.snapshot import FrameFigures, FrameImages, jpeg
+from dudmap.atomic_file import writing
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import DudmapError, FrameError
 from dudmap.extras import extra
@@ -42,10 +43,8 @@ class RerunLog(RunObserver):
         self._rr: Any = rerun
         if path.suffix != ".rrd":
             raise DudmapError(f"the log for Rerun is {path.name!r}; expected a name that ends in .rrd")
-        try:
+        with writing(f"the log {path}"):
             path.open("wb").close()
-        except OSError as error:
-            raise DudmapError(f"cannot write the log {path}: {error.strerror or error}") from error
         self._stream = self._rr.RecordingStream("dudmap")
         self._stream.save(path)
         self._stream.log("world", self._rr.ViewCoordinates.RDF, static=True)

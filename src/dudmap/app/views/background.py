@@ -90,12 +90,8 @@ class BackgroundRenderer:
     def colors(
         self, frame: Frame, wanted: NDArray[np.bool_], T_world_color: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours (h, w, 3) of the background in the exposure of a frame, and where they are known (h, w).
-
-        Args:
-            frame: The frame.
-            wanted: Pixels (h, w) of the colour image.
-            T_world_color: (4, 4) pose of the colour image.
+        """Colours (h, w, 3) of the background at the wanted pixels (h, w) of the colour image of a frame, in its
+        exposure, and where they are known (h, w).
         """
         of_map, distances = self._map_in_color(T_world_color)
         gain = exposure_gain(frame.color, of_map, (distances > 0) & ~wanted)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.views.background import BackgroundRenderer, continued
-from dudmap.app.views.tum_folder import TumFolder, camera_lines, depth_units
+from dudmap.app.views.rendering import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.exporting.run_content import RunContent
@@ -124,11 +124,8 @@ class Cleaner:
             self._renderer.add(frame, moving, T_world_camera, T_world_color)
 
     def _moving(self, index: int, frame: Frame, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a margin.
-
-        Raises:
-            DatasetError: The mask has another size.
-        """
+        """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a
+        margin."""
         mask, width = read_mask(self._masks[index]), self.sequence.camera.width
         if mask.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")
@@ -192,13 +189,10 @@ def unlike(
     where: NDArray[np.bool_],
     surely: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of an image whose colours differ from the expected ones more than is usual; single ones and lines
-    are edges that are a pixel off, and left out.
+    """Pixels (h, w) of an image (h, w, 3) whose colours differ from the expected ones more than is usual.
 
-    Args:
-        image, expected: (h, w, 3) uint8.
-        where: The pixels that are asked.
-        surely: Pixels that show what is expected, by which "usual" is judged; None for all that are asked.
+    Single ones and lines are edges that are a pixel off, and left out. Only pixels ``where`` are asked; what is usual
+    is judged by those of them that ``surely`` show what is expected, or by all.
     """
     import cv2
 
@@ -220,20 +214,14 @@ def clean_recording(
     progress: "Callable[[int, int], None] | None" = None,
     max_frames: int | None = None,
 ) -> CleanReport:
-    """Write the recording without what moves, in TUM layout.
+    """Write the recording without what moves, in TUM layout, into a new or empty folder.
 
     The folder receives rgb/, depth/, their lists rgb.txt, depth.txt and associations.txt, intrinsics.txt,
     groundtruth.txt if it is known, trajectory.txt (poses of the run), replaced/ and unknown/ (255 = pixels that were
     replaced, and those of them whose background no frame saw: their depth is 0, their colour continues what surrounds
     them), with replaced.txt and unknown.txt. Colour of a camera of its own stays in its own geometry, intrinsics.txt
-    says where that camera is, and replaced_color/ and unknown_color/ are the same for it.
-
-    Args:
-        run: A run over the recording, with map and masks.
-        sequence: The recording.
-        out: New or empty folder.
-        progress: Called with the number of finished frames and of all.
-        max_frames: Only so many frames from the start; None for all.
+    says where that camera is, and replaced_color/ and unknown_color/ are the same for it. ``progress`` receives the
+    numbers of finished frames and of all.
 
     Raises:
         DatasetError: The folder is not empty, or run and recording do not fit together.

@@ -1,37 +1,95 @@
-"""Artificial camera views: the map seen along a trajectory (thesis section 4.5.3)."""
+"""Artificial views (thesis section 4.5.3): the map seen along a trajectory, as picture, video or recording."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.views.tum_folder import TumFolder, depth_units
-from dudmap.app.views.video import CODECS, VideoWriter
-from dudmap.atomic_file import write_bytes
+from dudmap.atomic_file import atomic_path, write_bytes, write_text
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import ConfigError, DatasetError
+from dudmap.errors import ConfigError, DatasetError, printable
 from dudmap.io.exporting.run_content import RunContent
 
+CODECS = {".mp4": "vp09", ".avi": "XVID"}
+"""Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
 PICTURE = ".png"
 """Ending of a single picture."""
 EMPTY = 32
 """Grey value of pixels that show no surface."""
 
 
+class TumFolder:
+    """Writes a folder of PNG files for every kind of image, and a list of each whose first line is a title."""
+
+    def __init__(self, out: Path, title: str, kinds: Iterable[str]) -> None:
+        self._out, self._title = out, title
+        self._lines: dict[str, list[str]] = {kind: [] for kind in kinds}
+        for kind in self._lines:
+            (out / kind).mkdir(parents=True, exist_ok=True)
+
+    def add(self, kind: str, timestamp: float, image: NDArray) -> str:
+        """Write an image: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool as 255 and 0; returns its line of the
+        list."""
+        pixels = image[..., ::-1] if image.ndim == 3 else image.astype(np.uint8) * 255 if image.dtype == bool else image
+        line = f"{timestamp:.6f} {kind}/{timestamp:.6f}.png"
+        write_bytes(self._out / line.split()[1], cv2.imencode(".png", pixels)[1].tobytes(), sync=False)
+        self._lines[kind].append(line)
+        return line
+
+    def finish(self, camera: Camera, associations: Iterable[str] = (), more: Iterable[str] = ()) -> None:
+        """Write the lists, and intrinsics.txt with ``more`` lines than those of the camera of the depth images."""
+        lists = self._lines | ({"associations": list(associations)} if associations else {})
+        for name, lines in lists.items():
+            write_text(self._out / f"{name}.txt", "\n".join([f"# {self._title}", *lines]) + "\n")
+        numbers = [*camera_lines(camera), f"depth_scale {camera.depth_scale}", *more]
+        write_text(self._out / "intrinsics.txt", "\n".join(numbers) + "\n")
+
+
+def camera_lines(camera: Camera) -> list[str]:
+    """Lines of intrinsics.txt for a camera."""
+    lines = [f"{key} {getattr(camera, key)}" for key in ("fx", "fy", "cx", "cy", "width", "height")]
+    lens = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False)
+    return [*lines, *(f"{key} {value}" for key, value in lens)]
+
+
+def depth_units(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint16]:
+    """Depth in the units of a camera's images; 0 where it is too large for them."""
+    units = np.rint(depth * camera.depth_scale)
+    return np.where(units > 65535, 0, units).astype(np.uint16)
+
+
+@contextmanager
+def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Write a video of a size (width, height); gives a function that adds an image (H, W, 3) in RGB order.
+
+    Raises:
+        ConfigError: The ending of the path is unknown, or this OpenCV cannot write the format.
+    """
+    codec = CODECS.get(path.suffix.lower())
+    if codec is None:
+        known = ", ".join(CODECS)
+        raise ConfigError(f"cannot write {path.name!r}; the ending must be one of {known}, or .png for a picture")
+    if str(path) != printable(path):  # OpenCV ends the process at a name that is no UTF-8
+        raise ConfigError(f"cannot write a video as {path}; expected a name of printable characters")
+    with atomic_path(path) as temporary:
+        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)
+        if not writer.isOpened():
+            raise ConfigError(f"this build of OpenCV cannot write {path} (codec {codec}); name a folder for images")
+        try:
+            yield lambda color: writer.write(np.ascontiguousarray(color[..., ::-1]))
+        finally:
+            writer.release()
+
+
 def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float) -> Trajectory:
     """Trajectory on an arc about the middle of what the cameras looked at, at their mean distance and height.
 
     The arc lies about the mean place of the cameras, ``sweep_deg`` wide, there and back; from 360 on it is a circle.
-
-    Args:
-        run: The run.
-        up: (3,) unit vector against gravity.
-        sweep_deg: Width of the arc, degrees.
-        frames: Number of poses.
-        fps: Poses per second.
+    ``up`` (3,) is a unit vector against gravity.
     """
     middle = np.median(run.surface.vertices.astype(np.float64), axis=0)
     arm = run.trajectory.Ts_world_camera[:, :3, 3].mean(axis=0) - middle
@@ -77,16 +135,9 @@ def render_run(
     """Write the map as a camera on a trajectory sees it; returns the number of frames.
 
     A file name ending with .png gives one picture, of the first pose, and one with another known ending a video. A name
-    without an ending is a folder, which receives a recording in TUM layout:
-    rgb/, depth/ and their lists, intrinsics.txt and groundtruth.txt.
-
-    Args:
-        run: The run.
-        trajectory: Poses in the world of the run.
-        out: Picture, video or folder.
-        size: Width and height, pixels; None for those of the recording.
-        fps: Of a video.
-        progress: Called with the number of finished frames and of all.
+    without an ending is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists,
+    intrinsics.txt and groundtruth.txt. ``size`` is width and height in pixels, None for those of the recording; ``fps``
+    that of a video. ``progress`` receives the numbers of finished frames and of all.
 
     Raises:
         ConfigError: The ending is unknown.
@@ -100,9 +151,9 @@ def render_run(
         write_bytes(out, cv2.imencode(PICTURE, color[..., ::-1])[1].tobytes())
         return 1
     if out.suffix and not out.is_dir():
-        with VideoWriter(out, (camera.width, camera.height), fps) as video:
+        with video_file(out, (camera.width, camera.height), fps) as add:
             for number, T in enumerate(trajectory.Ts_world_camera, start=1):
-                video.write(_view(run, T, camera)[0])
+                add(_view(run, T, camera)[0])
                 if progress is not None:
                     progress(number, len(trajectory))
         return len(trajectory)

@@ -8,11 +8,15 @@ from dudmap.errors import CameraError, FrameError, MissingExtraError
 from dudmap.extras import extra
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.geometry.camera import Camera
+    from dudmap.core.geometry.trajectory import Trajectory
 
-__all__ = ["CAMERAS", "CameraFrame", "LiveCamera", "driver", "open_camera"]
+__all__ = ["CAMERAS", "MAX_WAIT", "CameraFrame", "LiveCamera", "driver", "open_camera"]
 
 CAMERAS = {
     "realsense": "drivers:RealSenseCamera",
@@ -23,6 +27,9 @@ CAMERAS = {
     "replay": "replay:ReplayCamera",
 }
 """Module and class of every camera by its name; without a name the first of them that is connected is taken."""
+MAX_WAIT = 0.1
+"""Time for which a frame may wait for its processing, seconds: at 30 Hz one that takes three times as long as usual
+delays the next ones and drops none, and nothing is processed that is much older."""
 
 
 class CameraFrame(NamedTuple):
@@ -46,7 +53,7 @@ class LiveCamera(ABC):
         name: Short name, usable as a folder name.
         camera: Intrinsics of the depth images.
         calibration: Of the colour camera; None for colour that is registered to depth.
-        ground_truth: None; a camera knows no true poses.
+        ground_truth: True poses; a camera knows none.
         length: Number of frames in the stream, None where it has no end.
         timed: Whether the times of the frames are those of a clock.
     """
@@ -54,7 +61,7 @@ class LiveCamera(ABC):
     name: str
     camera: "Camera"
     calibration: "Calibration | None" = None
-    ground_truth: None = None
+    ground_truth: "Trajectory | None" = None
     length: int | None = None
     timed: bool = True
 
@@ -69,6 +76,10 @@ class LiveCamera(ABC):
     @abstractmethod
     def close(self) -> None:
         """Stop the camera; ``read`` in another thread returns soon."""
+
+    def mask(self, index: int) -> "NDArray[np.bool_] | None":
+        """True dynamic mask (H, W) of a frame; a camera knows none."""
+        return None
 
     def preview(self, count: int) -> "list[Frame]":
         """Some frames before the stream begins, with which the kernels are loaded; fewer if the stream ends."""

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dudmap.errors import FrameError
-from dudmap.io.cameras import CameraFrame, LiveCamera
+from dudmap.io.cameras import MAX_WAIT, CameraFrame, LiveCamera
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from dudmap.core.frames.frame import Frame
     from dudmap.io.sequences import Sequence
 
@@ -17,8 +19,8 @@ if TYPE_CHECKING:
 class ReplayCamera(LiveCamera):
     """Delivers the frames of a recording at their times; the first one when it is first asked for.
 
-    Of the frames that become due while an earlier one is read from disk, only the newest is read, as a camera would
-    lose the others.
+    Of the frames that become due while an earlier one is read from disk, those due since ``MAX_WAIT`` are read; the
+    others are lost, as with a camera.
 
     Args:
         recording: Path of a recording in any format that is read, or the opened sequence.
@@ -33,9 +35,12 @@ class ReplayCamera(LiveCamera):
         self._sequence = open_sequence(recording) if isinstance(recording, str) else recording
         self.name = self._sequence.name
         self.camera, self.calibration = self._sequence.camera, self._sequence.calibration
-        self.length = len(self._sequence)
+        self.ground_truth, self.length = self._sequence.ground_truth, len(self._sequence)
+        self.opened = getattr(self._sequence, "opened", None)
+        self.sources: dict[str, str] = getattr(self._sequence, "sources", {})
         self.timed = is_timed(self._sequence)
-        self._times = self._sequence.timestamps - self._sequence.timestamps[0]
+        self.timestamps = self._sequence.timestamps
+        self._times = self.timestamps - self.timestamps[0]
         self._start: float | None = None
         self._next = 0
         self._closed = Event()
@@ -50,7 +55,8 @@ class ReplayCamera(LiveCamera):
         if self._closed.wait(max(0.0, early)):
             return None
         elapsed = time.perf_counter() - self._start
-        number = max(self._next, int(np.searchsorted(self._times, elapsed, side="right")) - 1)
+        latest = int(np.searchsorted(self._times, elapsed, side="right")) - 1
+        number = max(self._next, min(latest, int(np.searchsorted(self._times, elapsed - MAX_WAIT))))
         self._next = number + 1
         return CameraFrame(number, self._frame(number), self._start + float(self._times[number]))
 
@@ -58,6 +64,10 @@ class ReplayCamera(LiveCamera):
         """First frames; the replay begins later."""
         frames = [self._frame(number) for number in range(min(count, len(self._times)))]
         return [frame for frame in frames if not isinstance(frame, FrameError)]
+
+    def mask(self, index: int) -> "NDArray[np.bool_] | None":
+        """True dynamic mask (H, W) of a frame if the recording has it."""
+        return self._sequence.mask(index)
 
     def close(self) -> None:
         """End the replay."""

@@ -39,16 +39,31 @@ class RunContent:
         folder = Path(folder)
         if not (folder / "trajectory.txt").is_file():
             raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
-        versions = _metrics(folder).get("versions")
+        run = cls(folder)
+        run.check_version()
+        return run
+
+    def check_version(self) -> None:
+        """Refuse the folder of a newer version."""
+        versions = self.metrics.get("versions")
         written = str(versions.get("dudmap", "0")) if isinstance(versions, dict) else "0"
         if _numbers(written) > _numbers(__version__):
-            raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
-        return cls(folder)
+            found = f"{self.folder} was written by dudmap {written} and this is {__version__}"
+            raise DatasetError(f"{found}; update dudmap")
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """Content of metrics.json; empty without this file."""
+        path = self.folder / "metrics.json"
+        try:
+            return dict(read_json(path)) if path.is_file() else {}
+        except DAMAGE as error:
+            raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
 
     @property
     def recording(self) -> dict[str, Any]:
         """Arguments of ``open_sequence`` for the recording of the run; empty if the run does not name it."""
-        found = _metrics(self.folder).get("recording")
+        found = self.metrics.get("recording")
         return found if isinstance(found, dict) else {}
 
     @cached_property
@@ -114,15 +129,6 @@ class RunContent:
         if not masks:
             raise DatasetError(f"{self.folder} holds no masks of what moves; repeat the run with --save-masks")
         return masks
-
-
-def _metrics(folder: Path) -> dict[str, Any]:
-    """Content of metrics.json; empty without this file."""
-    path = folder / "metrics.json"
-    try:
-        return dict(read_json(path)) if path.is_file() else {}
-    except DAMAGE as error:
-        raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
 
 
 def _numbers(version: str) -> list[int]:
