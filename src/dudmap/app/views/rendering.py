@@ -80,7 +80,11 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callab
         if not writer.isOpened():
             raise ConfigError(f"this build of OpenCV cannot write {path} (codec {codec}); name a folder for images")
         try:
-            yield lambda color: writer.write(np.ascontiguousarray(color[..., ::-1]))
+
+            def write(color: NDArray[np.uint8]) -> None:
+                writer.write(np.ascontiguousarray(color[..., ::-1]))
+
+            yield write
         finally:
             writer.release()
 

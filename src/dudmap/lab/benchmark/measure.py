@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import tempfile
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
     from dudmap.io.sequences import Sequence
 
+Cells = list[str] | tuple[str, ...]
+"""Texts of one line of a table."""
 Row = dict[str, Any]
 """One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
@@ -258,7 +260,7 @@ def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and word
     return f"{value * column.factor:.{column.digits}f}" if isinstance(value, int | float) else str(value)
 
 
-def grid(header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> str:
+def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
     """Markdown table; the first ``words`` columns are left-aligned, the others right-aligned."""
     lines = ["| " + " | ".join(header) + " |"]
     lines.append("|" + "|".join("---" if number < words else "---:" for number in range(len(header))) + "|")
@@ -266,7 +268,7 @@ def grid(header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -
     return "\n".join(lines) + "\n"
 
 
-def markdown(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> str:
+def markdown(rows: list[Row], columns: tuple[Column, ...] = COLUMNS) -> str:
     """Markdown table of the rows, followed by a list of the failed ones."""
     good = [row for row in rows if "error" not in row]
     used = [column for column in columns if any(row.get(column.key) is not None for row in good)]
@@ -279,7 +281,7 @@ def markdown(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> str:
     return grid(header, body) + ("\n" + "\n".join(failed) + "\n" if failed else "")
 
 
-def save(rows: Sequence[Row], text: str, out: Path, name: str, more: dict[str, Any] | None = None) -> None:
+def save(rows: list[Row], text: str, out: Path, name: str, more: dict[str, Any] | None = None) -> None:
     """Write <name>.md, <name>.csv and <name>.json into a folder, in stored units."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.md").write_text(text, encoding="utf-8")

@@ -71,9 +71,16 @@ def rates(threads: int) -> tuple[float, float]:
     size, rounds = (1 << 26) // threads, 3000
     arrays = [[np.zeros(size, np.float32) for _ in range(3)] for _ in range(threads)]
     data = [np.ones(2048, np.float32) for _ in range(threads)]
-    _triad(*(array[:8] for array in arrays[0]), np.float32(2))
+    first, second, third = (array[:8] for array in arrays[0])
+    _triad(first, second, third, np.float32(2))
     _multiply_add(data[0], 1)
-    moved = 3 * 4 * size * threads / _best_seconds(threads, lambda k: _triad(*arrays[k], np.float32(2)))
+    moved = (
+        3
+        * 4
+        * size
+        * threads
+        / _best_seconds(threads, lambda k: _triad(arrays[k][0], arrays[k][1], arrays[k][2], np.float32(2)))
+    )
     computed = threads * rounds * 2048 * 64 / _best_seconds(threads, lambda k: _multiply_add(data[k], rounds))
     return moved, computed
 

@@ -4,7 +4,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +66,11 @@ class Tenths(RunObserver):
             self._lost += 1
         else:
             true = self._recording.ground_truth.Ts_world_camera[index]
-            if self._T_room_world is None:
-                self._T_room_world = true @ se3.inverse(result.T_world_camera)
-            self._errors.append(float(np.linalg.norm((self._T_room_world @ result.T_world_camera - true)[:3, 3])))
+            T_room_world = (
+                true @ se3.inverse(result.T_world_camera) if self._T_room_world is None else self._T_room_world
+            )
+            self._T_room_world = T_room_world
+            self._errors.append(float(np.linalg.norm((T_room_world @ result.T_world_camera - true)[:3, 3])))
         if (index + 1) % (len(self._recording) // 10) == 0:
             cpu, wall = np.median(self._times, axis=0)
             size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
@@ -98,7 +100,15 @@ def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[
     tenths = Tenths(recording, done)
     with tempfile.TemporaryDirectory() as folder:
         out, storing = Path(folder) / "run", Storing({"path": "soak"})
-        run(recording, Config(), out, progress=False, ahead=0, observers=(tenths,), storing=storing)
+        run(
+            cast("SyntheticSequence", recording),
+            Config(),
+            out,
+            progress=False,
+            ahead=0,
+            observers=(tenths,),
+            storing=storing,
+        )
     return tenths.rows
 
 

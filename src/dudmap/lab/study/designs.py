@@ -182,6 +182,7 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
         ConfigError: The design does not fit the factors.
     """
     kind = options.kind
+    found: list[Point]
     if kind == "full-factorial":
         found = _full_factorial(factors)
     elif kind in ("fractional-factorial", "plackett-burman"):

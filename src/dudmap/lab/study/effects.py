@@ -66,12 +66,12 @@ def anova(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table
     from statsmodels.stats.anova import anova_lm
 
     data, names = pd.DataFrame({"y": table[response], "block": table["sequence"]}), {}
-    for number, factor in enumerate(factor for factor in factors if table[factor.key].nunique() > 1):
-        many = factor.numeric and table[factor.key].nunique() > MOST_LEVELS
+    for number, factor in enumerate(factor for factor in factors if len(table[factor.key].unique()) > 1):
+        many = factor.numeric and len(table[factor.key].unique()) > MOST_LEVELS
         data[f"x{number}"] = factor.coded(table[factor.key].to_numpy()) if many else table[factor.key].map(str)
         names[f"x{number}" if many else f"C(x{number})"] = factor.name
-    block = " + C(block)" if data["block"].nunique() > 1 else ""
-    if not names or data["y"].nunique() < 2:
+    block = " + C(block)" if len(data["block"].unique()) > 1 else ""
+    if not names or len(data["y"].unique()) < 2:
         return None
     for order in (2, 1):
         model = ols(f"y ~ ({' + '.join(names)})**{order}{block}", data).fit()

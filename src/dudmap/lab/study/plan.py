@@ -32,8 +32,8 @@ class TuneOptions(BaseModel):
 
     model_config = STRICT
 
-    trials: int = Field(40, ge=1)
-    early: float = Field(0.34, ge=0, lt=1, description="early from 0 to below 1")
+    trials: int = Field(default=40, ge=1)
+    early: float = Field(default=0.34, ge=0, lt=1, description="early from 0 to below 1")
     seed: int = 0
 
 

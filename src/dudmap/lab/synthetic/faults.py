@@ -174,5 +174,5 @@ def parse_faults(assignments: Sequence[str]) -> dict[str, Any]:
         except ValueError:
             raise ConfigError(f"cannot understand the fault {assignment!r}; expected NAME=NUMBER[,NUMBER...]") from None
         several = isinstance(getattr(SensorFaults(), name), tuple) or len(numbers) > 1
-        values[name] = numbers if several else numbers[0]
+        values[name] = numbers if several else next(iter(numbers))
     return values

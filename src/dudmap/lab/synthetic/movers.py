@@ -127,7 +127,8 @@ def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: f
     scene, speed, size = staging.scene, staging.pace(1.2), staging.scene.mover_scale
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     aside = shift * size * (np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a))
-    line = (b + aside, a + aside) if reverse else (a + aside, b + aside)
+    first, last = (a + aside).tolist(), (b + aside).tolist()
+    line = (last, first) if reverse else (first, last)
     path = crossing(
         line, speed, staging.duration, enter=1.0 + delay, start_inside=staging.start_dynamic, entry_speed=1.2 * size
     )

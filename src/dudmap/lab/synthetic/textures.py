@@ -46,7 +46,7 @@ def _noise(mean: float, *parts: tuple[float, ...], color: tuple[float, float, fl
     """Maker of a texture of noise: its mean, and of every part the amplitude and the arguments of ``fractal``."""
 
     def make(rng: np.random.Generator) -> Image:
-        return _gray(sum((size * fractal(rng, *rest) for size, *rest in parts), mean), color)
+        return _gray(np.asarray(sum((size * fractal(rng, *rest) for size, *rest in parts), mean)), color)
 
     return make
 
