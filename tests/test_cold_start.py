@@ -22,12 +22,12 @@ recording = synthetic.sequence(frames=100, camera=camera, camera_path="handheld"
 run(recording, Config().override(["volume.voxel_size=0.02"]), sys.argv[1], calibrate=True, progress=False)
 """
 INTEGERS = {
-    "_cell", "_cell_key", "_changes_sign", "_corner_words", "_is_empty", "_known_leaf", "_mark", "_may_cross", "_put",
-    "_slot_at", "_step_block", "_surrounded_words", "_voxel", "_yield_core", "announce", "corners_at", "done", "fill",
-    "find", "finest_at", "finest_level", "finish", "half_word", "inside_window", "is_known", "least_weight",
-    "load_corners", "may_hold_surface", "quarter_word", "take", "wait_for_all", "wait_for_work",
+    "_block_at", "_cell", "_cell_key", "_changes_sign", "_corner_words", "_is_empty", "_known_leaf", "_mark",
+    "_may_cross", "_put", "_step_block", "_surrounded_words", "_voxel", "_words_at", "_yield_core", "announce",
+    "child_of", "done", "fill", "finest_level", "finish", "inside_window", "is_known", "load_corners",
+    "may_hold_surface", "place_of", "take", "wait_for_all", "wait_for_work",
 }  # fmt: skip
-"""Kernels without arithmetic on fractions, which have no roundings."""
+"""Kernels whose arithmetic has no roundings: on integers, or by powers of two."""
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ from dudmap.core.backends import threads
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, run_team, take, wait_for_all, wait_for_work
 from dudmap.core.backends.descent import descend
-from dudmap.core.backends.parameters import to_lattice
 from dudmap.core.backends.threads import kernel
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -84,11 +83,7 @@ def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, column
     parameters = tracker.parameters(volume.band)
     images = level.depth, level.intensity, weights, level.camera.intrinsics
     found = volume.backend.register(volume.grid, *images, T, first, rules, parameters)
-    grid = volume.grid
-    expected = descend(
-        lambda at: volume.backend.linearize(grid, *images, to_lattice(at, grid.voxel_size, grid.origin), parameters),
-        T, first, rules,
-    )  # fmt: skip
+    expected = descend(lambda at: tracker.linearize(volume, level, at, weights), T, first, rules)
     assert found.iterations == expected.iterations > 2
     assert found.settled == expected.settled
     assert np.abs(found.T_world_camera - T).max() > 1e-3

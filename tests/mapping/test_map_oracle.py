@@ -180,8 +180,14 @@ def test_poor_readings_give_way_to_better_ones(monkeypatch):
     frames, gains = [poor] * 20 + [good] * 5 + [poor] * 3, [1] * 20 + [5] * 5 + [1] * 3
     weights_of = [np.full(CAMERA.shape, gain, dtype=np.uint8) for gain in gains]
     for frame, weights in zip(frames, weights_of, strict=True):
-        monkeypatch.setattr(volume, "_reading_weights", lambda depth, camera, weights=weights: weights)
-        volume.integrate(frame, T)
+        view = volume._view
+
+        def weighted(*arguments, view=view, weights=weights):
+            return view(*arguments)._replace(weights=weights)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(volume, "_view", weighted)
+            volume.integrate(frame, T)
     points, distance, weight, _ = voxels_of(volume)
     chosen = np.random.default_rng(2).choice(np.flatnonzero(weight > 0), 1000, replace=False)
     expected, weights, _ = fuse(

@@ -95,9 +95,9 @@ def speed(
     )
     text = markdown(figures)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "speed.md").write_text(text, encoding="utf-8")
+    write_text(out / "speed.md", text)
     content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
-    (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_text(out / "speed.json", json.dumps(content, indent=2) + "\n")
     answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
 
 

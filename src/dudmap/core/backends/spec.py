@@ -126,29 +126,6 @@ class Backend(Protocol):
 
     # -- read the map ------------------------------------------------------------------------------------------------
 
-    def linearize(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        parameters: RegistrationParameters,
-    ) -> NormalEquations:
-        """Normal equations of the robust cost (eq. 4.43 with the weights of 4.46) of an image at a pose.
-
-        Args:
-            grid: The map.
-            depth: (h, w) float32, metres, 0 = none.
-            intensity: (h, w) float32 in [0, 1].
-            weights: (h, w) float32 static weights in [0, 1].
-            intrinsics: (4,) float32 fx, fy, cx, cy.
-            T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
-            parameters: Of the cost.
-        """
-        ...
-
     def register(
         self,
         grid: VoxelGrid,
@@ -161,8 +138,19 @@ class Backend(Protocol):
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations if they are known;
-        see ``descent.py``. Images and parameters as of ``linearize``."""
+        """Levenberg-Marquardt steps from a pose on (eq. 4.43 with the weights of 4.46); see ``descent.py``.
+
+        Args:
+            grid: The map.
+            depth: (h, w) float32, metres, 0 = none.
+            intensity: (h, w) float32 in [0, 1].
+            weights: (h, w) float32 static weights in [0, 1].
+            intrinsics: (4,) float32 fx, fy, cx, cy.
+            T_world_camera: (4, 4) pose at which the steps begin.
+            first: Normal equations there; None where they are not known yet.
+            rules: Beginning and end; without steps the result are the normal equations at the pose.
+            parameters: Of the cost.
+        """
         ...
 
     def sample(
@@ -174,8 +162,9 @@ class Backend(Protocol):
         T_grid_camera: NDArray[np.float32],
         free_after: int,
     ) -> MapSample:
-        """Signed distance, intensity difference and occupancy of the map at the points of an image; arguments as of
-        ``linearize``; ``free_after`` observations make free space."""
+        """Signed distance, intensity difference and occupancy of the map at the points of an image; images as of
+        ``register``, ``T_grid_camera`` (3, 4) float32 from the camera to the window's lattice (voxels); ``free_after``
+        observations make free space."""
         ...
 
     def raycast(

@@ -22,6 +22,8 @@ from dudmap.core.tracking.observability import COMPLETE, Observability, gradient
 FINEST_DAMPING = 1e-4
 """Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
 directions, along which more damping shortens the steps until they are taken for convergence."""
+NO_STEP = DescentRules(np.eye(6), damping=0.0, limit=0, stop=0.0, stop_gain=0.0, taken=0.0)
+"""Rules of a registration that ends where it begins, with the normal equations there."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
 MEDIAN_STRIDE = 4
@@ -268,10 +270,7 @@ class Tracker:
             weights: (h, w) float32 static weights in [0, 1].
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
-        return volume.backend.linearize(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
-            volume.T_grid_camera(T_world_camera), self.parameters(volume.band, color_weight),
-        )  # fmt: skip
+        return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, color_weight).equations
 
     def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
         """Parameters of the cost in a map with this truncation band; ``color_weight`` None: as configured."""

@@ -3,8 +3,6 @@
 Bands do not depend on the number of threads, and sums are added in their order (``threads.py``).
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -216,19 +214,6 @@ class CpuBackend:
 
     # -- read the map ------------------------------------------------------------------------------------------------
 
-    def linearize(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        parameters: RegistrationParameters,
-    ) -> NormalEquations:
-        """See ``Backend.linearize``."""
-        return self._linearization(grid, depth, intensity, weights, intrinsics, parameters)(T_grid_camera)
-
     def register(
         self,
         grid: VoxelGrid,
@@ -260,35 +245,6 @@ class CpuBackend:
         equations = first if first is not None and buffer < 0 else normal_equations(sums, residuals[buffer])
         return Descent(T, equations, count, settled)
 
-    def _linearization(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        parameters: RegistrationParameters,
-    ) -> Callable[[NDArray[np.float32]], NormalEquations]:
-        """Normal equations of an image as a function of its pose; see ``Backend.linearize``."""
-        window, geometry = on_host(grid.window), on_host(grid.geometry).reshape(-1)
-        height, width = depth.shape
-        ranges, p = bands(height, -(-PIXELS_PER_BAND // width)), single(parameters)
-        voxel_size, sdf_unit = np.float32(grid.voxel_size), np.float32(grid.sdf_unit)
-
-        def at(T_grid_camera: NDArray[np.float32]) -> NormalEquations:
-            sums = np.zeros((len(ranges), registration.NUM_SUMS))
-            residuals = np.empty((2, height, width), dtype=np.float32)
-            run_bands(
-                lambda start, stop, out: registration.linearize_rows(
-                    start, stop, depth, intensity, weights, intrinsics, T_grid_camera, window, grid.shape, geometry,
-                    voxel_size, sdf_unit, p, residuals, out,
-                ),
-                ranges, list(sums),
-            )  # fmt: skip
-            return normal_equations(sums.sum(axis=0), residuals)
-
-        return at
-
     def sample(
         self,
         grid: VoxelGrid,
@@ -302,12 +258,10 @@ class CpuBackend:
         grid = grid.on_host()
         shape, geometry, sdf_unit = depth.shape, grid.geometry.reshape(-1), np.float32(grid.sdf_unit)
         out = MapSample(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-        run_bands(
-            lambda start, stop: sampling.sample_rows(
-                start, stop, depth, intensity, intrinsics, T_grid_camera, grid.window, grid.shape, geometry, sdf_unit,
-                grid.free_count, free_after, *out,
-            ),
-            bands(shape[0], max(8, -(-shape[0] // 8))),
+        rows = max(8, -(-shape[0] // 8))
+        run_team(
+            sampling.sample, -(-shape[0] // rows), rows, depth, intensity, intrinsics, T_grid_camera, grid.window,
+            grid.shape, geometry, sdf_unit, grid.free_count, free_after, *out,
         )  # fmt: skip
         return out
 

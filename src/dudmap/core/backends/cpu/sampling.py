@@ -4,6 +4,7 @@ import numpy as np
 
 from dudmap.core.backends.cpu.gathers import LANES
 from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
 from dudmap.core.backends.threads import kernel, scalar
@@ -21,7 +22,7 @@ def corner_weight(k, ax, ay, az):
     return (x if k >> 2 != 0 else one - x) * (y if (k >> 1) & 1 != 0 else one - y) * (z if k & 1 != 0 else one - z)
 
 
-@kernel
+@scalar
 def sample_rows(
     row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
     distance, difference, occupancy,
@@ -89,3 +90,30 @@ def sample_rows(
         for u in range(w):
             if slots[u] <= -2 and free_count[np.uintp(-2 - slots[u])] >= free_after:
                 occupancy[v, u] = FREE
+
+
+@kernel
+def sample(
+    leads, team, rows, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
+    distance, difference, occupancy,
+):  # fmt: skip
+    """Sample the map at the points of an image, ``rows`` rows to a band, for a team of threads (``teams.py``); other
+    arguments as of ``sample_rows``."""
+    wide_vectors()
+    height = depth.shape[0]
+    num_bands = -(-height // rows)
+    if leads:
+        announce(team, 0)
+        band, _ = take(team, num_bands)
+    else:
+        band, _ = wait_for_work(team, num_bands)
+    while band != NO_BAND:
+        sample_rows(
+            band * rows, min(band * rows + rows, height), depth, intensity, intrinsics, T, window, shape, geometry,
+            sdf_unit, free_count, free_after, distance, difference, occupancy,
+        )  # fmt: skip
+        done(team)
+        band, _ = take(team, num_bands)
+    if leads:
+        wait_for_all(team, num_bands)
+        finish(team)

@@ -155,7 +155,7 @@ class WarpBackend(CpuBackend):
         intrinsics: NDArray[np.float32],
         parameters: RegistrationParameters,
     ) -> Callable[[NDArray[np.float32]], NormalEquations]:
-        """See ``CpuBackend``; the images go up once, for all poses."""
+        """Normal equations of an image as a function of its pose in the lattice; the images go up once for all."""
         shape, p, camera = depth.shape, struct(parameters), camera_of(intrinsics)
         threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
         with self._using():
