@@ -11,7 +11,7 @@ from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.tracking.tracker import Tracker
+from dudmap.core.tracking.tracker import NO_STEP, Tracker
 from small_maps import CAMERA, CONFIG, integrated, voxels
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
@@ -31,10 +31,8 @@ def linearized(volume, recording, tukey=0.0, index=4):
     depth, shade = frame.depth.astype(np.float32), volume.backend.intensity(np.ascontiguousarray(frame.color))
     weights = np.linspace(0, 1, depth.size, dtype=np.float32).reshape(depth.shape)
     volume.look_at(T)
-    return volume.backend.linearize(
-        volume.grid, depth, shade, weights, CAMERA.intrinsics, volume.window.T_grid_camera(T),
-        registration(volume, tukey),
-    )  # fmt: skip
+    images = depth, shade, weights, CAMERA.intrinsics
+    return volume.backend.register(volume.grid, *images, T, None, NO_STEP, registration(volume, tukey)).equations
 
 
 def test_maps_have_the_same_blocks_and_voxels(maps):
