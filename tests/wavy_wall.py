@@ -16,3 +16,9 @@ def wall(distance: float, seed: int = 0, bump: float = 0.1) -> Frame:
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     depth = distance + bump * np.sin(u / 9.0) * np.cos(v / 7.0)
     return Frame(float(seed), depth.astype(np.float32), rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8))
+
+
+def box_before_wall() -> Frame:
+    frame = wall(3.0, bump=0.0)
+    frame.depth[15:35, 20:45] = 1.2
+    return frame

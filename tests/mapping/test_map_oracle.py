@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import fusion, hashing
+from dudmap.core.backends.cpu import fusion
 from dudmap.core.backends.cpu.visibility import SETTLED
 from dudmap.core.backends.parameters import SensorNoise
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.volume import FREE, TsdfVolume
 from dudmap.core.map.voxel_blocks import MAX_LOAD
 from dudmap.errors import MapError
 from oracle import fuse, trilinear
-from wavy_wall import CAMERA, CONSTANT, wall
+from wavy_wall import CAMERA, CONSTANT, box_before_wall, wall
 
 
 def poses(count: int) -> list[np.ndarray]:
@@ -225,48 +224,6 @@ def test_sample_is_trilinear_interpolation():
     assert checked > 200
 
 
-def test_hash_table_agrees_with_a_dictionary():
-    rng = np.random.default_rng(4)
-    wanted = rng.integers(-50, 50, (5000, 3)).astype(np.int32)
-    table, coords = np.full(6007, hashing.EMPTY, np.int32), np.empty((5000, 3), np.int16)
-    entries, count = hashing.insert_all(table, coords, 0, wanted)
-    expected: dict[tuple[int, ...], int] = {}
-    for row in wanted:
-        expected.setdefault(tuple(row), len(expected))
-    assert count == len(expected)
-    assert [expected[tuple(row)] for row in wanted] == entries.tolist()
-    others = rng.integers(-60, 60, (3000, 3)).astype(np.int32)
-    found = hashing.find_all(table, coords, others)
-    assert found.tolist() == [expected.get(tuple(row), -1) for row in others]
-
-
-def test_the_index_of_blocks_grows_like_a_dictionary():
-    """Entries, coordinates and voxels of every block stay what they were while all arrays and the hash are enlarged."""
-    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.01), depth_max=4.0)
-    volume.look_at(np.eye(4))
-    rng, size = np.random.default_rng(5), int(np.prod(volume.window.shape))
-    expected: dict[int, int] = {}
-    marked: dict[int, int] = {}
-    for batch in range(12):
-        cells = rng.choice(size, 2500, replace=False).astype(np.int32)
-        entries = volume.window.entries_of(cells, volume.blocks)
-        assert entries.tolist() == [expected.setdefault(int(cell), len(expected)) for cell in cells]
-        fresh = np.array([cell for cell in cells[:300].tolist() if cell not in marked], dtype=np.int32)
-        volume.window.allocate(fresh, volume.blocks, 1)
-        volume.blocks.geometry[volume.window.cells[fresh]] = fresh[:, None]
-        marked |= {int(cell): batch for cell in fresh}
-    assert volume.blocks.num_entries == len(expected) > 4 * (1 << 12)
-    assert len(volume.blocks.table) > 1 << 14
-    known = np.array(list(expected), dtype=np.int64)
-    coords = np.stack(np.unravel_index(known, tuple(volume.window.shape)), axis=1) + volume.window.origin
-    assert np.array_equal(volume.blocks.coords[: len(known)], coords)
-    entries = volume.window.entries_of(known[::-1].astype(np.int32), volume.blocks)
-    assert entries.tolist() == list(range(len(known)))[::-1]
-    slots = volume.blocks.slot_of[[expected[cell] for cell in marked]]
-    assert np.all(volume.blocks.geometry[slots] == np.array(list(marked))[:, None])
-    assert np.array_equal(volume.window.cells[list(marked)], slots)
-
-
 def test_a_black_image_with_valid_depth_changes_the_surface_like_any_other():
     bright, black = wall(1.5), wall(1.5)
     black.color[:] = 0
@@ -300,12 +257,6 @@ def test_a_far_journey_leaves_the_map_intact():
     assert np.count_nonzero(after.vertices[:, 0] < 20) == len(before.vertices)
 
 
-def box_before_wall() -> Frame:
-    frame = wall(3.0, bump=0.0)
-    frame.depth[15:35, 20:45] = 1.2
-    return frame
-
-
 def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"carve_rate": 4, "voxel_size": 0.02}), depth_max=4.0)
     for _ in range(15):
@@ -320,22 +271,6 @@ def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     seen = volume.sample(box_before_wall().depth, np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
     empty = (seen.occupancy == FREE) | (seen.distance > 0.8 * volume.truncation)
     assert np.mean(empty[18:32, 24:41]) > 0.9
-
-
-def test_the_window_is_a_copy_of_the_hash_table():
-    """Also of blocks that were seen to be empty, and of those whose surface has come back."""
-    volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"carve_rate": 4, "voxel_size": 0.02}), depth_max=4.0)
-    released, before = 0, np.empty(0, np.int32)
-    for frame in (*[box_before_wall()] * 8, *[wall(3.0, bump=0.0)] * 16, *[box_before_wall()] * 3):
-        volume.integrate(frame, np.eye(4))
-        window = volume.window
-        fresh = BlockWindow(volume.block_size, int(window.shape[0]))
-        fresh.fill(window.origin, volume.blocks)
-        np.testing.assert_array_equal(window.cells, fresh.cells)
-        np.testing.assert_array_equal(np.sort(window.near), fresh.near)
-        released += len(np.setdiff1d(before, fresh.near))
-        before = fresh.near
-    assert released > 0
 
 
 def test_blocks_do_not_come_and_go_with_the_noise():
