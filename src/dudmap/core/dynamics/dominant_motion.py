@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.consensus import neighbour_votes
 from dudmap.core.dynamics.ransac import NOISE_PX, pixels_at_width, reproject, rigid_motion
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
@@ -223,8 +224,6 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
         corners: The labelled corners.
         whole_only: Leave out the segments whose corners disagree.
     """
-    from scipy.spatial import KDTree
-
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
         return np.zeros(level.depth.shape, dtype=bool)
@@ -239,12 +238,10 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     rows, columns = np.nonzero(mixed[labels] & (level.depth > 0))
     if len(rows) == 0:
         return out
-    z = level.depth[rows, columns].astype(np.float64)
-    # the segment is a fourth coordinate, so that corners of other segments are far away
-    known = np.column_stack([corners.points, 1e3 * corners.segment_of])
-    queries = np.column_stack([level.camera.points(columns, rows, z), 1e3 * labels[rows, columns]])
-    _, nearest = KDTree(known).query(queries, k=NEIGHBOURS)  # a segment of 3 moving and other corners has 5 and more
-    out[rows, columns] = moving[nearest].mean(axis=1) >= AGREED
+    queries = level.camera.points(columns, rows, level.depth[rows, columns].astype(np.float64))
+    # a segment of three moving and other corners has five and more
+    votes = neighbour_votes(queries, labels[rows, columns], corners.points, corners.segment_of, moving, NEIGHBOURS)
+    out[rows, columns] = votes >= AGREED * NEIGHBOURS
     return out
 
 

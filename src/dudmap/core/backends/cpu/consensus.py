@@ -1,4 +1,5 @@
-"""Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, Gauss-Newton on the inliers."""
+"""Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, Gauss-Newton on the inliers, and
+votes of the nearest ones."""
 
 from typing import NamedTuple
 
@@ -136,3 +137,35 @@ def _linearize_band(start, stop, motions, inlier_px, points, targets, intrinsics
                     gradient[g, i] = total
                 else:
                     H[g, i, j] = H[g, j, i] = total
+
+
+@kernel
+def neighbour_votes(queries, groups, points, group_of, moving, neighbours):
+    """Number (q,) of the nearest points of the same group that move.
+
+    Args:
+        queries, groups: (q, 3) float64 positions, and the group (q,) of each, which has ``neighbours`` points or more.
+        points, group_of, moving: (n, 3) float64, (n,) int32, (n,) bool: the points, their groups, and which move.
+        neighbours: Number of points that vote.
+    """
+    votes = np.empty(len(queries), np.int64)
+    distances, voters = np.empty(neighbours), np.empty(neighbours, np.int64)
+    for q in range(len(queries)):
+        distances[:] = np.inf
+        for n in range(len(points)):
+            if group_of[n] != groups[q]:
+                continue
+            x, y, z = points[n, 0] - queries[q, 0], points[n, 1] - queries[q, 1], points[n, 2] - queries[q, 2]
+            square = x * x + y * y + z * z
+            if square >= distances[neighbours - 1]:
+                continue
+            place = neighbours - 1
+            while place > 0 and distances[place - 1] > square:
+                distances[place], voters[place] = distances[place - 1], voters[place - 1]
+                place -= 1
+            distances[place], voters[place] = square, n
+        count = 0
+        for place in range(neighbours):
+            count += 1 if moving[voters[place]] else 0
+        votes[q] = count
+    return votes
