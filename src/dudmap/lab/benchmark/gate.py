@@ -12,8 +12,6 @@ from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.measure import Row, grid, measure_sequence
 from dudmap.lab.benchmark.suites import WORLDS, Entry
 
-SAMPLES = 100_000
-"""Points sampled on each surface; shares then vary by at most 0.03 %, a third of the smallest margin."""
 EXCERPT = "freiburg1_xyz"
 """Twelve real frames among the test fixtures."""
 FIGURES: dict[str, tuple[str, float, float]] = {
@@ -44,7 +42,7 @@ def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
     rows = []
     for entry in entries:
         sequence = entry.open()
-        row = measure_sequence(sequence, config, entry.surfaces(sequence), samples=SAMPLES)
+        row = measure_sequence(sequence, config, entry.surfaces(sequence))
         rows.append({"sequence": entry.name} | row)
     return rows
 

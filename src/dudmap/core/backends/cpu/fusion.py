@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.integration import integrate_blocks, observation_weights, pack_pixels, used_readings
-from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.cpu.visibility import TILE, mark_blocks, observe_free, tile_ranges, visible_slots
 from dudmap.core.backends.parameters import BLOCK, SensorNoise, single
@@ -69,13 +69,9 @@ def touch(
     block_size = np.float32(BLOCK) * p.voxel_size
     step = 0
     while step < 2:
-        if leads:
-            announce(team, step)
-            band, number = take(team, BANDS)
-        else:
-            band, number = wait_for_work(team, BANDS)
-            if band == NO_BAND:
-                break
+        band, number = first_band(leads, team, step, BANDS)
+        if band == NO_BAND and not leads:
+            break
         while band != NO_BAND:
             if number == 0:
                 first, last = part(tiles, band), part(tiles, band + 1)
@@ -141,13 +137,9 @@ def fuse(
     block_size = np.float32(BLOCK) * parameters.voxel_size
     step = 0
     while step < 2:
-        if leads:
-            announce(team, step)
-            band, number = take(team, BANDS)
-        else:
-            band, number = wait_for_work(team, BANDS)
-            if band == NO_BAND:
-                break
+        band, number = first_band(leads, team, step, BANDS)
+        if band == NO_BAND and not leads:
+            break
         while band != NO_BAND:
             if number == 0:
                 pack_pixels(part(size[0], band), part(size[0], band + 1), depth, rgb, weights, parameters, pixels)

@@ -4,7 +4,7 @@ import numpy as np
 
 from dudmap.core.backends.cpu.gathers import LANES
 from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
-from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
 from dudmap.core.backends.threads import kernel, scalar
@@ -102,11 +102,7 @@ def sample(
     wide_vectors()
     height = depth.shape[0]
     num_bands = -(-height // rows)
-    if leads:
-        announce(team, 0)
-        band, _ = take(team, num_bands)
-    else:
-        band, _ = wait_for_work(team, num_bands)
+    band, _ = first_band(leads, team, 0, num_bands)
     while band != NO_BAND:
         sample_rows(
             band * rows, min(band * rows + rows, height), depth, intensity, intrinsics, T, window, shape, geometry,

@@ -12,7 +12,7 @@ from numba import njit
 from numba.core import types
 from numba.extending import intrinsic
 
-from dudmap.core.backends.threads import also_in_other_threads, kernel, num_threads
+from dudmap.core.backends.threads import also_in_other_threads, kernel, num_threads, scalar
 
 TICKET, DONE = 0, 8
 """Places, on two cache lines, of the next ticket, step << 32 | band, and of the number of bands that are done."""
@@ -110,6 +110,15 @@ def wait_for_work(team, num_bands):
             return band, step
         _yield_core()
     return NO_BAND, FINISHED
+
+
+@scalar
+def first_band(leads, team, step, num_bands):
+    """A first band of the next step, which the leading thread offers to all, and the number of its step."""
+    if leads:
+        announce(team, step)
+        return take(team, num_bands)
+    return wait_for_work(team, num_bands)
 
 
 @kernel
