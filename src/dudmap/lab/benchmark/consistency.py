@@ -134,7 +134,7 @@ def measure_consistency(
             f"{LEAST_BLOCKS * length + min(gaps)} of one recording, with its time stamps"
         )
     config, every = Config(), max(1, len(stamps) // PAIRS)
-    preprocess = Preprocessor(sequence.camera, config.preprocess, None, sequence.calibration)
+    preprocess = Preprocessor(sequence.camera, config.preprocess, calibration=sequence.calibration)
     misfits, counts = np.zeros((2, len(gaps), blocks, len(poses))), np.zeros((2, len(gaps), blocks))
     views: dict[int, Level] = {}
 
