@@ -35,8 +35,6 @@ from dudmap.core.frames.exposure import exposed
 from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
 
-MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
 MAX_GAP = 1.5
 """Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
 MAP_ROUGHNESS = 0.4
@@ -179,8 +177,9 @@ class DynamicDetector:
             dynamic = evidence.moving_regions(seeds, log_odds, level.depth, noise.tolerance, least, SEEDED_SHARE)
             if self.config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
-            if moving is not None:
-                dynamic = dynamic | moving
+            if moving is not None and moving.any():
+                image = timestamp, level, T_world_camera, segmentation(), noise.bounded_sigma
+                dynamic = dynamic | (moving & ~self.memory.stayed(*image, moving))
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -251,7 +250,7 @@ class DynamicDetector:
         3. Segments that have settled are static.
         """
         level, T_world_camera = frame.level, frame.T_world_camera
-        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
+        before = self.memory.last_dynamic(level, T_world_camera)
         counts = evidence.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
         split = split_mixed_segments(segmentation, before, *counts[:2])
         if split is not segmentation:
