@@ -22,6 +22,11 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 kernel = njit(**_OPTIONS)
+_EXACT = {name: value for name, value in _OPTIONS.items() if name != "fastmath"}
+exact = njit(**_EXACT)
+"""Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
+exact_scalar = njit(**_EXACT, forceinline=True)
+"""Compiles what such loops call; ``py_func`` is the same formula for whole images."""
 scalar = njit(**_OPTIONS, forceinline=True)
 """Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
 function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
