@@ -13,6 +13,7 @@ from dudmap.core.backends.cpu.evidence import (
     noise_limit,
     static_sigma,
 )
+from dudmap.core.backends.cpu.image_comparison import AGREEING_SIGMAS
 from dudmap.core.backends.cpu.segment_motion import (
     COMMON_DISTANCE,
     COMMON_MISMATCH,
@@ -24,7 +25,9 @@ from dudmap.core.backends.cpu.segment_motion import (
     SETTLED_SIGMAS,
     STARTED_SHARE,
 )
+from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
+from dudmap.core.frames.exposure import fit_exposure
 
 
 def weighed(depth, sample, noise):
@@ -118,3 +121,17 @@ def still(segments, dynamic, gap, difference):
     visible = (visible > 0.7) & (size >= segments.min_pixels)
     limit = 1.2 * max(COMMON_MISMATCH, quartile(mismatch[visible]))
     return (visible & (moves < 0.1) & (np.abs(distance) < 1) & (mismatch < limit))[count + 1 :]
+
+
+def compared(depth, intensity, moves, gap, difference, marks, noise):
+    """Shift of two images, and readings: those that agree, all, and those of the older image."""
+    agreeing = np.count_nonzero(np.abs(gap) < AGREEING_SIGMAS * (noise.base + noise.scale * depth**2))
+    sigma = static_sigma.py_func(depth, noise.base, noise.scale, np.float32(0))
+    tolerance = edge_tolerance.py_func(sigma, depth, noise.edge_sigmas, noise.edge_slope)
+    common = (marks == 0) & ~moves & (np.abs(gap) < tolerance)
+    gain, offset = fit_exposure(intensity, difference, common.astype(np.float32))
+    difference = difference + np.float32(1 - gain) * intensity - np.float32(offset)
+    down, across = np.gradient(intensity)
+    contrast = float(median(np.sqrt(down**2 + across**2)[common]))
+    shift = np.sqrt(2) * median(np.abs(difference[common])) / contrast
+    return shift, agreeing, np.count_nonzero(depth), np.count_nonzero(np.isfinite(gap))

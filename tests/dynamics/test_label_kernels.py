@@ -13,6 +13,7 @@ from dudmap.core.backends.cpu.evidence import (
     moving_pixels,
     weigh_readings,
 )
+from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.labeling import opened
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, moving_segments, stand_still
 from dudmap.core.backends.parameters import SURFACE, MapSample, single
@@ -117,3 +118,15 @@ def test_segments_that_stand_still(scene):
     assert stand_still(segments, dynamic, gap, difference, settled) == expected.any()
     assert np.array_equal(settled[1:], expected)
     assert 0 < expected.sum() < 32
+
+
+def test_an_older_image_is_compared(scene):
+    rng, depth, intensity, _ = scene
+    gap = (0.01 * smooth(rng, 4)).astype(np.float32)
+    gap[(depth <= 0) | (rng.random(SHAPE) < 0.1)] = np.nan
+    difference = np.where(np.isnan(gap), np.float32(np.nan), 0.1 * intensity + 0.02 * smooth(rng, 1))
+    images = depth, intensity, smooth(rng, 4) > 1, gap, difference, (smooth(rng, 4) > 1).astype(np.uint8)
+    expected = label_oracle.compared(*images, NOISE)
+    assert compare_images(*images, NOISE, 100) == expected
+    assert np.isnan(compare_images(*images, NOISE, depth.size)[0])
+    assert 0 < expected[0] < 2

@@ -162,7 +162,11 @@ class DynamicDetector:
             moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
             exposure: Gain and offset that make the image's intensities those of the map.
         """
-        config, depth, noise = self.config, level.depth, self._noise_parameters(level, volume.voxel_size)
+        config, depth, noise = (
+            self.config,
+            level.depth,
+            noise_parameters(self.config, self.sensor, level, volume.voxel_size),
+        )
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
         sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
         histogram = np.zeros(BINS, np.int64)
@@ -223,15 +227,6 @@ class DynamicDetector:
         self.memory.reset()
         self.background.reset()
 
-    def _noise_parameters(self, level: Level, voxel_size: float) -> NoiseParameters:
-        """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
-        config, sensor = self.config, self.sensor
-        parameters = NoiseParameters(
-            sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
-            DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas,
-        )  # fmt: skip
-        return single(parameters)
-
     def _seen_free(self, frame: _Comparison, unknown: float) -> NDArray[np.bool_]:
         """Pixels (h, w) in space that single frames have seen to be free, of size 0 where they are not asked;
         ``unknown`` is the share of the readings in space unknown to the map."""
@@ -279,6 +274,15 @@ class DynamicDetector:
         open_pixels = (distance > noise) | frame.free
         labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0
+
+
+def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
+    """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
+    parameters = NoiseParameters(
+        sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
+        DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas,
+    )  # fmt: skip
+    return single(parameters)
 
 
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
