@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.segment_motion import classify_segments, split_mixed_segments
+from dudmap.core.backends.cpu.segment_motion import classify_segments, counts_in, split_mixed_segments
 from dudmap.core.dynamics.segments import segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level
@@ -59,7 +59,9 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
 
 
 def split(segmentation, before):
-    return split_mixed_segments(segmentation.labels, segmentation.count, before, segmentation.min_pixels)
+    labels, count = segmentation.labels, segmentation.count
+    total, part, _ = counts_in(labels, count, before, before)
+    return split_mixed_segments(labels, count, before, total, part, segmentation.min_pixels)
 
 
 def test_segments_that_have_merged_are_split_by_their_last_labels():

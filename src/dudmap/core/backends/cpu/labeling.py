@@ -256,19 +256,25 @@ def opened(mask, half):
     """
     h, w = mask.shape
     across, out = np.empty((h, w), np.bool_), mask.copy()
-    for dilate in range(2):
+    for turn in range(2):  # the pixels outside are dilated, then those inside
         for v in range(h):
             for u in range(w):
-                found = False
-                for n in range(max(u - half, 0), min(u + half + 1, w)):
-                    found = found or out[v, n] == (dilate == 1)
-                across[v, u] = found
+                across[v, u] = out[v, u] == (turn == 1)
+            for k in range(1, half + 1):
+                for u in range(w - k):
+                    n = np.uintp(u + k)
+                    across[v, u] |= out[v, n] == (turn == 1)
+                    across[v, n] |= out[v, u] == (turn == 1)
         for v in range(h):
+            first, last = max(v - half, 0), min(v + half, h - 1)
             for u in range(w):
-                found = False
-                for n in range(max(v - half, 0), min(v + half + 1, h)):
-                    found = found or across[n, u]
-                out[v, u] = found == (dilate == 1)
+                out[v, u] = across[first, u]
+            for n in range(first + 1, last + 1):
+                for u in range(w):
+                    out[v, u] |= across[n, u]
+            if turn == 0:
+                for u in range(w):
+                    out[v, u] = not out[v, u]
     return out
 
 

@@ -72,24 +72,28 @@ def window_means(compared, difference, window):
     """Mean difference (h, w) over those pixels of a square window that are compared."""
     h, w = compared.shape
     half, by_area = window // 2, 1.0 / (window * window)
-    ones, sums, means = np.empty((h, w)), np.empty((h, w)), np.empty((h, w), np.float32)
+    ones, sums, means = np.zeros((h, w)), np.zeros((h, w)), np.empty((h, w), np.float32)
+    one, value = np.empty(w + 2 * half), np.empty(w + 2 * half)
     for v in range(h):
-        for u in range(w):
-            one, total = 0.0, 0.0
-            for k in range(-half, half + 1):
-                n = mirrored(u + k, w)
-                if compared[v, n]:
-                    one += 1.0
-                    total += f64(difference[v, n])
-            ones[v, u], sums[v, u] = one, total
+        for u in range(-half, w + half):
+            n = mirrored(u, w)
+            one[u + half] = 1.0 if compared[v, n] else 0.0
+            value[u + half] = f64(difference[v, n]) if compared[v, n] else 0.0
+        for k in range(window):
+            for u in range(w):
+                ones[v, u] += one[np.uintp(u + k)]
+                sums[v, u] += value[np.uintp(u + k)]
     for v in range(h):
+        one[:] = 0
+        value[:] = 0
+        for k in range(-half, half + 1):
+            n = mirrored(v + k, h)
+            for u in range(w):
+                one[np.uintp(u)] += ones[n, u]
+                value[np.uintp(u)] += sums[n, u]
         for u in range(w):
-            one, total = 0.0, 0.0
-            for k in range(-half, half + 1):
-                n = mirrored(v + k, h)
-                one += ones[n, u]
-                total += sums[n, u]
-            means[v, u] = np.float32(total * by_area) / max(np.float32(one * by_area), LEAST_SHARE)
+            share = max(np.float32(one[np.uintp(u)] * by_area), LEAST_SHARE)
+            means[v, u] = np.float32(value[np.uintp(u)] * by_area) / share
     return means
 
 
@@ -192,18 +196,20 @@ def classify_segments(evidence, before, min_pixels):
 
 
 @exact_scalar
-def counts_in(labels, count, mask):
-    """Pixels (count + 1,) float64 of each segment, and those of them in a mask (h, w) bool."""
-    total, inside = np.zeros(count + 1), np.zeros(count + 1)
+def counts_in(labels, count, first, second):
+    """Pixels (count + 1,) of each segment, and those of them in two masks (h, w) bool."""
+    total, ones, twos = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
-            total[labels[v, u]] += 1.0
-            inside[labels[v, u]] += mask[v, u]
-    return total, inside
+            n = labels[v, u]
+            total[n] += 1
+            ones[n] += first[v, u]
+            twos[n] += second[v, u]
+    return total, ones, twos
 
 
 @exact_scalar
-def split_mixed_segments(labels, count, before, min_pixels):
+def split_mixed_segments(labels, count, before, total, part, min_pixels):
     """Labels and number of the segments where those that were separate in the last frame, a dynamic and a static one,
     stay separate.
 
@@ -212,8 +218,8 @@ def split_mixed_segments(labels, count, before, min_pixels):
     Args:
         labels, count, min_pixels: As of ``SegmentImage``.
         before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        total, part: (count + 1,) int64 pixels of each segment, and those that did.
     """
-    total, part = counts_in(labels, count, before)
     number, first = np.zeros(count + 1, np.int32), count
     for n in range(1, len(total)):
         if min(part[n], total[n] - part[n]) >= max(min_pixels, 0.2 * total[n]):
@@ -248,21 +254,23 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
     Returns:
         Labels and number of the segments, some of which may have been split.
     """
-    labels, count = split_mixed_segments(segments.labels, segments.count, before, segments.min_pixels)
-    h, w = labels.shape
-    total, started = counts_in(labels, count, seeds)
+    labels, count = segments.labels, segments.count
+    total, started, part = counts_in(labels, count, seeds, before)
+    labels, count = split_mixed_segments(labels, count, before, total, part, segments.min_pixels)
+    if count > segments.count:
+        total, started, part = counts_in(labels, count, seeds, before)
+    (h, w), size = labels.shape, np.maximum(total, 1)
+    begins = started / size >= STARTED_SHARE
     compared, difference = np.empty((h, w), np.bool_), np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
-            n = labels[v, u]
-            if sample.occupancy[v, u] == UNKNOWN and started[n] / max(total[n], 1.0) < STARTED_SHARE:
-                dynamic[v, u] = False
-            compared[v, u] = sample.occupancy[v, u] == SURFACE
+            occupancy = sample.occupancy[v, u]
+            dynamic[v, u] = dynamic[v, u] and (occupancy != UNKNOWN or begins[labels[v, u]])
+            compared[v, u] = occupancy == SURFACE
             lit = sample.difference[v, u] + (gain * intensity[v, u] - offset)
             difference[v, u] = np.float32(0) if np.isnan(lit) else lit  # in the air
     evidence = segment_evidence(segments, labels, count, compared, dynamic, sample.distance, difference)
-    total, part = counts_in(labels, count, before)
-    moving = classify_segments(evidence, part / np.maximum(total, 1.0), segments.min_pixels)
+    moving = classify_segments(evidence, part / size, segments.min_pixels)
     for v in range(h):
         for u in range(w):
             dynamic[v, u] = dynamic[v, u] or moving[labels[v, u]]
