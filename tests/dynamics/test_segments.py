@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import segment_counts
-from dudmap.core.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
+from dudmap.core.backends.cpu.segment_motion import classify_segments, counts_in, split_mixed_segments
+from dudmap.core.dynamics.segments import segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.camera import Camera
@@ -59,20 +59,23 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
 
 
 def split(segmentation, before):
-    counts = segment_counts(segmentation.labels, segmentation.count, [before])
-    return split_mixed_segments(segmentation, before, *counts)
+    labels, count = segmentation.labels, segmentation.count
+    total, part, _ = counts_in(labels, count, before, before)
+    return split_mixed_segments(labels, count, before, total, part, segmentation.min_pixels)
 
 
 def test_segments_that_have_merged_are_split_by_their_last_labels():
     whole = segment(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
     body = np.zeros(CAMERA.shape, bool)
-    assert split(whole, body) is whole
+    assert split(whole, body)[1] == whole.count
     body[:, :60] = True
-    two = split(whole, body)
-    assert two.count == whole.count + 1
-    assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
+    labels, count = split(whole, body)
+    assert count == whole.count + 1
+    assert len(np.unique(labels[body])) == len(np.unique(labels[~body])) == 1
     body[:, 6:60] = False  # a strip that came into view
-    assert split(whole, body) is whole
+    labels, count = split(whole, body)
+    assert count == whole.count
+    assert np.array_equal(labels, whole.labels)
 
 
 def scene(x):
@@ -212,23 +215,12 @@ def test_an_object_that_stops_becomes_static_after_the_settle_time():
 )
 def test_motion_is_decided_per_segment(share, before, distance, mismatch, whole):
     """A segment some of which moves is dynamic if the rest of it fits less well than static segments do."""
-    evidence = SegmentEvidence(
-        size=np.array([0, 500.0, 20000]),
-        compared=np.ones(3),
-        dynamic=np.array([0, share, 0]),
-        distance=np.array([0, distance, 0.1]),
-        mismatch=np.array([0, mismatch, 0.05]),
-    )
-    assert classify_segments(evidence, np.array([0, before, 0])).tolist() == [False, whole, False]
+    evidence = np.array([[0.0] * 5, [500, 1, share, distance, mismatch], [20000, 1, 0, 0.1, 0.05]])
+    found = classify_segments(evidence, np.array([0.0, before, 0]), 60.0)
+    assert found.tolist() == [False, whole, False]
 
 
 def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
     for share, whole in ((0.5, False), (0.9, True)):
-        evidence = SegmentEvidence(
-            size=np.array([0, 5000.0, 15000]),
-            compared=np.ones(3),
-            dynamic=np.array([0, share, 0]),
-            distance=np.array([0, 3.0, 0.1]),
-            mismatch=np.array([0, 1.0, 0.05]),
-        )
-        assert classify_segments(evidence, np.zeros(3)).tolist() == [False, whole, False]
+        evidence = np.array([[0.0] * 5, [5000, 1, share, 3, 1], [15000, 1, 0, 0.1, 0.05]])
+        assert classify_segments(evidence, np.zeros(3), 60.0).tolist() == [False, whole, False]
