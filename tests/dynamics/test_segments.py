@@ -8,6 +8,7 @@ from dudmap.core.backends.cpu.segment_motion import classify_segments, counts_in
 from dudmap.core.dynamics.segments import segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
@@ -108,6 +109,22 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
     assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
+
+
+def test_what_is_remembered_follows_a_correction_of_the_world():
+    """As if the world had been the corrected one from the first frame on."""
+    correction, sigma = se3.exp(np.array([0.3, -0.1, 0.2, 0.0, 0.1, 0.05])), np.full(CAMERA.shape, 0.01, np.float32)
+    memory, (image, board) = TemporalMemory(DynamicsConfig(settle_time=1.0)), scene(0.0)
+    surface = segment(image, TOLERANCE)
+    for i in range(35):
+        memory.update(i / 30, image, np.eye(4), board, surface)
+    memory.apply_correction(correction)
+    frame = 35 / 30, image, correction, surface, sigma, board
+    assert memory.settled(*frame)[board].mean() > 0.9
+    assert memory.last_dynamic(image, correction, 0.1)[board].mean() > 0.9
+    assert not free_space(memory, 35 / 30, image, correction).any()
+    memory.apply_correction(correction)
+    assert not memory.settled(*frame).any()
 
 
 def free_space(memory, timestamp, image, T, unknown=0.0):

@@ -339,6 +339,7 @@ class Slam(SlamResults):
         self.bootstrap.abandon()  # frames held back have poses of before
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
+        self.detector.apply_correction(correction)
         return correction @ T_world_camera, True
 
     def _calibrate(

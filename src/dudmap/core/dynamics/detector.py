@@ -222,6 +222,11 @@ class DynamicDetector:
         if self.config.free_space:
             self.background.update(timestamp, exposed(level, exposure), T_world_camera, labels.dynamic)
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move what is remembered with a correction (4, 4) of the world."""
+        self.memory.apply_correction(T_new_old)
+        self.background.apply_correction(T_new_old)
+
     def reset(self) -> None:
         """Forget the remembered frames after a loss of tracking."""
         self.memory.reset()

@@ -30,7 +30,7 @@ DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RememberedFrame:
     """A tracked frame with its labels.
 
@@ -118,6 +118,12 @@ class TemporalMemory:
             recent_frames.popleft()
         while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
             settle_frames.popleft()
+
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the frames with a correction (4, 4) of the world."""
+        frames = [*self._settle_frames, *self._recent_frames, *(() if self._imported else self._start_frames)]
+        for frame in {id(frame): frame for frame in [*frames, self._last] if frame is not None}.values():
+            frame.T_world_camera = T_new_old @ frame.T_world_camera
 
     def reset(self) -> None:
         """Forget all frames after a loss of tracking; those imported from another pass stay."""
