@@ -107,7 +107,7 @@ def test_mesh_of_a_run_is_moved_into_the_true_world(folders):
     assert len(Mesh.load(run / "mesh_error.ply").faces) == 4
     apart = figures("mesh", run / "mesh.ply", recording / "surface.ply", "--samples", 2000, "--no-error-mesh")
     assert apart["accuracy_rmse_m"] > 0.1
-    aligned = figures("mesh", run, recording, "--align", "--samples", 2000, "--distances", "0.002")
+    aligned = figures("mesh", run, recording, "--register", "--samples", 2000, "--distances", "0.002")
     assert aligned["icp_rmse_m"] < 1e-3
     assert aligned["precision_2mm"] > 0.99
 
@@ -132,6 +132,10 @@ def test_pictures(folders):
     assert re.search(r"ate_rmse +│ [\d.]+ mm", outcome.stdout)
     assert evaluate("mesh", run, recording, "--plots", "--samples", 2000).exit_code == 0
     assert evaluate("masks", run, recording, "--plots").exit_code == 0
+    assert evaluate("masks", run, recording, "--plot-format", "pdf").exit_code == 0
+    assert (run / "masks.pdf").read_bytes().startswith(b"%PDF")
+    assert evaluate(run, "--reference", recording, "--plot-format", "svg").exit_code == 0
+    assert "<svg" in (run / "trajectory.svg").read_text(encoding="utf-8")
     for name in ("trajectory", "error", "rpe", "residuals", "mesh_error", "masks"):
         image = cv2.imread(str(run / f"{name}.png"))
         assert image is not None, name
@@ -150,6 +154,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
         ((run, "--reference", tmp_path / "empty"), "there is no true trajectory"),
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
         ((run, "--plots"), "name one with --reference"),
+        ((run, "--plot-format", "gif"), "found --plot-format gif; expected png, pdf or svg"),
         (("mesh", tmp_path / "empty", recording), "there is no mesh"),
         (("mesh", tmp_path / "broken.ply", recording), "cannot read the mesh"),
         (("mesh", run, recording, "--distances", "1cm"), "expected numbers separated by commas"),

@@ -17,17 +17,18 @@ app = typer.Typer(add_completion=False)
 def render(
     run: o.RunArgument,
     out: Annotated[
-        Path, typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout.")
+        Path,
+        typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout."),
     ],
     trajectory: Annotated[
-        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
+        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
     ] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the middle of the map.")] = False,
     sweep: Annotated[
         float, typer.Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
     max_frames: o.FramesOption = 120,
-    fps: Annotated[float, typer.Option(min=0.1, help="Frames per second.")] = 30.0,
+    fps: o.RateOption = 30.0,
     size: Annotated[str | None, typer.Option(help="Image size in pixels.", metavar="WxH")] = None,
     up: o.UpOption = None,
     quiet: o.QuietOption = False,
