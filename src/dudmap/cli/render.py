@@ -47,12 +47,12 @@ def render(
     if (trajectory is None) == (not orbit):
         raise ConfigError("name either a --trajectory or --orbit")
     content = RunContent.load(run)
-    if trajectory is not None:
-        path = Trajectory.load(trajectory)
-    else:
-        path = rendering.orbit(content, up_of(content, ExportOptions(up=o.direction(up))), sweep, max_frames, fps)
+    pixels = None if size is None else o.image_size(size)
     with counted("rendering", quiet=quiet or as_json) as progress:
-        count = rendering.render_run(
-            content, path, out, size=None if size is None else o.image_size(size), fps=fps, progress=progress
-        )
+        if trajectory is not None:
+            path = Trajectory.load(trajectory)
+        else:
+            upright, camera = up_of(content, ExportOptions(up=o.direction(up))), rendering.view_camera(content, pixels)
+            path = rendering.orbit(content, upright, sweep, max_frames, fps, camera)
+        count = rendering.render_run(content, path, out, size=pixels, fps=fps, progress=progress, whole=orbit)
     answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)

@@ -118,16 +118,18 @@ class View {
     const right = new THREE.Vector3().crossVectors(this.up, back).normalize();
     const axes = [right, new THREE.Vector3().crossVectors(back, right), back];
     const points = this.mapPoints().map((point) => axes.map((axis) => axis.dot(point)));
-    const middle = axes.map((_, k) => points.reduce((sum, point) => [Math.min(sum[0], point[k]), Math.max(sum[1], point[k])],
-      [Infinity, -Infinity]).reduce((low, high) => (low + high) / 2));
+    const most = (value) => points.reduce((largest, point) => Math.max(largest, value(point)), -Infinity);
     const tangent = Math.tan((this.camera.fov * Math.PI) / 360) * 0.96;
-    const reach = [tangent * this.camera.aspect, tangent];
-    let away = 0.5;
-    for (const point of points)
-      for (const k of [0, 1]) away = Math.max(away, Math.abs(point[k] - middle[k]) / reach[k] + point[2] - middle[2]);
-    this.controls.target.set(0, 0, 0);
-    axes.forEach((axis, k) => this.controls.target.addScaledVector(axis, middle[k]));
-    this.camera.position.copy(this.controls.target).addScaledVector(back, away);
+    let away = most((point) => point[2]) + 0.5;
+    const place = [tangent * this.camera.aspect, tangent].map((reach, k) => {
+      const low = most((point) => point[2] - point[k] / reach);
+      const high = most((point) => point[2] + point[k] / reach);
+      away = Math.max(away, (high + low) / 2);
+      return (reach * (high - low)) / 2;
+    });
+    const at = (distance) => new THREE.Vector3(...place, distance).applyMatrix4(new THREE.Matrix4().makeBasis(...axes));
+    this.camera.position.copy(at(away));
+    this.controls.target.copy(at((most((point) => point[2]) - most((point) => -point[2])) / 2));
     this.controls.update();
   }
 
