@@ -50,7 +50,7 @@ def program(*arguments, cwd):
 def run_folder(tmp_path_factory):
     """What the README's second command leaves, on the real excerpt."""
     where = tmp_path_factory.mktemp("docs")
-    line = next(line for line in README.splitlines() if "--save-masks --out my_run" in line)
+    line = next(line for line in README.splitlines() if "--out my_run --set" in line)
     arguments = shlex.split(line.partition("#")[0].replace("SEQUENCE", str(EXCERPT)))[1:]
     done = program(*arguments, cwd=where)
     assert done.returncode == 0, done.stderr

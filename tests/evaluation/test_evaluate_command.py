@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.viewing.run_files import RunFiles
 from dudmap.cli import app
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
 from layouts import bonn, pose, replica, tum_line, write
+from run_folders import write_run
 
 
 def evaluate(*arguments):
@@ -193,3 +195,17 @@ def test_errors_are_printed_in_millimetres():
     assert _shown("ate_rmse_m", 0.00745755) == ("ate_rmse", "7.5 mm")
     assert _shown("rpe_trans_rmse_m_per_s", 0.0123) == ("rpe_trans_rmse per s", "12.3 mm")
     assert _shown("path_length_m", 3.25) == ("path_length_m", "3.25")
+    assert _shown("rpe_rot_rmse_deg_per_m", 0.7146) == ("rpe_rot_rmse per m", "0.71 deg")
+    assert _shown("ate_rot_rmse_deg", 2.7328) == ("ate_rot_rmse (see rotation_rmse)", "2.73 deg")
+
+
+def test_times_per_stage_are_a_table_for_a_paper(tmp_path):
+    write_run(tmp_path / "run")
+    figures = json.loads(evaluate("timings", tmp_path / "run", "--json").stdout)
+    columns = RunFiles.load(tmp_path / "run")
+    for stage in ("total", *columns.stages):
+        assert figures[f"{stage}_median_ms"] == pytest.approx(np.median(columns.column(stage)), abs=1e-3)
+        assert figures[f"{stage}_p95_ms"] == pytest.approx(np.percentile(columns.column(stage), 95), abs=1e-3)
+    rows = (tmp_path / "run" / "timings.tex").read_text(encoding="utf-8").splitlines()
+    assert rows[2].startswith(f"total & {figures['total_median_ms']:.1f} & ")
+    assert len(rows) == 3 + len(columns.stages) + 1

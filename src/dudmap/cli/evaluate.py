@@ -26,7 +26,7 @@ app = typer.Typer(
     cls=DefaultGroup,
     add_completion=False,
     no_args_is_help=True,
-    help="Score a trajectory, a mesh or dynamic masks against the ground truth.\n\n"
+    help="Score a trajectory, a mesh or dynamic masks against the ground truth, or the time per frame.\n\n"
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
@@ -121,7 +121,7 @@ def mesh(
 ) -> None:
     """Score a mesh: accuracy, completeness, precision, recall, F-score and ghosts.
 
-    A run folder and a recording with groundtruth.txt are aligned at their first pose. Anything else must share one
+    A run folder and a recording with groundtruth.txt are aligned at their first pose. Other surfaces must share one
     coordinate frame.
     """
     from dudmap.evaluation import reconstruction
@@ -210,6 +210,30 @@ def masks(
         pictures = [target / f"masks.{ending}"]
         plot_masks(pictures[0], result)
     _report(figures, target / "masks.evaluation.json", pictures, as_json=as_json, title="masks")
+
+
+@app.command()
+def timings(run: o.RunArgument, as_json: o.JsonOption = False, out: OutOption = None) -> None:
+    """Score the time per frame: median, mean and 95 % quantile of every stage, also as a LaTeX table (timings.tex)."""
+    import numpy as np
+
+    from dudmap.app.viewing.run_files import RunFiles
+
+    found = RunFiles.load(run)
+    if not found.frames:
+        raise DatasetError(f"{run} holds no times per frame (timings.csv); name a folder of dudmap run")
+    figures: Figures = {"estimate": str(run), "frames": len(found.frames)}
+    lines = [r"\begin{tabular}{lrrr}", r"stage & median & mean & 95\,\% \\ \hline"]
+    for stage in ["total", *found.stages]:
+        times = found.column(stage)
+        row = float(np.median(times)), float(times.mean()), float(np.percentile(times, 95))
+        for name, value in zip(("median", "mean", "p95"), row, strict=True):
+            figures[f"{stage}_{name}_ms"] = round(value, 3)
+        cells = " & ".join(f"{value:.1f}" for value in row)
+        lines.append(f"{stage.replace('_', ' ')} & {cells} \\\\")
+    target = _output_folder(out, run)
+    write_text(target / "timings.tex", "\n".join([*lines, r"\end{tabular} % milliseconds per frame"]) + "\n")
+    _report(figures, target / "timings.evaluation.json", [target / "timings.tex"], as_json=as_json, title="timings")
 
 
 def _plot_ending(plots: bool, plot_format: str | None) -> str:

@@ -112,7 +112,9 @@ JobsOption = Annotated[
     int, typer.Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
-SaveMasksOption = Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")]
+SaveMasksOption = Annotated[
+    bool, typer.Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")
+]
 HostOption = Annotated[
     str, typer.Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
 ]

@@ -23,7 +23,7 @@ def render(
     trajectory: Annotated[
         Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
     ] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the middle of the map.")] = False,
+    orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the whole map.")] = False,
     sweep: Annotated[
         float, typer.Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
@@ -36,7 +36,7 @@ def render(
 ) -> None:
     """Render the map as a camera would see it: a picture, a video, or a recording without anything that moves.
 
-    A picture shows the first pose of the trajectory, or without one the map from the middle of the orbit.
+    A picture shows the first pose of the trajectory, or without one the whole map.
     """
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory

@@ -38,7 +38,7 @@ def run(
     ] = None,
     max_frames: o.MaxFramesOption = None,
     out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<recording>.")] = None,
-    save_masks: o.SaveMasksOption = False,
+    save_masks: o.SaveMasksOption = True,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     passes: o.PassesOption = 1,
