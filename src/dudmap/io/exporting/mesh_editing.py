@@ -39,12 +39,12 @@ def cropped(mesh: Mesh, box: Box) -> Mesh:
 
 def without_small_pieces(mesh: Mesh, area: float = SPECK) -> Mesh:
     """Mesh without the connected pieces whose surface is smaller than ``area``, square metres."""
-    piece = _pieces(mesh)[mesh.faces[:, 0]]
+    piece = pieces(mesh)[mesh.faces[:, 0]]
     kept = np.bincount(piece, face_areas(mesh))[piece] >= area
     return mesh if kept.all() else with_faces(mesh, kept)
 
 
-def _pieces(mesh: Mesh) -> NDArray[np.int32]:
+def pieces(mesh: Mesh) -> NDArray[np.int32]:
     """Number (V,) of the connected piece that each vertex belongs to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
