@@ -14,7 +14,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
-from layouts import bonn, pose, replica, tum_line, write
+from layout_images import pose, tum_line
+from layouts import bonn, replica, write
 from run_folders import write_run
 
 

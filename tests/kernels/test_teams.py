@@ -62,7 +62,7 @@ def registration():
     config = Config().override(["volume.voxel_size=0.05", "volume.truncation_noise=0"])
     backend = CpuBackend()
     volume = TsdfVolume(CAMERA, config.volume, config.sensor, backend=backend)
-    observation = Preprocessor(CAMERA, config.preprocess, backend)(wall(2.0))
+    observation = Preprocessor(CAMERA, config.preprocess)(wall(2.0))
     volume.integrate(wall(2.0), np.eye(4))
     level = Pyramid.of(observation, CAMERA, config).fine
     tracker = Tracker(config.tracker, config.sensor)

@@ -87,8 +87,7 @@ class Slam(SlamResults):
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
-        backend = make_backend(self.device)
-        self.preprocess = Preprocessor(camera, config.preprocess, backend, given)
+        self.preprocess = Preprocessor(camera, config.preprocess, given)
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
@@ -339,6 +338,7 @@ class Slam(SlamResults):
         self.bootstrap.abandon()  # frames held back have poses of before
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
+        self.detector.apply_correction(correction)
         return correction @ T_world_camera, True
 
     def _calibrate(

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import compare_with_frame, free_space, seen_marked
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget
+from dudmap.core.backends.cpu.evidence import free_space, seen_marked
+from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.cpu.segment_motion import stand_still
 from dudmap.core.dynamics.label_scale import scaled_side
-from dudmap.core.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
+from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 
@@ -29,7 +30,7 @@ DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RememberedFrame:
     """A tracked frame with its labels.
 
@@ -118,6 +119,12 @@ class TemporalMemory:
         while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
             settle_frames.popleft()
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the frames with a correction (4, 4) of the world."""
+        frames = [*self._settle_frames, *self._recent_frames, *(() if self._imported else self._start_frames)]
+        for frame in {id(frame): frame for frame in [*frames, self._last] if frame is not None}.values():
+            frame.T_world_camera = T_new_old @ frame.T_world_camera
+
     def reset(self) -> None:
         """Forget all frames after a loss of tracking; those imported from another pass stay."""
         self._last = None
@@ -183,41 +190,33 @@ class TemporalMemory:
         segmentation: Segmentation,
         sigma: NDArray[np.float32],
         dynamic: NDArray[np.bool_],
+        least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
         """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
 
-        The dynamic part of a segment has settled if, compared with every frame kept of ``settle_time``, more than 0.7
-        of its pixels are visible, less than 0.1 of them lie off by more than 4 sigma, the mean distance is below one
-        sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
+        The dynamic part of a segment has settled if it has stood still (``stand_still``) since every frame kept of
+        ``settle_time``.
 
         Args:
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
             segmentation: Its segments.
-            sigma: (h, w) float32, standard deviation of a distance, metres.
+            sigma: (h, w) float32, standard deviation of a distance, metres; ``least_sigma`` at least.
             dynamic: (h, w) bool.
+            least_sigma: Metres.
         """
-        none = np.zeros_like(dynamic)
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
-            return none
-        count = segmentation.count
-        labels = segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0))
-        parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
-        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
-        settled[: count + 1] = False
+            return np.zeros_like(dynamic)
+        settled = np.ones(segmentation.count + 1, dtype=np.bool_)
+        settled[0] = False
+        segments = segmentation.with_noise(sigma, least_sigma)
         for target in _targets(T_world_camera, frames):
-            image = level.depth, level.intensity, level.camera.intrinsics
-            sums = compare_with_frame(*image, target, parts.with_noise(sigma), 4)
-            evidence = evidence_of(sums, parts.min_pixels)
-            visible = evidence.compared > 0.7
-            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
-            settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
-            settled &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
-            if not settled.any():
-                return none
-        return settled[parts.labels]
+            ((gap, difference, _),) = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])
+            if not stand_still(segments, dynamic, gap, difference, settled):
+                return np.zeros_like(dynamic)
+        return dynamic & settled[segmentation.labels]
 
 
 def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:
