@@ -64,6 +64,11 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), f"{page.name} links {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_link_texts_are_words_and_no_names_of_pages(page):
+    assert re.findall(r"\[[a-z/-]+\.md\]\(", page.read_text(encoding="utf-8")) == []
+
+
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
     for page in PAGES[3:]:

@@ -160,7 +160,7 @@ def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels (h, w) all of whose neighbours are seen: at the borders of the map its colours fade into black."""
     import cv2
 
-    return cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.float32]:
