@@ -36,13 +36,14 @@ def calibrate(
     the images do not prove stays as the files give it.
     """
     from dudmap.app.pipeline.calibration import calibrate_sequence
-    from dudmap.app.terminal import plain_console
+    from dudmap.app.terminal import counted, plain_console
     from dudmap.core.geometry.calibration import Calibration
 
     recording = reading.open(sequence)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
-    estimate = calibrate_sequence(recording, parameters.read(), given, max_frames)
+    with counted("calibrating", quiet=as_json) as progress:
+        estimate = calibrate_sequence(recording, parameters.read(), given, max_frames, progress=progress)
     if out is not None:
         estimate.calibration.save(out)
     if as_json:
