@@ -30,9 +30,8 @@ _OPTIONS: dict[str, Any] = {
 def sources() -> str:
     """Digest of name, time of change and size of all files whose text or constants kernels are compiled from."""
     folder = Path(__file__).parent
-    files = sorted(
-        path for where in (folder, folder / "cpu", folder.parent / "formulas") for path in where.glob("*.py")
-    )
+    folders = folder, folder / "cpu", folder.parent / "formulas"
+    files = sorted(path for each in folders for path in each.glob("*.py"))
     stamps = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files]
     return hashlib.sha256(repr(stamps).encode()).hexdigest()
 
@@ -44,7 +43,7 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        compiled = njit(**_OPTIONS, **options)(function)
+        compiled = njit(**(_OPTIONS | options))(function)
         if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
             index = compiled._cache._cache_file
             index._source_stamp = index._source_stamp, sources()
@@ -54,6 +53,10 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 kernel = _compiled()
+exact = _compiled(fastmath=False)
+"""Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
+exact_scalar = _compiled(fastmath=False, forceinline=True)
+"""Compiles what such loops call; ``py_func`` is the same formula for whole images."""
 scalar = _compiled(forceinline=True)
 """Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
 function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import compare_with_frame, free_space, seen_marked
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget
+from dudmap.core.backends.cpu.evidence import free_space, seen_marked
+from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.label_scale import scaled_side
-from dudmap.core.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
+from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 
@@ -32,7 +33,7 @@ DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RememberedFrame:
     """A tracked frame with its labels.
 
@@ -121,6 +122,12 @@ class TemporalMemory:
         while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
             settle_frames.popleft()
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the frames with a correction (4, 4) of the world."""
+        frames = [*self._settle_frames, *self._recent_frames, *(() if self._imported else self._start_frames)]
+        for frame in {id(frame): frame for frame in [*frames, self._last] if frame is not None}.values():
+            frame.T_world_camera = T_new_old @ frame.T_world_camera
+
     def reset(self) -> None:
         """Forget all frames after a loss of tracking; those imported from another pass stay."""
         self._last = None
@@ -185,21 +192,27 @@ class TemporalMemory:
         segmentation: Segmentation,
         sigma: NDArray[np.float32],
         dynamic: NDArray[np.bool_],
+        least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
         """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
+
+        The dynamic part of a segment has settled if it has stood still (``stand_still``) since every frame kept of
+        ``settle_time``.
 
         Args:
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
             segmentation: Its segments.
-            sigma: (h, w) float32, standard deviation of a distance, metres.
+            sigma: (h, w) float32, standard deviation of a distance, metres; ``least_sigma`` at least.
             dynamic: (h, w) bool.
+            least_sigma: Metres.
         """
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
             return np.zeros_like(dynamic)
-        return _still(frames, level, T_world_camera, segmentation, sigma, dynamic)
+        segments = segmentation.with_noise(sigma, least_sigma)
+        return _still(frames, level, T_world_camera, segments, dynamic)
 
     def stayed(
         self,
@@ -209,6 +222,7 @@ class TemporalMemory:
         segmentation: Segmentation,
         sigma: NDArray[np.float32],
         moving: NDArray[np.bool_],
+        least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) that images show to move, but whose segment is where older frames have seen it.
 
@@ -216,49 +230,38 @@ class TemporalMemory:
         that a motion that they show would have shown; a frame in which the segment was taken to move proves nothing.
 
         Args:
-            timestamp, level, T_world_camera, segmentation, sigma: As for ``settled``.
+            timestamp, level, T_world_camera, segmentation, sigma, least_sigma: As for ``settled``.
             moving: (h, w) bool.
         """
         frames = [frame for frame in self._recent_frames if timestamp - frame.timestamp >= LONGEST_BASELINE]
         if not frames or not moving.any():
             return np.zeros_like(moving)
-        return _still(frames, level, T_world_camera, segmentation, sigma, moving, unmarked=True)
+        segments = segmentation.with_noise(sigma, least_sigma)
+        return _still(frames, level, T_world_camera, segments, moving, unmarked=True)
 
 
 def _still(
     frames: Sequence[RememberedFrame],
     level: Level,
     T_world_camera: NDArray[np.float64],
-    segmentation: Segmentation,
-    sigma: NDArray[np.float32],
+    segments: SegmentImage,
     chosen: NDArray[np.bool_],
     *,
     unmarked: bool = False,
 ) -> NDArray[np.bool_]:
-    """Those of the chosen pixels (h, w) whose segment is where all frames have seen it.
-
-    The chosen part of a segment is if, compared with every frame, more than 0.7 of its pixels are visible, less than
-    0.1 of them lie off by more than 4 sigma, the mean distance is below one sigma, and the intensity mismatch below
-    1.2 times the frame's upper quartile (or COMMON_MISMATCH); ``unmarked``: if no frame took it to be dynamic.
-    """
-    count = segmentation.count
-    labels = segmentation.labels + np.where(chosen, np.int32(count), np.int32(0))
-    parts = replace(segmentation, labels=labels, count=2 * count)  # the chosen part of segment n is n + count
-    still = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
-    still[: count + 1] = False
+    """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
+    ``unmarked``: and that no frame took to be dynamic."""
+    labels, image = segments.labels, (level.depth, level.intensity, level.camera.intrinsics)
+    still = np.arange(segments.count + 1) > 0
+    size = np.bincount(labels[chosen], minlength=len(still))
     for target in _targets(T_world_camera, frames):
-        image = level.depth, level.intensity, level.camera.intrinsics
         if unmarked and target.marks.any():
-            still &= parts.share(seen_marked(*image, target, MAX_DISPLACEMENT)) < DYNAMIC_SHARE
-        sums = compare_with_frame(*image, target, parts.with_noise(sigma), 4)
-        evidence = evidence_of(sums, parts.min_pixels)
-        visible = evidence.compared > 0.7
-        common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
-        still &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
-        still &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
-        if not still.any():
-            break
-    return still[parts.labels]
+            marked = chosen & seen_marked(*image, target, MAX_DISPLACEMENT)
+            still &= np.bincount(labels[marked], minlength=len(still)) < DYNAMIC_SHARE * size
+        ((gap, difference, _),) = reproject(*image, [target])
+        if not stand_still(segments, chosen, gap, difference, still):
+            return np.zeros_like(chosen)
+    return chosen & still[labels]
 
 
 def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:

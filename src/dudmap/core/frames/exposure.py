@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.median import nth
+from dudmap.core.backends.threads import scalar
 from dudmap.core.frames.observation import Level
 
 LARGE_GAIN, MORE_ROUNDS, MAX_GAIN = 1.25, 3, 4.0
@@ -35,6 +36,7 @@ def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[floa
     return then[0] * first[0], then[0] * first[1] + then[1]
 
 
+@scalar
 def fit_exposure(
     intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[float, float]:
@@ -47,33 +49,42 @@ def fit_exposure(
     Args:
         intensity: (h, w) float32 of the image.
         difference: (h, w) float32 map minus image, NaN off the map.
-        weights: (h, w) float32 static weights.
+        weights: (h, w) static weights.
     """
-    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
-    if len(used) < 100:
+    h, w = intensity.shape
+    used, count = np.empty(h * w, np.int32), 0
+    for v in range(h):
+        for u in range(w):
+            if np.isfinite(difference[v, u]) and weights[v, u] > 0.5:
+                used[count] = v * w + u
+                count += 1
+    if count < 100:
         return 1.0, 0.0
-    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels determine two numbers well
-    x = intensity.reshape(-1)[used].astype(np.float64)
-    y = x + difference.reshape(-1)[used]
-    change = exposure = _fit(x, y)
-    for _ in range(MORE_ROUNDS):
-        if change[0] < LARGE_GAIN or exposure[0] > MAX_GAIN / change[0]:
+    stride = max(1, count // 1000)  # a thousand pixels determine two numbers well
+    x, y = np.empty(-(-count // stride)), np.empty(-(-count // stride))
+    for n in range(len(x)):
+        v, u = used[n * stride] // w, used[n * stride] % w
+        x[n] = intensity[v, u]
+        y[n] = x[n] + difference[v, u]
+    gain, offset = 1.0, 0.0
+    for _ in range(1 + MORE_ROUNDS):
+        change, shift = _fit(gain * x + offset, y)
+        gain, offset = change * gain, change * offset + shift
+        if change < LARGE_GAIN or gain > MAX_GAIN / change:
             break
-        change = _fit(exposure[0] * x + exposure[1], y)
-        exposure = chained(exposure, change)
-    return exposure
+    return gain, offset
 
 
-@kernel
+@scalar
 def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
     middle, count = len(x) // 2, len(x)
     errors = y - x
-    gain, offset = 1.0, np.partition(errors, middle)[middle]
+    gain, offset = 1.0, nth(errors, middle)
     for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
         for n in range(count):
             errors[n] = abs(y[n] - gain * x[n] - offset)
-        scale = max(1.5 * np.partition(errors, middle)[middle], 0.01)
+        scale = max(1.5 * nth(errors, middle), 0.01)
         total = x_sum = y_sum = 0.0
         for n in range(count):
             errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # the weight from here on
