@@ -44,14 +44,12 @@ SAMPLES, LEAST_BLOCKS = 2000, 3
 
 
 class Consistency(NamedTuple):
-    """Misfits of trajectories.
+    """Misfits of k trajectories.
 
     Attributes:
-        names: Of the k trajectories.
-        gaps: Frames between the two of a pair.
-        misfits: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255) over the pairs
-            that begin in one stretch of the recording, as long as the longest gap.
-        counts: (2, gaps, blocks) pairs.
+        names, gaps: Of the trajectories; frames between the two of a pair.
+        misfits, counts: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255), and (2,
+            gaps, blocks) pairs, that begin in one stretch of the recording, as long as the longest gap.
     """
 
     names: list[str]
@@ -81,10 +79,8 @@ class Consistency(NamedTuple):
         seen = self.counts[term].any(axis=1)
         if not seen.any():
             return np.nan, np.nan, np.nan
-        means, samples = (
-            np.log(np.maximum(found[..., term, seen, :], 1e-9)) for found in (self.means(), self.samples())
-        )
-        share, drawn = (np.expm1((found[..., one] - found[..., other]).mean(axis=-1)) for found in (means, samples))
+        misfits = (np.maximum(found[..., term, seen, :], 1e-9) for found in (self.means(), self.samples()))
+        share, drawn = (np.expm1(np.log(each[..., one] / each[..., other]).mean(axis=-1)) for each in misfits)
         return (float(share), *np.percentile(drawn, (2.5, 97.5)).tolist())
 
     def verdicts(self) -> list[str]:
@@ -94,9 +90,9 @@ class Consistency(NamedTuple):
             best = int(np.argmin(np.log(np.maximum(self.means()[term], 1e-9)).sum(axis=0)))
             for other in (k for k in range(len(self.names)) if k != best):
                 share, low, high = self.excess(term, other, best)
-                pair = (self.names[other], self.names[best])
                 outcome = "{} is worse than {} by" if low > 0 else "{} and {} are undecided:"
-                sentences.append(f"{name}: {outcome.format(*pair)} {share:.1%} ({low:.1%} to {high:.1%})")
+                named = outcome.format(self.names[other], self.names[best])
+                sentences.append(f"{name}: {named} {share:.1%} ({low:.1%} to {high:.1%})")
         return sentences
 
     def table(self) -> str:
@@ -104,9 +100,8 @@ class Consistency(NamedTuple):
         low, high = self.intervals()
         head = ["", *(f"{term} ({unit}), {gap}" for term, unit in TERMS.items() for gap in self.gaps)]
         cells = np.stack([self.means(), (high - low) / 2], axis=-1).reshape(-1, len(self.names), 2)
-        rows = [
-            [name, *(f"{mean:.2f} ± {half:.2f}" for mean, half in cells[:, k])] for k, name in enumerate(self.names)
-        ]
+        texts = ([f"{mean:.2f} ± {half:.2f}" for mean, half in cells[:, k]] for k in range(len(self.names)))
+        rows = [[name, *text] for name, text in zip(self.names, texts, strict=True)]
         return grid(head, rows, words=1) + "\n" + "\n".join(f"- {sentence}" for sentence in self.verdicts())
 
 
@@ -116,23 +111,25 @@ def measure_consistency(
     gaps: tuple[int, ...] = GAPS,
     max_frames: int | None = None,
 ) -> Consistency:
-    """Compare pairs of frames of a recording, as trajectories relate them; known dynamic pixels are left out.
+    """Compare pairs of frames of a recording, as trajectories relate them; known dynamic pixels and gaps too long for
+    the recording are left out.
 
     Raises:
         DatasetError: The trajectories have too few frames of the recording in common.
     """
     stamps = sequence.timestamps[:max_frames]
-    poses = [
-        {n: T for n, t in enumerate(stamps) if (T := _pose(each, t)) is not None} for each in trajectories.values()
-    ]
+    found = (((n, _pose(each, t)) for n, t in enumerate(stamps)) for each in trajectories.values())
+    poses = [{n: T for n, T in each if T is not None} for each in found]
     known = [n for n in range(len(stamps)) if all(n in each for each in poses)]
-    length = max(gaps)
-    blocks = (known[-1] + 1 - min(gaps)) // length if known else 0
-    if blocks < LEAST_BLOCKS:
+    least = min(gaps)
+    gaps = tuple(gap for gap in gaps if LEAST_BLOCKS * gap + least <= len(known))
+    if not gaps:
         raise DatasetError(
             f"{', '.join(trajectories)} and {sequence.name} have {len(known)} frames in common; expected at least "
-            f"{LEAST_BLOCKS * length + min(gaps)} of one recording, with its time stamps"
+            f"{(LEAST_BLOCKS + 1) * least} of one recording, with its time stamps"
         )
+    length = max(gaps)
+    blocks = (known[-1] - known[0] + 1 - least) // length
     config, every = Config(), max(1, len(stamps) // PAIRS)
     preprocess = Preprocessor(sequence.camera, config.preprocess, calibration=sequence.calibration)
     misfits, counts = np.zeros((2, len(gaps), blocks, len(poses))), np.zeros((2, len(gaps), blocks))
@@ -152,24 +149,16 @@ def measure_consistency(
         for g, gap in enumerate(gaps):
             if n + gap in shared:
                 motions = [se3.inverse(each[n + gap]) @ each[n] for each in poses]
-                found = pair_misfits(view(n), view(n + gap), motions)
-                block = min(n // length, blocks - 1)
-                usable = np.isfinite(found[:, 0])
-                misfits[usable, g, block] += found[usable]
+                pair, block = pair_misfits(view(n), view(n + gap), motions), min((n - known[0]) // length, blocks - 1)
+                usable = np.isfinite(pair[:, 0])
+                misfits[usable, g, block] += pair[usable]
                 counts[usable, g, block] += 1
     return Consistency(list(trajectories), gaps, misfits, counts)
 
 
 def pair_misfits(first: Level, second: Level, motions: List[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Mean misfits (2, k) of the depth (mm at 1 m) and the intensity (of 255) of two images on the same pixels.
-
-    Args:
-        first, second: The images.
-        motions: k motions (4, 4) from the first camera to the second.
-
-    Returns:
-        NaN where the images have too little in common.
-    """
+    """Mean misfits (2, k) of the depth (mm at 1 m) and the intensity (of 255) of two images on the same pixels, for k
+    motions (4, 4) from the first camera to the second; NaN where the images have too little in common."""
     import cv2
 
     camera, near, z = first.camera, np.ones((3, 3), np.uint8), first.depth
