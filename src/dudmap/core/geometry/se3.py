@@ -125,8 +125,8 @@ def log_rotation(R: Matrix) -> Matrix:
 
 def inverse(T: Matrix) -> Matrix:
     """Inverse of rigid motions (..., 4, 4): ``inverse(T) @ T == identity``."""
-    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
+    R_t = T[..., :3, :3].swapaxes(-1, -2)
+    out = np.zeros(T.shape, T.dtype)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
