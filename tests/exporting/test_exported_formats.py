@@ -24,7 +24,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting.exporters import EXPORTERS, export_run
 from dudmap.io.exporting.gravity import find_floor
-from dudmap.io.exporting.mesh_editing import without_specks
+from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.mesh_files import linear_light
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from exported_runs import CAMERA, VOXEL, make_run
@@ -44,7 +44,7 @@ def run(made):
 
 @pytest.fixture(scope="module")
 def mesh(run):
-    return without_specks(Mesh.load(run / "mesh.ply"))
+    return without_small_pieces(Mesh.load(run / "mesh.ply"))
 
 
 @pytest.fixture(scope="module")

@@ -167,8 +167,7 @@ class Slam(SlamResults):
 
         Raises:
             ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
-            DatasetError: The arrays have another shape or type.
-            FrameError: The images do not fit the camera or each other; the frame changed nothing.
+            FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
         if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
             raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
@@ -339,6 +338,7 @@ class Slam(SlamResults):
         self.bootstrap.abandon()  # frames held back have poses of before
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
+        self.detector.apply_correction(correction)
         return correction @ T_world_camera, True
 
     def _calibrate(

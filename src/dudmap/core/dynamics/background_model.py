@@ -101,6 +101,12 @@ class BackgroundModel:
         static = ~dynamic[::stride, ::stride]
         overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, _intrinsics(level))
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the points with a correction (4, 4) of the world."""
+        if self._background is not None:
+            points = self._background.points @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+            self._background = self._background._replace(points=points.astype(np.float32))
+
     def _seen_from(
         self, timestamp: float, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
     ) -> PointImage:

@@ -13,7 +13,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import DatasetError, FrameError
+from dudmap.errors import FrameError
 
 HOLE_NOISE = 0.01
 """Readings around a small hole may always differ by this much, metres."""
@@ -98,13 +98,14 @@ class Preprocessor:
         """Undistorted mask (H, W) bool of a frame.
 
         Raises:
-            DatasetError: The mask does not have the camera's size, or is not boolean.
+            FrameError: The mask does not have the camera's size, or is not boolean.
         """
         if mask.shape != self.camera.shape or mask.dtype != np.bool_:
             h, w = self.camera.shape
-            raise DatasetError(
+            raise FrameError(
                 f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
-                "the size of the camera's image"
+                "the size of the camera's image",
+                "type",
             )
         if self._maps is None:
             return mask
