@@ -16,6 +16,7 @@ from dudmap.core.backends.cpu.evidence import (
 from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.labeling import opened
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, moving_segments, stand_still
+from dudmap.core.backends.median import nth
 from dudmap.core.backends.parameters import SURFACE, MapSample, single
 from dudmap.core.dynamics.mixture import RULES, fit_mixture
 
@@ -130,3 +131,12 @@ def test_an_older_image_is_compared(scene):
     assert compare_images(*images, NOISE, 100) == expected
     assert np.isnan(compare_images(*images, NOISE, depth.size)[0])
     assert 0 < expected[0] < 2
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 400])
+def test_the_nth_value_is_that_of_the_sorted_ones(count):
+    rng = np.random.default_rng(count)
+    values = rng.integers(0, max(count // 2, 1), count).astype(float)
+    before = values.copy()
+    assert [nth(values, k) for k in range(count)] == sorted(values)
+    assert np.array_equal(values, before)

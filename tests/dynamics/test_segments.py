@@ -101,7 +101,7 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        before = memory.last_dynamic(image, np.eye(4), 0.1)
+        before = memory.last_dynamic(image, np.eye(4))
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
         assert before[inner].mean() > 0.9
@@ -121,10 +121,26 @@ def test_what_is_remembered_follows_a_correction_of_the_world():
     memory.apply_correction(correction)
     frame = 35 / 30, image, correction, surface, sigma, board
     assert memory.settled(*frame)[board].mean() > 0.9
-    assert memory.last_dynamic(image, correction, 0.1)[board].mean() > 0.9
+    assert memory.last_dynamic(image, correction)[board].mean() > 0.9
     assert not free_space(memory, 35 / 30, image, correction).any()
     memory.apply_correction(correction)
     assert not memory.settled(*frame).any()
+
+
+@pytest.mark.parametrize(("speed", "marked", "stands"), [(0.0, False, True), (0.3, False, False), (0.0, True, False)])
+def test_images_are_not_believed_on_what_older_frames_have_seen_in_its_place(speed, marked, stands):
+    """Unless it was taken to move in them: a crowd that drags the camera along also seems to stand still."""
+    memory = TemporalMemory(DynamicsConfig())
+    sigma = np.full(CAMERA.shape, 0.01, np.float32)
+    for i in range(20):
+        image, board = scene(speed * i / 30)
+        surface = segment(image, TOLERANCE)
+        stayed = memory.stayed(i / 30, image, np.eye(4), surface, sigma, board)
+        assert not stayed[~board].any()
+        if i < 12:  # images show motion over up to 0.4 s
+            assert not stayed.any()
+        memory.update(i / 30, image, np.eye(4), board if marked else np.zeros_like(board), surface)
+    assert (stayed[board].mean() > 0.9) == stands
 
 
 def free_space(memory, timestamp, image, T, unknown=0.0):

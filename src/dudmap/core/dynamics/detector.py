@@ -33,8 +33,6 @@ from dudmap.core.frames.exposure import exposed
 from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
 
-MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
 MAX_GAP = 1.5
 """Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
 MAP_ROUGHNESS = 0.4
@@ -192,8 +190,10 @@ class DynamicDetector:
         if config.regions:
             if config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
-            if moving is not None:
-                dynamic = dynamic | moving
+            if moving is not None and moving.any():
+                least = config.noise_threshold / 3
+                image = timestamp, level, T_world_camera, segmentation(), sigma
+                dynamic = dynamic | (moving & ~self.memory.stayed(*image, moving, least))
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -250,7 +250,7 @@ class DynamicDetector:
         """Dynamic pixels (h, w) decided by segment (``moving_segments``), without those that have settled, and the
         segments."""
         level, T_world_camera, sigma = frame.level, frame.T_world_camera, frame.sigma
-        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
+        before = self.memory.last_dynamic(level, T_world_camera)
         least, (gain, offset) = self.config.noise_threshold / 3, frame.exposure
         labels, count = moving_segments(
             segmentation.with_noise(sigma, least), before, seeds, frame.sample, level.intensity,

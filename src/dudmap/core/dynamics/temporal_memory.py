@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.evidence import free_space, seen_marked
 from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
-from dudmap.core.backends.cpu.segment_motion import stand_still
+from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
+from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.label_scale import scaled_side
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
@@ -26,6 +27,8 @@ YOUNG_UNKNOWN_SHARE = 0.1
 """Share of the readings in space unknown to the map from which on single frames give free space at any age."""
 SEAM = 1
 """Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+MAX_DISPLACEMENT = 0.1
+"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
 DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
@@ -132,18 +135,17 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
-            max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
         """
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, dtype=bool)
         (target,) = _targets(T_world_camera, [self._last])
-        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
+        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, MAX_DISPLACEMENT)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
@@ -209,14 +211,57 @@ class TemporalMemory:
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
             return np.zeros_like(dynamic)
-        settled = np.ones(segmentation.count + 1, dtype=np.bool_)
-        settled[0] = False
         segments = segmentation.with_noise(sigma, least_sigma)
-        for target in _targets(T_world_camera, frames):
-            ((gap, difference, _),) = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])
-            if not stand_still(segments, dynamic, gap, difference, settled):
-                return np.zeros_like(dynamic)
-        return dynamic & settled[segmentation.labels]
+        return _still(frames, level, T_world_camera, segments, dynamic)
+
+    def stayed(
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        segmentation: Segmentation,
+        sigma: NDArray[np.float32],
+        moving: NDArray[np.bool_],
+        least_sigma: float = 0.0,
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) that images show to move, but whose segment is where older frames have seen it.
+
+        Corners go astray where colours lie beside their depth. The frames are older than images are compared over, so
+        that a motion that they show would have shown; a frame in which the segment was taken to move proves nothing.
+
+        Args:
+            timestamp, level, T_world_camera, segmentation, sigma, least_sigma: As for ``settled``.
+            moving: (h, w) bool.
+        """
+        frames = [frame for frame in self._recent_frames if timestamp - frame.timestamp >= LONGEST_BASELINE]
+        if not frames or not moving.any():
+            return np.zeros_like(moving)
+        segments = segmentation.with_noise(sigma, least_sigma)
+        return _still(frames, level, T_world_camera, segments, moving, unmarked=True)
+
+
+def _still(
+    frames: Sequence[RememberedFrame],
+    level: Level,
+    T_world_camera: NDArray[np.float64],
+    segments: SegmentImage,
+    chosen: NDArray[np.bool_],
+    *,
+    unmarked: bool = False,
+) -> NDArray[np.bool_]:
+    """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
+    ``unmarked``: and that no frame took to be dynamic."""
+    labels, image = segments.labels, (level.depth, level.intensity, level.camera.intrinsics)
+    still = np.arange(segments.count + 1) > 0
+    size = np.bincount(labels[chosen], minlength=len(still))
+    for target in _targets(T_world_camera, frames):
+        if unmarked and target.marks.any():
+            marked = chosen & seen_marked(*image, target, MAX_DISPLACEMENT)
+            still &= np.bincount(labels[marked], minlength=len(still)) < DYNAMIC_SHARE * size
+        ((gap, difference, _),) = reproject(*image, [target])
+        if not stand_still(segments, chosen, gap, difference, still):
+            return np.zeros_like(chosen)
+    return chosen & still[labels]
 
 
 def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import scalar
 from dudmap.core.frames.observation import Level
 
@@ -79,11 +80,11 @@ def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
     middle, count = len(x) // 2, len(x)
     errors = y - x
-    gain, offset = 1.0, np.partition(errors, middle)[middle]
+    gain, offset = 1.0, nth(errors, middle)
     for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
         for n in range(count):
             errors[n] = abs(y[n] - gain * x[n] - offset)
-        scale = max(1.5 * np.partition(errors, middle)[middle], 0.01)
+        scale = max(1.5 * nth(errors, middle), 0.01)
         total = x_sum = y_sum = 0.0
         for n in range(count):
             errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # the weight from here on

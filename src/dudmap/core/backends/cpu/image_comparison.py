@@ -3,6 +3,7 @@
 import numpy as np
 
 from dudmap.core.backends.cpu.evidence import edge_tolerance, static_sigma
+from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import exact
 from dudmap.core.frames.exposure import fit_exposure
 
@@ -53,6 +54,6 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
                 contrasts[count] = np.sqrt(down * down + across * across)
                 errors[count] = abs(difference[v, u] + slope * intensity[v, u] - shift)
                 count += 1
-    contrast = np.float64(np.partition(contrasts[:count], count // 2)[count // 2])
-    error = np.float64(np.partition(errors[:count], count // 2)[count // 2])
+    contrast = np.float64(nth(contrasts[:count], count // 2))
+    error = np.float64(nth(errors[:count], count // 2))
     return (np.sqrt(2.0) * error / contrast if contrast > 0 else np.nan), agreeing, readings, seen
