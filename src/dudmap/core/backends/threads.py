@@ -45,7 +45,7 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = njit(**(_OPTIONS | options))(function)
         if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
-            index = compiled._cache._cache_file
+            index: Any = vars(compiled)["_cache"]._cache_file
             index._source_stamp = index._source_stamp, sources()
         return compiled
 
