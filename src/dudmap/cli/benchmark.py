@@ -214,7 +214,7 @@ def first_second(
     config = o.read_config(None, None, assignments)
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
     runs = [
-        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES, noise="none", seed=seed), config)
+        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES + 1, noise="none", seed=seed), config)
         for scene, seed in worlds
     ]
     tree = {

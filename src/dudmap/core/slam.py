@@ -186,6 +186,7 @@ class Slam(SlamResults):
         view = replace(view, blind=self._is_blind(view))
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
+            self._refine_start()
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
@@ -244,6 +245,12 @@ class Slam(SlamResults):
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
+
+    def _refine_start(self) -> None:
+        """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
+        correction = None if self.prior_map else self.mapper.refine_start(self.tracker)
+        if correction is not None:
+            self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""

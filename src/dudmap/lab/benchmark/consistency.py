@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import fit_exposure
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid, reduced
