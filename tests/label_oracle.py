@@ -13,6 +13,7 @@ from dudmap.core.backends.cpu.evidence import (
     noise_limit,
     static_sigma,
 )
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.cpu.image_comparison import AGREEING_SIGMAS
 from dudmap.core.backends.cpu.segment_motion import (
     COMMON_DISTANCE,
@@ -27,7 +28,6 @@ from dudmap.core.backends.cpu.segment_motion import (
 )
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
-from dudmap.core.frames.exposure import fit_exposure
 
 
 def weighed(depth, sample, noise):

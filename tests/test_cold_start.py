@@ -68,3 +68,26 @@ def test_what_kernels_call_is_inlined():
                     calls |= {one.id for one in called if isinstance(one, ast.Name)}
     assert "linearize_pair" in calls
     assert {name for name in calls if kinds.get(name, set()) & {"kernel", "exact"}} == INTEGERS
+
+
+def test_kernels_of_the_first_frames_do_not_compile_numpys_sorting():
+    """A selection or a sort by NumPy takes seconds of a cold start to compile."""
+    slow, found, kernels = {"partition", "sort", "argsort", "unique", "median", "percentile"}, set(), 0
+    for path in sorted((Path(dudmap.__file__).parent / "core" / "backends" / "cpu").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            decorators = getattr(node, "decorator_list", [])
+            if {one.id for one in decorators if isinstance(one, ast.Name)} & {
+                "kernel",
+                "scalar",
+                "exact",
+                "exact_scalar",
+            }:
+                kernels += 1
+                called = {
+                    one.func.attr
+                    for one in ast.walk(node)
+                    if isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute)
+                }
+                found |= {(node.name, name) for name in called & slow}
+    assert kernels > 50
+    assert found == set()

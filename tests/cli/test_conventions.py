@@ -100,6 +100,7 @@ FAKED = {
     "merge": (["merge", "a", "b"], {"dudmap.fleet.merge.merge_runs": lambda *_: merged()}),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
     "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
+    "benchmark consistency": None,  # tests/benchmark/test_consistency.py
     "benchmark gate": (
         ["benchmark", "gate"],
         {

@@ -235,7 +235,8 @@ class MapOptions:
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """The command with single options in place of its arguments that are dataclasses of options."""
     signature = inspect.signature(command)
-    groups = {name: found.annotation for name, found in signature.parameters.items() if is_dataclass(found.annotation)}
+    annotations: dict[str, Any] = {name: found.annotation for name, found in signature.parameters.items()}
+    groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
 
     @wraps(command)
     def flat(**given: Any) -> None:  # noqa: ANN401

@@ -45,7 +45,7 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = njit(**(_OPTIONS | options))(function)
         if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
-            index = compiled._cache._cache_file
+            index: Any = vars(compiled)["_cache"]._cache_file
             index._source_stamp = index._source_stamp, sources()
         return compiled
 
@@ -128,7 +128,7 @@ def bands(n: int, size: int) -> list[tuple[int, int]]:
 def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *each: Sequence[Any]) -> list[Any]:
     """Results, in order, of ``function(start, stop, *items)`` over all ranges; ``each`` holds one item per range."""
     calls = list(zip(ranges, *each, strict=True))
-    threads = min(num_threads(), len(calls))
+    threads = min(num_threads(), len(calls)) if len(calls) > 1 else 1
     if threads <= 1:
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)

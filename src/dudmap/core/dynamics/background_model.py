@@ -121,7 +121,8 @@ def _subsampled(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]
     """Depth of one pixel per stride across and down, and mean intensity around it."""
     import cv2
 
-    depth = level.depth[:: _stride(level), :: _stride(level)]
+    stride = _stride(level)
+    depth = level.depth[::stride, ::stride]
     return depth, np.asarray(cv2.resize(level.intensity, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 

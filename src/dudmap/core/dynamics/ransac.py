@@ -66,8 +66,8 @@ def rigid_motion(
         rng.choice(n, (HYPOTHESES, 3), p=areas / areas.sum()),
     ])  # fmt: skip
     expected = reproject(T_expected, points, camera)
-    by_axis = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
-    found = consensus.Correspondences(*by_axis, areas, camera.intrinsics)
+    at, seen_at, expected_at = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
+    found = consensus.Correspondences(at, seen_at, expected_at, areas, camera.intrinsics)
     return consensus.best_motion(draws, found, _params(camera), T_expected)
 
 

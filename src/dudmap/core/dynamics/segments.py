@@ -1,6 +1,7 @@
 """Surface segments of an image."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +42,8 @@ class Segmentation:
     def with_noise(self, sigma: NDArray[np.float32], least: float) -> SegmentImage:
         """The segments as kernels take them; sigma (h, w) is that of the distance of a static point, metres, and
         ``least`` what it is here at least."""
-        return SegmentImage(
-            self.labels, self.count, self.min_pixels, self.gradient, self.window, sigma, np.float32(least)
-        )
+        least_sigma: Any = np.float32(least)
+        return SegmentImage(self.labels, self.count, self.min_pixels, self.gradient, self.window, sigma, least_sigma)
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
 from dudmap.core.dynamics.detector import noise_parameters
-from dudmap.core.frames.exposure import LARGE_GAIN
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry import se3

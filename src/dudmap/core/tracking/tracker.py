@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
 from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
-from dudmap.core.frames.exposure import chained, exposed, fit_exposure
+from dudmap.core.frames.exposure import chained, exposed
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume

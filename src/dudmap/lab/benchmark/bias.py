@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import exposed, fit_exposure
+from dudmap.core.backends.cpu.exposure import fit_exposure
+from dudmap.core.frames.exposure import exposed
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.preprocess import Preprocessor

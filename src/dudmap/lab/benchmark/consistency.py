@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import fit_exposure
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid, reduced
@@ -171,16 +171,15 @@ def pair_misfits(first: Level, second: Level, motions: List[NDArray[np.float64]]
     for T in motions:
         x, y, depth = np.tensordot(T[:3, :3].astype(np.float32), points, 1) + T[:3, 3, None, None].astype(np.float32)
         ahead = np.maximum(depth, np.float32(1e-3))
-        place = x / ahead * camera.fx + camera.cx, y / ahead * camera.fy + camera.cy
-        seen, grey, surface = (
-            cv2.remap(image, *(axis.astype(np.float32) for axis in place), cv2.INTER_LINEAR)
-            for image in (second.depth, second.intensity, smooth)
-        )
+        us = (x / ahead * camera.fx + camera.cx).astype(np.float32)
+        vs = (y / ahead * camera.fy + camera.cy).astype(np.float32)
+        images = second.depth, second.intensity, smooth
+        seen, grey, surface = (np.asarray(cv2.remap(image, us, vs, cv2.INTER_LINEAR)) for image in images)
         valid &= (surface > 0.999) & (depth > 0)
         gaps.append(np.minimum(np.abs(seen - depth) / ahead**2, WORST_DEPTH))
         differences.append(grey - first.intensity)
     static = valid & (np.min(gaps, axis=0) < WORST_DEPTH)
-    textured = static & (np.hypot(*np.gradient(first.intensity)) > TEXTURED)
+    textured = static & (np.linalg.norm(np.gradient(first.intensity), axis=0) > TEXTURED)
     out = np.full((2, len(motions)), np.nan)
     if np.count_nonzero(static) >= FEWEST:
         out[0] = [1000 * gap[static].mean() for gap in gaps]

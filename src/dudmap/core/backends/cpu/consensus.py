@@ -92,7 +92,7 @@ def search(leads, team, draws, found, params, T_expected, motions, scores, refin
             start, stop = len(all_motions) * band // BANDS, len(all_motions) * (band + 1) // BANDS
             for g in range(start, stop):
                 if number == 0:
-                    motions[g] = hypothesis(draws[g], found)
+                    hypothesis(draws[g], found, motions[g])
                 else:
                     refine(refined[g], found, params.inlier_px[g // (REFINED + 1)])
             score(start, stop, all_motions, found, params, all_scores)
@@ -102,11 +102,14 @@ def search(leads, team, draws, found, params, T_expected, motions, scores, refin
             wait_for_all(team, BANDS)
             if step == 0:
                 for k in range(levels):
-                    refined[k * (REFINED + 1)] = T_expected
-                    for n in range(1, REFINED + 1):
+                    first = k * (REFINED + 1)
+                    for n in range(REFINED + 1):
                         best = highest(scores[:, k])
-                        refined[k * (REFINED + 1) + n] = motions[best]
-                        scores[best, k] = -np.inf
+                        T = T_expected if n == 0 else motions[best]
+                        for i in range(16):
+                            refined[first + n, i // 4, i % 4] = T[i // 4, i % 4]
+                        if n > 0:
+                            scores[best, k] = -np.inf
             step += 1
     best = 0
     if leads:
@@ -149,8 +152,8 @@ def solved(A, b):
 
 
 @scalar
-def exponential(twist):
-    """Rigid motion (4, 4) of a twist (6,), as by ``se3.exp``."""
+def exponential(twist, T):
+    """Write the rigid motion (4, 4) of a twist (6,), as by ``se3.exp``."""
     x, y, z = twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
     a, b, c = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
@@ -158,8 +161,11 @@ def exponential(twist):
         theta = np.sqrt(square)
         a, b = np.sin(theta) / theta, (1 - np.cos(theta)) / square
         c = (1 - a) / square
-    W, WW, T = np.zeros((3, 3)), np.zeros((3, 3)), np.eye(4)
+    W, WW = np.zeros((3, 3)), np.zeros((3, 3))
     W[0, 1], W[0, 2], W[1, 0], W[1, 2], W[2, 0], W[2, 1] = -z, y, z, -x, -y, x
+    for i in range(4):
+        for j in range(4):
+            T[i, j] = 1.0 if i == j else 0.0
     for i in range(3):
         T[i, 3] = twist[i]
         for j in range(3):
@@ -169,12 +175,11 @@ def exponential(twist):
         for j in range(3):
             T[i, j] += a * W[i, j] + b * WW[i, j]
             T[i, 3] += (b * W[i, j] + c * WW[i, j]) * twist[j]
-    return T
 
 
 @scalar
-def hypothesis(draw, found):
-    """Motion (4, 4) of three correspondences, from the twist that is linear in their flow."""
+def hypothesis(draw, found, T):
+    """Write the motion (4, 4) of three correspondences, from the twist that is linear in their flow."""
     points, targets, i = found.points, found.targets, found.intrinsics
     A, b = np.zeros((6, 6)), np.empty(6)
     for k in range(3):
@@ -191,7 +196,7 @@ def hypothesis(draw, found):
             b[m] = targets[row, n] - (f * ray + np.float64(i[2 + row]))
     for m in range(6):
         A[m, m] += REGULAR
-    return exponential(solved(A, b))
+    exponential(solved(A, b), T)
 
 
 @scalar
@@ -206,7 +211,8 @@ def refine(T, found, inlier_px):
             trace += H[m, m]
         for m in range(6):
             H[m, m] += REGULAR * trace
-        step, old = exponential(solved(H, gradient)), T.copy()
+        step, old = np.empty((4, 4)), T.copy()
+        exponential(solved(H, gradient), step)
         for i in range(3):
             for j in range(4):
                 T[i, j] = step[i, 3] if j == 3 else 0.0

@@ -3,9 +3,9 @@
 import numpy as np
 
 from dudmap.core.backends.cpu.evidence import edge_tolerance, static_sigma
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import exact
-from dudmap.core.frames.exposure import fit_exposure
 
 AGREEING_SIGMAS = 3 * np.sqrt(2)
 """Difference of two readings of one surface that noise explains, in standard deviations of one of them."""
