@@ -248,8 +248,7 @@ class Slam(SlamResults):
 
     def _refine_start(self) -> None:
         """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
-        correction = None if self.prior_map else self.mapper.refine_start(self.tracker)
-        if correction is not None:
+        if self.prior_map is None and (correction := self.mapper.refine_start(self.tracker)) is not None:
             self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
