@@ -64,11 +64,11 @@ class Agreement:
         """Whether both maps hold enough of one surface to be compared."""
         return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
 
-    def rejection_reason(self, many: bool = False) -> str:
+    def rejection_reason(self, many: bool = False, max_denied: float = MAX_DENIED) -> str:
         """Sentence on the first check that fails, empty if the maps can be joined; ``many``: a pair among many runs."""
         if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
-        if self.denied > MAX_DENIED:
+        if self.denied > max_denied:
             return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
         return self.color_reason(many)
 

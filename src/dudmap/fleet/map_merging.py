@@ -14,7 +14,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.fleet.agreement import Agreement, agreement
+from dudmap.fleet.agreement import MAX_DENIED, Agreement, agreement
 from dudmap.fleet.map_fusion import fuse_maps
 from dudmap.fleet.map_samples import SurfacePoints, surface_points
 from dudmap.fleet.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
@@ -154,8 +154,10 @@ class MapSurface:
         return cls(saved.volume, surface_points(saved.volume, positions, SURFACE_POINTS))
 
 
-def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
-    """Find the relative pose of two maps, whose voxels have one size, and decide whether they show the same place.
+def compare_maps(a: SavedMap, b: SavedMap, max_denied: float = MAX_DENIED) -> MapPair:
+    """Find the relative pose of two maps and decide whether they show the same place.
+
+    ``max_denied`` is the share of the surface that free space may deny, more where things may have been moved.
 
     Raises:
         MapError: A map has no surface.
@@ -164,15 +166,21 @@ def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
     if not found:
         return MapPair(None, NOT_RECOGNISED)
-    return decided(MapSurface.of(a), MapSurface.of(b), found)
+    return decided(MapSurface.of(a), MapSurface.of(b), found, max_denied=max_denied)
 
 
-def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False) -> MapPair:
+def decided(
+    a: MapSurface,
+    b: MapSurface,
+    found: Sequence[Hypothesis],
+    many: bool = False,
+    max_denied: float = MAX_DENIED,
+) -> MapPair:
     """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
     is taken. ``many``: The maps are two of many, most of which do not show one place."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a, b, hypothesis, many)
+        pair = _checked(a, b, hypothesis, many, max_denied)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -185,7 +193,7 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, max_denied: float) -> MapPair:
     """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
@@ -198,5 +206,5 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
     checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
-    reason = checked.rejection_reason(many)
+    reason = checked.rejection_reason(many, max_denied)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)
