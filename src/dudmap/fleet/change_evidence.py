@@ -23,6 +23,8 @@ UNKNOWN, CONFIRMED, DENIED, BEHIND = 0, 1, 2, 3
 """State of a vertex: the other map did not see the place; has a surface there; saw free space; or has it behind one."""
 DEVIATIONS = 3.0
 """Standard deviations that noise may reach."""
+MAX_VIEWS = 24
+"""Keyframes of a visit that are asked what they look through."""
 CELL = 0.5
 """Edge of the cells in which the noise of the surfaces is measured, metres: the size of furniture."""
 MIN_CELL_POINTS = 50
@@ -112,15 +114,44 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     state = np.full(len(points), UNKNOWN, np.uint8)
     state[sdf >= -tolerance] = CONFIRMED
     state[sdf < -tolerance] = BEHIND
-    away = np.flatnonzero((sdf > tolerance) | (samples.state == EMPTY))
-    gap = KDTree(other.mesh.vertices).query(points[away])[0]
-    seen = samples.weight[away] >= READINGS * other.volume.config.carve_rate
-    state[away[gap > tolerance[away]]] = UNKNOWN
-    state[away[(gap > tolerance[away]) & seen]] = DENIED
+    seen = samples.weight >= READINGS * other.volume.config.carve_rate
+    away = np.flatnonzero((sdf > tolerance) | (samples.state == EMPTY) | np.isnan(sdf))
+    away = away[surface_tree(other.mesh.vertices).query(points[away], workers=-1)[0] > tolerance[away]]
+    state[away] = np.where((seen & ~np.isnan(sdf))[away], DENIED, UNKNOWN)
+    doubtful = away[state[away] == UNKNOWN]
+    state[doubtful[times_seen_through(other, points[doubtful], tolerance[doubtful]) >= READINGS]] = DENIED
     blur = EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel).astype(np.float32)
     color = np.where((state == CONFIRMED)[:, None], samples.color, 0)
     weight = own.sample(points).weight
     return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color)
+
+
+def times_seen_through(
+    visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """How many keyframes (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
+
+    The map remembers free space block by block, and not where a part of a block is hidden. What a keyframe sees of the
+    map is behind space that it saw to be free, farther than a margin (n,), metres, also beside the pixel.
+    """
+    import cv2
+
+    counts, camera = np.zeros(len(points), np.int64), visit.volume.camera
+    T_map = se3.inverse(visit.T_common_map)
+    step = max(1, len(visit.keyframes) // MAX_VIEWS)
+    for T in visit.keyframes[::step] if len(points) else ():
+        depth = visit.volume.raycast(T_map @ T, camera).depth
+        nearest = cv2.erode(depth, np.ones((3, 3), np.uint8))
+        local = transformed(se3.inverse(T), points)
+        u, v = np.rint(np.nan_to_num(camera.project(local), nan=-1, posinf=-1, neginf=-1)).astype(np.int64).T
+        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        counts[inside] += nearest[v[inside], u[inside]] > (local[:, 2] + 2 * margin)[inside]
+    return counts
+
+
+def surface_tree(points: NDArray[np.floating]) -> KDTree:
+    """Tree of many points (n, 3) that are spread over surfaces, built in a third of the time of a balanced one."""
+    return KDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def noise_share(

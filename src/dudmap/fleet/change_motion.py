@@ -20,7 +20,7 @@ from dudmap.fleet.sdf_alignment import align_maps
 Array = NDArray[np.float64]
 TURNS = 12
 """Turns about the vertical from which the surfaces are brought together."""
-COARSE, REFINED = 250, 4
+COARSE, REFINED = 250, 3
 """Points of a surface in the first step, and poses that are refined."""
 ICP_ROUNDS = 25
 PULL = 0.05
@@ -128,7 +128,7 @@ def motion_between(
     best: Motion | None = None
     T_a, T_b = before.T_common_map, after.T_common_map
     surfaces = new.sample(4000).surface(se3.inverse(T_b)), missing.sample(4000).surface(se3.inverse(T_a))
-    for _, T in poses[:REFINED]:
+    for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN]:
         aligned = align_maps(after.volume, before.volume, *surfaces, se3.inverse(T_b) @ T @ T_a, MIN_POINTS)
         for candidate in (T_b @ aligned.T_a_b @ se3.inverse(T_a), T):
             fit = _fit(after, missing, new, candidate), _fit(before, new, missing, se3.inverse(candidate))
@@ -155,8 +155,8 @@ def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
             p, q, n = points[use], b.points[near[use]], b.normals[near[use]]
             J = np.hstack([n, np.cross(p, n)])
             r = ((p - q) * n).sum(axis=1)
-            hats = np.stack([se3.hat(point) for point in p])
-            pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), -hats], axis=2)
+            turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
+            pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
             H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
             g = J.T @ r + np.einsum("nij,ni->j", pull, PULL * (p - q))
             T = se3.exp(-np.linalg.solve(H + 1e-9 * np.eye(6), g)) @ T

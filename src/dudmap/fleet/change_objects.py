@@ -9,11 +9,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence
+from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, surface_tree
 
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
-BRIDGE = 0.12
+BRIDGE = 0.15
 """The same through surface that the other map did not see, metres: free space is known in blocks, whose borders remain
 unknown."""
 LEAST_FACE = 0.3
@@ -56,22 +56,32 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
     """Whether a piece is large enough, wider than the depth edges there, and was seen often enough."""
     if piece.area < LEAST_FACE * min_size**2 or np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
         return False
-    points = piece.points[:: max(1, len(piece.points) // 2000)]
+    blur = float(np.median(found.blur[piece.vertices]))
+    return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
+
+
+def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
+    """Whether points (n, 3) extend so far (m) along the first two of their principal axes."""
+    points = points[:: max(1, len(points) // 2000)]
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     low, high = np.percentile(points @ axes.T, [2, 98], axis=0)
     extents = np.sort(high - low)
-    blur = float(np.median(found.blur[piece.vertices]))
-    return bool(extents[2] > 0.7 * min_size and extents[1] > max(LEAST_WIDTH * min_size, 2 * blur))
+    return bool(extents[2] > length and extents[1] > width)
 
 
 def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Flagged vertices (V,) that are not, nor hang on, the blurred edge of surface that the other map confirms."""
     numbers, points = np.flatnonzero(flagged), found.points
-    against = points[(found.state == CONFIRMED) & ~flagged]
+    against = (found.state == CONFIRMED) & ~flagged
+    if len(numbers):
+        reach = found.blur[numbers].max()
+        low, high = points[numbers].min(axis=0) - reach, points[numbers].max(axis=0) + reach
+        against &= np.all((points > low) & (points < high), axis=1)
+    against = points[against]
     if len(numbers) == 0 or len(against) == 0:
         return flagged.copy()
     blur = found.blur[numbers]
-    core = KDTree(against).query(points[numbers])[0] > blur
+    core = surface_tree(against).query(points[numbers], workers=-1)[0] > blur
     out = np.zeros(len(flagged), bool)
     if core.any():
         out[numbers[KDTree(points[numbers[core]]).query(points[numbers])[0] <= blur]] = True
@@ -92,14 +102,19 @@ def bridged(pieces: list[Piece], unseen: NDArray[np.int32], count: int) -> list[
     """Pieces of which those are one that hang together by triangles (n, 3) of a mesh with ``count`` vertices."""
     surface = _components(np.concatenate([unseen[:, :2], unseen[:, 1:]]), count)
     parts = [np.unique(surface[piece.vertices]) for piece in pieces]
-    trees = [KDTree(piece.points) for piece in pieces]
     pairs = [
         (a, b) for a in range(len(pieces)) for b in range(a)
         if len(np.intersect1d(parts[a], parts[b], assume_unique=True))
-        and np.isfinite(trees[a].query(pieces[b].points, distance_upper_bound=BRIDGE)[0]).any()
+        and gap_between(pieces[a], pieces[b]) < BRIDGE
     ]  # fmt: skip
     group = _components(np.array(pairs, np.int64).reshape(-1, 2), len(pieces))
     return [joined([pieces[n] for n in np.flatnonzero(group == g)]) for g in np.unique(group)]
+
+
+def gap_between(a: Piece, b: Piece) -> float:
+    """Distance of the nearest points of two pieces, metres; that of their boxes if it is large."""
+    apart = float(np.linalg.norm(np.maximum(np.maximum(a.box[0] - b.box[1], b.box[0] - a.box[1]), 0)))
+    return apart if apart > 1 else float(KDTree(a.points).query(b.points)[0].min())
 
 
 def joined(pieces: list[Piece]) -> Piece:

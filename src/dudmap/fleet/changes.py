@@ -12,15 +12,19 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh import joined as joined_meshes
 from dudmap.fleet.change_colors import recolored_pieces
-from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence
+from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import Body, Motion, motion_between
-from dudmap.fleet.change_objects import Piece, connected, denied_pieces, joined
-from dudmap.io.exporting.gravity import level_normal
+from dudmap.fleet.change_objects import BRIDGE, Piece, connected, denied_pieces, gap_between, joined
+from dudmap.io.exporting.gravity import CONE, PARALLEL
 from dudmap.io.exporting.mesh_editing import with_faces
 
 Array = NDArray[np.float64]
 NEAR = 0.3
 """Gap between surfaces of one thing that moved by less than its size, metres: they then are its opposite faces."""
+ON_SURFACE = 0.02
+"""Distance of a piece from the surface that it would belong to after a motion, metres: the largest tolerances."""
+FRAGMENT = 0.15
+"""Area of a piece, in that of the one beside it, below which it is a part of the same thing."""
 LEAST_UNKNOWN = 0.25
 """Surface of a part of the place that only one visit saw, square metres, from which on it is listed."""
 
@@ -78,38 +82,36 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
     missing, new = (denied_pieces(one, voxel, min_size) for one in found)
-    held = -before.keyframes[:, :3, 1].mean(axis=0)
-    held /= np.linalg.norm(held)
-    up = level_normal(before.mesh, held)
-    out = _moved(before, after, found, missing, new, held if up is None else up)
-    out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in missing]
-    out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in new]
+    out = _moved(before, after, found, missing, new) if missing and new else []
+    out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
+    out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
     out += [Change("recoloured", None, piece, share) for piece, share in recolored_pieces(found[1], min_size)]
     out.sort(key=lambda change: -len(change.points))
     return out + _unknown(found, voxel), found
 
 
 def _moved(
-    before: Visit, after: Visit, found: tuple[Evidence, Evidence], missing: list[Piece], new: list[Piece], up: Array
+    before: Visit, after: Visit, found: tuple[Evidence, Evidence], missing: list[Piece], new: list[Piece]
 ) -> list[Change]:
     """Pairs of pieces that are one thing, the best fits first; they are taken out of the lists."""
     motions: list[tuple[Motion, Piece, Piece]] = []
+    up = vertical(before)
     for old in missing:
         for now in new:
             motion = _motion(before, after, found, old, now, up)
             if motion is not None:
                 motions.append((motion, old, now))
     out: list[Change] = []
-    for motion, old, now in sorted(motions, key=lambda row: -row[0].fit):
+    surfaces = (surface_tree(after.mesh.vertices), surface_tree(before.mesh.vertices)) if motions else ()
+    for motion, old, now in sorted(motions, key=lambda row: -row[0].fit * min(row[1].area, row[2].area)):
         if not (any(old is piece for piece in missing) and any(now is piece for piece in new)):
             continue
-        both = []
-        for pieces, first, T in ((missing, old, motion.T_after_before), (new, now, se3.inverse(motion.T_after_before))):
-            target = KDTree((now if first is old else old).points)
-            parts = [p for p in pieces if p is first or _explained(p, first, T, target)]
+        both, T = [], motion.T_after_before
+        for pieces, first, T_there, there in zip((missing, new), (old, now), (T, se3.inverse(T)), surfaces, strict=True):
+            parts = [p for p in pieces if p is first or _explained(p, first, T_there, there)]
             pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
             both.append(joined(parts))
-        out.append(Change("moved", *both, motion.fit, motion.T_after_before))
+        out.append(Change("moved", *both, motion.fit, T))
     return out
 
 
@@ -126,12 +128,36 @@ def _motion(
     return motion_between(before, after, *bodies, up)
 
 
-def _explained(piece: Piece, first: Piece, T: Array, target: KDTree) -> bool:
-    """Whether a further piece near the first one of a thing went the same way."""
-    if KDTree(first.points).query(piece.points)[0].min() > NEAR:
+def vertical(visit: Visit) -> Array:
+    """Unit vector (3,) that most of the surface faces among those near the direction in which the cameras were held."""
+    held = -visit.keyframes[:, :3, 1].mean(axis=0)
+    held /= np.linalg.norm(held)
+    normals = visit.mesh.normals[:: max(1, len(visit.mesh.normals) // 5000)].astype(np.float64)
+    normals = normals[normals @ held > CONE]
+    if len(normals) == 0:
+        return held
+    facing = normals @ normals[:: max(1, len(normals) // 300)].T > PARALLEL
+    mean = normals[facing[:, np.argmax(facing.sum(axis=0))]].mean(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _explained(piece: Piece, first: Piece, T: Array, there: KDTree) -> bool:
+    """Whether a further piece near the first one of a thing went the same way, to a surface of the other visit."""
+    if gap_between(piece, first) > NEAR:
         return False
-    moved = piece.points @ T[:3, :3].T + T[:3, 3]
-    return bool(np.median(target.query(moved)[0]) < 0.05)
+    return bool(np.median(there.query(piece.points @ T[:3, :3].T + T[:3, 3])[0]) < ON_SURFACE)
+
+
+def _with_fragments(pieces: list[Piece]) -> list[Piece]:
+    """Pieces, largest first, with which small ones beside them are joined: parts of a thing that were seen by chance."""
+    out: list[Piece] = []
+    for piece in sorted(pieces, key=lambda one: -one.area):
+        near = [n for n, one in enumerate(out) if piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE]
+        if near:
+            out[near[0]] = joined([out[near[0]], piece])
+        else:
+            out.append(piece)
+    return out
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:

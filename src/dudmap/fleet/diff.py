@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.fleet.agreement import MIN_OVERLAP
-from dudmap.fleet.change_evidence import Visit
+from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_report import change_page, tinted
 from dudmap.fleet.changes import Change, find_changes, mesh_of
 from dudmap.fleet.map_merging import compare_maps
@@ -22,8 +23,6 @@ from dudmap.own_folder import make_folder, remove_files
 CHANGES_FILE, REPORT = "changes.json", "report.html"
 WRITTEN = {"": r"changes\.json|report\.html", "changes": r"\d+\.ply"}
 """Names of all files of a comparison by sub-folder, as regular expressions; the next one removes them first."""
-MAX_DENIED = 0.5
-"""Share of the surface of one visit that the other may have seen through. More is another place, or one emptied."""
 BEST_FRAMES = 3
 """Frames of each visit that are named for a change."""
 
@@ -48,6 +47,54 @@ def diff_runs(
         ConfigError: ``min_size`` is impossible.
         DudmapError: ``out`` cannot be used.
     """
+    found = compared(before, after, min_size)
+    tree = found.tree()
+    if out is not None:
+        _write(Path(out), tree, found)
+    return tree
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two runs that were compared.
+
+    Attributes:
+        maps: Of both runs.
+        visits: The maps in the world of the first.
+        changes: What changed.
+        evidence: On the surface of both.
+        alignment, notes: Figures of the alignment, and what the user should know.
+        min_size: Edge of the smallest thing that is reported, metres.
+    """
+
+    maps: tuple[SavedMap, SavedMap]
+    visits: tuple[Visit, Visit]
+    changes: list[Change]
+    evidence: tuple[Evidence, Evidence]
+    alignment: dict[str, Any]
+    notes: list[str]
+    min_size: float
+
+    def tree(self) -> dict[str, Any]:
+        """Content of changes.json."""
+        rows = []
+        for number, change in enumerate(self.changes, start=1):
+            frames = [
+                best_frames(change, saved, visit) for saved, visit in zip(self.maps, self.visits, strict=True)
+            ]
+            shown = {"frames_before": [t for t, _ in frames[0]], "frames_after": [t for t, _ in frames[1]]}
+            rows.append({"id": number} | change.tree() | shown)
+        kinds = [change.kind for change in self.changes]
+        return {
+            "before": str(self.maps[0].folder), "after": str(self.maps[1].folder),
+            "T_before_after": self.visits[1].T_common_map.tolist(), "alignment": self.alignment,
+            "min_size": self.min_size, "notes": self.notes,
+            "counts": {kind: kinds.count(kind) for kind in sorted(set(kinds))}, "changes": rows,
+        }  # fmt: skip
+
+
+def compared(before: str | Path, after: str | Path, min_size: float) -> Comparison:
+    """Compare two run folders, see ``diff_runs``."""
     before, after = Path(before), Path(after)
     maps = SavedMap.load(before), SavedMap.load(after)
     coarsest = max(saved.volume.voxel_size for saved in maps)
@@ -73,27 +120,14 @@ def diff_runs(
         )
     visits = Visit.of(maps[0], np.eye(4)), Visit.of(maps[1], T)
     changes, found = find_changes(*visits, min_size)
-    rows = []
-    for number, change in enumerate(changes, start=1):
-        frames = [best_frames(change, saved, visit) for saved, visit in zip(maps, visits, strict=True)]
-        shown = {"frames_before": [t for t, _ in frames[0]], "frames_after": [t for t, _ in frames[1]]}
-        rows.append({"id": number} | change.tree() | shown)
-    kinds = [change.kind for change in changes]
-    tree = {
-        "before": str(before), "after": str(after), "T_before_after": T.tolist(), "alignment": pair_tree,
-        "min_size": min_size, "notes": notes, "counts": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        "changes": rows,
-    }  # fmt: skip
-    if out is not None:
-        _write(Path(out), tree, changes, found, visits, maps)
-    return tree
+    return Comparison(maps, visits, changes, found, pair_tree, notes, min_size)
 
 
 def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], NDArray[np.float64]]:
     """Figures of the alignment and the pose (4, 4) of the second map in the world of the first."""
     if same:
         return {"reason": None}, np.eye(4)
-    pair = compare_maps(maps[0], maps[1], MAX_DENIED)
+    pair = compare_maps(maps[0], maps[1], changed=True)
     if pair.T_a_b is None:
         shared = pair.agreement
         too_small = "" if shared is None or shared.enough else f"; at least {MIN_OVERLAP:.0%} is needed"
@@ -114,21 +148,18 @@ def best_frames(change: Change, saved: SavedMap, visit: Visit) -> list[tuple[flo
     return [(saved.keyframes[n].timestamp, visit.keyframes[n]) for n in order if np.isfinite(scores[n])]
 
 
-def _write(
-    out: Path, tree: dict[str, Any], changes: Sequence[Change], found: Any, visits: Any, maps: Any
-) -> None:
+def _write(out: Path, tree: dict[str, Any], found: Comparison) -> None:
     """Write changes.json, the meshes and the page."""
     if out.exists() and not (out.is_dir() and ((out / CHANGES_FILE).is_file() or not any(out.iterdir()))):
         raise DudmapError(f"{out} exists and holds no comparison of `dudmap diff`; name another folder with --out")
+    changes, visits, maps = found.changes, found.visits, found.maps
     with writing(f"the comparison {out}"):
         out.mkdir(parents=True, exist_ok=True)
         remove_files(out, WRITTEN)
         make_folder(out / "changes")
         for number, change in enumerate(changes, start=1):
-            mesh_of(change, found).save(out / "changes" / f"{number}.ply")
-        poses = [
-            (best_frames(change, maps[1], visits[1]) or best_frames(change, maps[0], visits[0])) for change in changes
-        ]
+            mesh_of(change, found.evidence).save(out / "changes" / f"{number}.ply")
+        poses = [best_frames(one, maps[1], visits[1]) or best_frames(one, maps[0], visits[0]) for one in changes]
         meshes = [tinted(visit.mesh, changes, side) for side, visit in zip(("before", "after"), visits, strict=True)]
         write_text(out / REPORT, change_page(tree, meshes, visits, [p[0][1] if p else None for p in poses]))
         write_text(out / CHANGES_FILE, json.dumps(tree, indent=1) + "\n")
