@@ -45,6 +45,9 @@ def run(
     as_json: o.JsonOption = False,
     saved: o.MapOption = None,
     localize: o.LocalizeOption = False,
+    watch: Annotated[
+        bool, o.map_option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl).")
+    ] = False,
     passes: Annotated[
         int, o.map_option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="1|2")
     ] = 1,
@@ -114,7 +117,15 @@ def run(
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
     storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, report)
+    if watch and saved is None:
+        raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
     with observers(report=report, page=page, rerun=rerun, log=log) as watching:
+        if watch:
+            from dudmap.core.places.saved_map import SavedMap
+            from dudmap.fleet.change_watch import ChangeWatch
+
+            assert saved is not None
+            watching += (ChangeWatch(SavedMap.load(saved), watching),)
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 TRUTH = "changes.json"
 SKINS = ("cardboard", "books", "plaid", "checks", "denim", "brick", "stripes", "paper")
 KINDS = {"appeared", "disappeared", "moved", "opened", "recoloured"}
-NEAREST, FARTHEST, GRAZING = 0.5, 3.5, 0.2
+NEAREST, FARTHEST, GRAZING = 0.5, 4.5, 0.2
 """Distances (m) and least cosine of the angle of incidence at which a surface counts as seen."""
 VIEWS = 5
 """Frames of 30 that must see a surface, or through it."""
