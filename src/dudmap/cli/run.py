@@ -46,7 +46,8 @@ def run(
     saved: o.MapOption = None,
     localize: o.LocalizeOption = False,
     watch: Annotated[
-        bool, o.map_option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl).")
+        bool,
+        o.map_option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl)."),
     ] = False,
     passes: Annotated[
         int, o.map_option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="1|2")

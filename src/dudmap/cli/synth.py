@@ -90,8 +90,9 @@ def synth(
 ) -> None:
     """Render a synthetic recording with exact ground truth.
 
-    With --visits 2 it writes visit-1, visit-2 and changes.json, what each visit could see of the changes. Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
-    surface_observed.ply, scene.json and sensor_truth.json.
+    Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
+    surface_observed.ply, scene.json and sensor_truth.json. With --visits 2 these are in visit-1 and visit-2, beside
+    changes.json: what each visit could see of the changes.
     """
     from dudmap.lab import synthetic
     from dudmap.lab.synthetic.faults import parse_faults

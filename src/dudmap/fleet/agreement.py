@@ -29,7 +29,8 @@ MAX_DENIED = 0.01
 parts of one recording) or 0 to 0.006 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12,
 floors of a building with other plants and boxes 0.006 to 0.024."""
 MAX_CHANGED = 0.5
-"""The same share of two visits between which things may have been moved. More is another place, or one that was emptied."""
+"""The same share of two visits between which things may have been moved. More is another
+place, or one that was emptied."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
 have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""

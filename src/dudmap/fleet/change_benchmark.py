@@ -81,12 +81,15 @@ def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path) -> 
     return folders
 
 
-def score_pair(changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_before: NDArray[np.float64]) -> dict[str, Any]:
+def score_pair(
+    changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_before: NDArray[np.float64]
+) -> dict[str, Any]:
     """What was found of each true change, the false changes, and how far surface and motion agree.
 
     ``T_scene_before`` (4, 4) brings the found changes to the frame of the true ones. Things that the truth calls
     unknown count neither as missed nor as false.
     """
+
     def surface(one: TrueChange | Change) -> NDArray[np.float64]:
         if isinstance(one, TrueChange):
             return np.concatenate([one.before, one.after])
@@ -102,7 +105,9 @@ def score_pair(changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_b
     things: list[dict[str, Any]] = []
     false: list[str] = []
     for number, true in enumerate(truth):
-        mine = sorted((c for c, owner in zip(found, owners, strict=True) if owner == number), key=lambda c: -len(c.points))
+        mine = sorted(
+            (c for c, owner in zip(found, owners, strict=True) if owner == number), key=lambda c: -len(c.points)
+        )
         false += [c.kind for c in mine[1:] if true.kind != "unknown"]
         if true.kind == "unknown":
             continue

@@ -25,7 +25,8 @@ CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0
 """What light alone does not do: a difference of the shares of red, green and blue, or a correlation so low of textures
 with at least this standard deviation (grey levels)."""
 SOLID = 0.7
-"""Share of the surface within the extent of a change that must have other colours: highlights and edges are scattered."""
+"""Share of the surface within the extent of a change that must have other colours: highlights
+are scattered."""
 
 
 def recolored_pieces(found: Evidence, min_size: float) -> list[tuple[Piece, float]]:
@@ -73,7 +74,7 @@ def _different(centres: NDArray[np.float64], own: NDArray[np.float64], other: ND
 
 
 def _is_paint(own: NDArray[np.float64], other: NDArray[np.float64], light: NDArray[np.float64]) -> bool:
-    """Whether the colours (n, 3) of a piece differ as light, with gains (3,) for the whole place, does not make them."""
+    """Whether the colours (n, 3) of a piece differ as light, with gains (3,), does not make them."""
     shares = [(colors + 8) / (colors + 8).sum(axis=1, keepdims=True) for colors in (own, other * light)]
     if np.abs(np.median(shares[0], axis=0) - np.median(shares[1], axis=0)).max() > CHROMA:
         return True

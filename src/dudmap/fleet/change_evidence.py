@@ -64,6 +64,7 @@ class Evidence:
 
     @property
     def points(self) -> NDArray[np.float64]:
+        """Vertices (V, 3), metres."""
         return self.mesh.vertices.astype(np.float64)
 
 
@@ -126,9 +127,7 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color)
 
 
-def times_seen_through(
-    visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]
-) -> NDArray[np.int64]:
+def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
     """How many keyframes (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
 
     The map remembers free space block by block, and not where a part of a block is hidden. What a keyframe sees of the
@@ -157,7 +156,7 @@ def surface_tree(points: NDArray[np.floating]) -> KDTree:
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of the distances (n,) between two surfaces around each point (n, 3), in the unit of these.
+    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3), in the unit of these.
 
     It is 1.48 times the median of the absolute distances below a limit (n,) in a cell, and at least that of all.
     """

@@ -1,4 +1,4 @@
-"""Whether a thing that is missing in one place is the one that is new in another: the rigid motion between two surfaces.
+"""Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
 
 Both surfaces are brought together from several turns by the iterative closest point method (to planes; Chen and Medioni
 1992), the best few poses are refined on the distances and intensities of both maps (``align_maps``), and the result is
@@ -12,17 +12,21 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
-from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit
+from dudmap.core.geometry.alignment import agree
+from dudmap.fleet.change_evidence import CONFIRMED, Evidence, Visit
 from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, SurfacePoints, transformed
 from dudmap.fleet.sdf_alignment import align_maps
 
 Array = NDArray[np.float64]
-TURNS = 12
+TURNS = 16
 """Turns about the vertical from which the surfaces are brought together."""
-COARSE, REFINED = 250, 3
+COARSE, REFINED = 300, 5
 """Points of a surface in the first step, and poses that are refined."""
 ICP_ROUNDS = 25
+COLOR_LENGTH = 0.3
+"""Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and Kang
+1997), in sizes of the thing."""
 PULL = 0.05
 """Weight of the distance to a point against that to its plane: holds flat surfaces from sliding."""
 MIN_POINTS = 60
@@ -69,7 +73,9 @@ class Body:
         numbers = np.union1d(inside[keep], piece.vertices)
         denied = np.isin(numbers, piece.vertices)
         mesh = found.mesh
-        return cls(points[numbers], mesh.normals[numbers].astype(float), mesh.colors[numbers].astype(float), denied, margin)
+        return cls(
+            points[numbers], mesh.normals[numbers].astype(float), mesh.colors[numbers].astype(float), denied, margin
+        )
 
     def chosen(self, rows: NDArray) -> "Body":
         """Some of the points."""
@@ -97,7 +103,11 @@ def _planes(points: Array, normals: Array, margin: float) -> list[tuple[Array, f
     for _ in range(3):
         best = None
         for number in tried:
-            on = left & (np.abs((points - points[number]) @ normals[number]) < margin) & (normals @ normals[number] > 0.9)
+            on = (
+                left
+                & (np.abs((points - points[number]) @ normals[number]) < margin)
+                & (normals @ normals[number] > 0.9)
+            )
             if best is None or on.sum() > best.sum():
                 best = on
         if best is None or best.sum() < max(LEAST_PLANE * len(points), 10):
@@ -111,24 +121,22 @@ def _planes(points: Array, normals: Array, margin: float) -> list[tuple[Array, f
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A rigid motion ``T_after_before`` (4, 4) of a thing in the common frame, and the share of its surface that fits."""
+    """A rigid motion (4, 4) of a thing in the common frame, and the share of its surface that fits."""
 
     T_after_before: Array
     fit: float
 
 
-def motion_between(
-    before: Visit, after: Visit, missing: Body, new: Body, up: Array
-) -> Motion | None:
+def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
     """The motion that brings the missing surface to the new one, None if they are not one thing.
 
     ``up`` (3,) is the direction about which things turn most.
     """
-    poses = sorted(_brought_together(missing.sample(COARSE), new.sample(COARSE), up), key=lambda found: -found[0])
+    poses = _brought_together(missing.sample(COARSE), new.sample(COARSE), up)
     best: Motion | None = None
     T_a, T_b = before.T_common_map, after.T_common_map
     surfaces = new.sample(4000).surface(se3.inverse(T_b)), missing.sample(4000).surface(se3.inverse(T_a))
-    for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN]:
+    for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN / 2]:
         aligned = align_maps(after.volume, before.volume, *surfaces, se3.inverse(T_b) @ T @ T_a, MIN_POINTS)
         for candidate in (T_b @ aligned.T_a_b @ se3.inverse(T_a), T):
             fit = _fit(after, missing, new, candidate), _fit(before, new, missing, se3.inverse(candidate))
@@ -138,33 +146,50 @@ def motion_between(
 
 
 def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
-    """Shares of the points that meet, and motions (4, 4) from a to b, one for each first turn."""
-    out, tree = [], KDTree(b.points)
+    """Shares of the points that meet, and different motions (4, 4) from a to b, the best first."""
+    out: list[tuple[float, Array]] = []
     size = float(np.linalg.norm(np.ptp(b.points, axis=0)))
+    shade = COLOR_LENGTH * size / 255
+    tree = KDTree(np.hstack([b.points, shade * b.colors]))
+    middles = [(body.points.min(axis=0) + body.points.max(axis=0)) / 2 for body in (a, b)]
+
+    def met(T: Array, gate: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
+        points, normals = transformed(T, a.points), a.normals @ T[:3, :3].T
+        near = tree.query(np.hstack([points, shade * a.colors]))[1]
+        close = np.linalg.norm(points - b.points[near], axis=1) < gate
+        return points, near, close & ((normals * b.normals[near]).sum(axis=1) > 0.5)
+
     for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
         T = np.eye(4)
         T[:3, :3] = se3.exp_rotation(up * turn)
-        T[:3, 3] = b.points.mean(axis=0) - T[:3, :3] @ a.points.mean(axis=0)
+        T[:3, 3] = middles[1] - T[:3, :3] @ middles[0]
         for step in range(ICP_ROUNDS):
-            points, normals = transformed(T, a.points), a.normals @ T[:3, :3].T
-            gate = max(0.3 * size * 0.85**step, 3 * b.tolerance)
-            gap, near = tree.query(points)
-            use = (gap < gate) & ((normals * b.normals[near]).sum(axis=1) > 0.5)
+            points, near, use = met(T, max(0.3 * size * 0.85**step, 3 * b.tolerance))
             if use.sum() < 10:
                 break
-            p, q, n = points[use], b.points[near[use]], b.normals[near[use]]
-            J = np.hstack([n, np.cross(p, n)])
-            r = ((p - q) * n).sum(axis=1)
-            turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
-            pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
-            H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
-            g = J.T @ r + np.einsum("nij,ni->j", pull, PULL * (p - q))
-            T = se3.exp(-np.linalg.solve(H + 1e-9 * np.eye(6), g)) @ T
-        points, normals = transformed(T, a.points), a.normals @ T[:3, :3].T
-        gap, near = tree.query(points)
-        meets = (gap < 3 * b.tolerance) & ((normals * b.normals[near]).sum(axis=1) > 0.5)
-        out.append((float(meets.mean()), T))
-    return out
+            T = se3.exp(_icp_step(points[use], b.points[near[use]], b.normals[near[use]])) @ T
+        _, near, use = met(T, 3 * b.tolerance)
+        alike = np.abs(a.colors - b.colors[near]).max(axis=1) < 2 * MAX_COLOR
+        out.append((float((use & alike).mean()), T))
+    out.sort(key=lambda found: -found[0])
+    centre = np.eye(4)
+    centre[:3, 3] = middles[0]
+    kept: list[tuple[float, Array]] = []
+    for share, T in out:
+        if not any(agree(T @ centre, other @ centre, 0.05, 10.0) for _, other in kept):
+            kept.append((share, T))
+    return kept
+
+
+def _icp_step(p: Array, q: Array, n: Array) -> Array:
+    """Twist (6,) that brings points (k, 3) to planes through others with normals n, and a little to these themselves."""
+    J = np.hstack([n, np.cross(p, n)])
+    r = ((p - q) * n).sum(axis=1)
+    turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
+    pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
+    H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
+    g = J.T @ r + np.einsum("nij,ni->j", pull, PULL * (p - q))
+    return -np.linalg.solve(H + 1e-9 * np.eye(6), g)
 
 
 def _fit(there: Visit, own: Body, other: Body, T: Array) -> float:

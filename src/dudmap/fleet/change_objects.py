@@ -19,7 +19,7 @@ unknown."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
 LEAST_WIDTH = 0.5
-"""Width of a change, the middle one of its three extents, in multiples of the smallest size: edges are long and thin."""
+"""Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 CERTAIN = 2
 """A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
 

@@ -55,7 +55,9 @@ def change_page(
         known = row["kind"] in TINTS
         pictures = _pictures(row, visits, pose) if known and pose is not None and row["id"] <= PICTURES else Html("")
         size = " x ".join(f"{100 * (b - a):.0f}" for a, b in zip(*row["box"], strict=True))
-        moved = f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
+        moved = (
+            f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
+        )
         text = f"{size} cm{moved}, confidence {row['confidence']:.2f}" if known else f"{row['area']:.1f} m2 seen once"
         line = '<li data-id="{id}"><b class="{kind}">{id}. {kind}</b> <span>{text}</span>{pictures}</li>'
         rows.append(html(line, id=row["id"], kind=row["kind"], text=text, pictures=pictures))
@@ -85,7 +87,9 @@ def _pictures(row: dict[str, Any], visits: Sequence[Visit], T: NDArray[np.float6
     """Both maps seen from one pose."""
     shown = []
     for name, visit in zip(("before", "after"), visits, strict=True):
-        camera = visit.volume.camera.resized(320, max(1, round(320 * visit.volume.camera.height / visit.volume.camera.width)))
+        camera = visit.volume.camera.resized(
+            320, max(1, round(320 * visit.volume.camera.height / visit.volume.camera.width))
+        )
         image = visit.volume.raycast(np.linalg.inv(visit.T_common_map) @ T, camera).color
         data = "data:image/jpeg;base64," + base64.b64encode(jpeg(image.copy())).decode()
         shown.append(html('<img src="{data}" alt="{name}" title="{name}">', data=data, name=f"{row['id']} {name}"))

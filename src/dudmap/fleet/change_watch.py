@@ -35,29 +35,40 @@ KINDS = ("appeared", "disappeared")
 
 
 class _Cells:
-    """Counts of cells: frames for and against a change, the first and the last time, and whether it was reported."""
+    """Frames for and against a change in cells, by their centres (n, 3): what free space is asked for grows as it goes.
 
-    def __init__(self) -> None:
-        self.rows: dict[int, list[float]] = {}
+    Attributes:
+        codes: (n,) int64 Morton codes, ascending.
+        score: (n,) frames for a change, less those against it.
+        first, last: (n,) seconds.
+        reported: (n,) bool.
+    """
 
-    def count(self, points: NDArray[np.float64], gain: int, now: float) -> None:
-        """One frame for (1) or against (-1) a change at points (n, 3)."""
-        for code in np.unique(morton.encode(np.floor(points / CELL).astype(np.int64))).tolist():
-            row = self.rows.get(code)
-            if row is None:
-                if gain > 0:
-                    self.rows[code] = [1, now, now, 0]
-                continue
-            row[0] += gain
-            row[2] = now
-            if row[0] <= 0 and not row[3]:
-                del self.rows[code]
+    def __init__(self, codes: NDArray[np.int64]) -> None:
+        self.codes, n = codes, len(codes)
+        self.score, self.first, self.last = np.zeros(n, np.int32), np.zeros(n), np.zeros(n)
+        self.reported = np.zeros(n, bool)
 
-    def certain(self) -> NDArray[np.int64]:
-        """Morton codes (n,) of the cells that are certain and not yet reported."""
-        rows = self.rows.items()
-        found = [code for code, row in rows if row[0] >= FRAMES and row[2] - row[1] >= SECONDS and not row[3]]
-        return np.array(found, np.int64)
+    def rows_of(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Rows of the cells of points (n, 3), which are added where they are new."""
+        codes = np.unique(morton.encode(np.floor(points / CELL).astype(np.int64)))
+        new = np.setdiff1d(codes, self.codes, assume_unique=True)
+        if len(new):
+            at = np.searchsorted(self.codes, new)
+            self.codes = np.insert(self.codes, at, new)
+            self.score, self.reported = np.insert(self.score, at, 0), np.insert(self.reported, at, False)
+            self.first, self.last = np.insert(self.first, at, 0.0), np.insert(self.last, at, 0.0)
+        return np.searchsorted(self.codes, codes)
+
+    def count(self, rows: NDArray[np.intp], gain: int, now: float) -> None:
+        """One frame for (1) or against (-1) a change in some cells."""
+        fresh = rows[self.score[rows] <= 0]
+        self.first[fresh], self.last[rows] = now, now
+        self.score[rows] = np.maximum(self.score[rows] + gain, 0)
+
+    def certain(self) -> NDArray[np.intp]:
+        """Rows of the cells that are certain and not yet reported."""
+        return np.flatnonzero((self.score >= FRAMES) & (self.last - self.first >= SECONDS) & ~self.reported)
 
 
 class ChangeWatch(RunObserver):
@@ -75,19 +86,22 @@ class ChangeWatch(RunObserver):
     def __init__(self, before: SavedMap, others: "tuple[RunObserver, ...]" = (), min_size: float = 0.1) -> None:
         self.volume, self.others, self.min_size = before.volume, others, min_size
         self.reported: list[dict[str, Any]] = []
-        self._cells = {kind: _Cells() for kind in KINDS}
         vertices = before.volume.extract_mesh().vertices.astype(np.float64)
-        _, first = np.unique(morton.encode(np.floor(vertices / CELL).astype(np.int64)), return_index=True)
-        self._surface = vertices[first]
+        codes, first = np.unique(morton.encode(np.floor(vertices / CELL).astype(np.int64)), return_index=True)
+        self._codes, self._surface = codes, vertices[first]
+        self._cells = self._fresh()
         self._file: TextIO | None = None
         self._slam: Slam | None = None
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """A pass begins."""
         self._slam, self.reported = slam, []
-        self._cells = {kind: _Cells() for kind in KINDS}
+        self._cells = self._fresh()
         self._close()
         self._file = (out / WATCH_FILE).open("w", encoding="utf-8", buffering=1)
+
+    def _fresh(self) -> dict[str, _Cells]:
+        return {"appeared": _Cells(np.empty(0, np.int64)), "disappeared": _Cells(self._codes)}
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Count what a tracked frame shows, and report what has become certain."""
@@ -120,18 +134,20 @@ class ChangeWatch(RunObserver):
             samples = sample_map(self.volume, points)
             margin = self._margin(z, sensor)
             free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > margin))
-            cells.count(points[free], 1, frame.timestamp)
+            cells.count(cells.rows_of(points[free]), 1, frame.timestamp)
             return
         local = transformed(se3.inverse(T), self._surface)
-        near = np.flatnonzero((local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max))
+        ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
+        ahead &= np.abs(local[:, 0]) < local[:, 2] * camera.width / camera.fx
+        near = np.flatnonzero(ahead)
         u, v = np.rint(camera.project(local[near])).astype(np.int64).T
         inside = (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
         near, u, v = near[inside], u[inside], v[inside]
         z, reading = local[near, 2], frame.depth[v, u]
         beside = np.minimum.reduce([reading, frame.depth[v, u - 1], frame.depth[v, u + 1], frame.depth[v - 1, u]])
         margin = self._margin(z, sensor)
-        cells.count(self._surface[near[beside > z + 2 * margin]], 1, frame.timestamp)
-        cells.count(self._surface[near[np.abs(reading - z) < margin]], -1, frame.timestamp)
+        cells.count(near[beside > z + 2 * margin], 1, frame.timestamp)
+        cells.count(near[np.abs(reading - z) < margin], -1, frame.timestamp)
 
     def _margin(self, z: NDArray[np.float64], sensor: Any) -> NDArray[np.float64]:  # noqa: ANN401 - its configuration
         """Distance (n,) that noise explains at depths (n,), metres."""
@@ -139,12 +155,13 @@ class ChangeWatch(RunObserver):
 
     def _report(self, kind: str, index: int, now: float) -> None:
         """Write the groups of certain cells that are large enough."""
-        codes = self._cells[kind].certain()
+        cells = self._cells[kind]
+        rows = cells.certain()
         wanted = LEAST_CELLS * (self.min_size / CELL) ** 2
-        if len(codes) < wanted:
+        if len(rows) < wanted:
             return
-        centres = (morton.decode(codes).astype(np.float64) + 0.5) * CELL
-        tree, left = KDTree(centres), set(range(len(codes)))
+        centres = (morton.decode(cells.codes[rows]).astype(np.float64) + 0.5) * CELL
+        tree, left = KDTree(centres), set(range(len(rows)))
         while left:
             group, edge = set[int](), {left.pop()}
             while edge:
@@ -155,8 +172,7 @@ class ChangeWatch(RunObserver):
             if len(group) < wanted:
                 continue
             members = sorted(group)
-            for code in codes[members].tolist():
-                self._cells[kind].rows[code][3] = 1
+            cells.reported[rows[members]] = True
             box = np.stack([centres[members].min(axis=0) - CELL / 2, centres[members].max(axis=0) + CELL / 2])
             if self._is_known(kind, box):
                 continue

@@ -1,7 +1,7 @@
 """What changed between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.core.geometry.mesh import joined as joined_meshes
 from dudmap.fleet.change_colors import recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import Body, Motion, motion_between
@@ -107,7 +106,9 @@ def _moved(
         if not (any(old is piece for piece in missing) and any(now is piece for piece in new)):
             continue
         both, T = [], motion.T_after_before
-        for pieces, first, T_there, there in zip((missing, new), (old, now), (T, se3.inverse(T)), surfaces, strict=True):
+        for pieces, first, T_there, there in zip(
+            (missing, new), (old, now), (T, se3.inverse(T)), surfaces, strict=True
+        ):
             parts = [p for p in pieces if p is first or _explained(p, first, T_there, there)]
             pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
             both.append(joined(parts))
@@ -119,13 +120,17 @@ def _motion(
     before: Visit, after: Visit, found: tuple[Evidence, Evidence], old: Piece, now: Piece, up: Array
 ) -> Motion | None:
     """The motion from a missing piece to a new one, None if they are two things."""
-    gap = np.maximum(np.maximum(old.box[0] - now.box[1], now.box[0] - old.box[1]), 0)
-    boxes = (old.box, now.box)
-    if np.linalg.norm(gap) < NEAR:
+    boxes = [(old.box, now.box)]
+    if gap_between(old, now) < NEAR:  # the faces that it left and those that it reached may be opposite ones
         both = np.stack([np.minimum(old.box[0], now.box[0]), np.maximum(old.box[1], now.box[1])])
-        boxes = (both, both)
-    bodies = [Body.of(one, piece, box) for one, piece, box in zip(found, (old, now), boxes, strict=True)]
-    return motion_between(before, after, *bodies, up)
+        boxes.append((both, both))
+    best: Motion | None = None
+    for pair in boxes:
+        bodies = [Body.of(one, piece, box) for one, piece, box in zip(found, (old, now), pair, strict=True)]
+        motion = motion_between(before, after, bodies[0], bodies[1], up)
+        if motion is not None and (best is None or motion.fit > best.fit):
+            best = motion
+    return best
 
 
 def vertical(visit: Visit) -> Array:
@@ -149,7 +154,7 @@ def _explained(piece: Piece, first: Piece, T: Array, there: KDTree) -> bool:
 
 
 def _with_fragments(pieces: list[Piece]) -> list[Piece]:
-    """Pieces, largest first, with which small ones beside them are joined: parts of a thing that were seen by chance."""
+    """Pieces, largest first, joined with small ones beside them: parts of a thing that were seen by chance."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
         near = [n for n, one in enumerate(out) if piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE]
@@ -161,7 +166,7 @@ def _with_fragments(pieces: list[Piece]) -> list[Piece]:
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:
-    """How far the surface lies off what noise explains: 1 minus the tolerance over the distance to the other surface."""
+    """How far the surface lies off what noise explains: 1 less the squared tolerance over the distance."""
     distance = np.maximum(np.nan_to_num(found.sdf[piece.vertices], nan=np.inf), 1e-6)
     return float(np.clip(1 - np.median(found.tolerance[piece.vertices] / distance) ** 2, 0, 1))
 

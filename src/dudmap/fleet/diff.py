@@ -79,9 +79,7 @@ class Comparison:
         """Content of changes.json."""
         rows = []
         for number, change in enumerate(self.changes, start=1):
-            frames = [
-                best_frames(change, saved, visit) for saved, visit in zip(self.maps, self.visits, strict=True)
-            ]
+            frames = [best_frames(change, saved, visit) for saved, visit in zip(self.maps, self.visits, strict=True)]
             shown = {"frames_before": [t for t, _ in frames[0]], "frames_after": [t for t, _ in frames[1]]}
             rows.append({"id": number} | change.tree() | shown)
         kinds = [change.kind for change in self.changes]
@@ -99,9 +97,7 @@ def compared(before: str | Path, after: str | Path, min_size: float) -> Comparis
     maps = SavedMap.load(before), SavedMap.load(after)
     coarsest = max(saved.volume.voxel_size for saved in maps)
     if not 2 * coarsest <= min_size <= 10:
-        raise ConfigError(
-            f"--min-size is {min_size:g} m; expected {2 * coarsest:g} (two voxels of the maps) to 10 m"
-        )
+        raise ConfigError(f"--min-size is {min_size:g} m; expected {2 * coarsest:g} (two voxels of the maps) to 10 m")
     for saved in maps:
         if not (saved.volume.blocks.free_count[: saved.volume.blocks.num_entries] > 0).any():
             raise MapError(

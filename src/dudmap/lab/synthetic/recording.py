@@ -149,9 +149,7 @@ class SyntheticSequence:
         """Recording with the same camera path, movers and sensor noise in another scene."""
         return self._like(scene, self._movers, self.parameters)
 
-    def _like(
-        self, scene: Scene, movers: list[SyntheticMover], parameters: dict[str, object]
-    ) -> "SyntheticSequence":
+    def _like(self, scene: Scene, movers: list[SyntheticMover], parameters: dict[str, object]) -> "SyntheticSequence":
         return SyntheticSequence(
             scene, movers, self.ground_truth, self.camera,
             noise=self._noise, seed=self._seed, fps=self._fps, motion_blur=self._motion_blur,

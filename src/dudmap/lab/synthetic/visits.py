@@ -191,7 +191,9 @@ class _Stage:
 
     def _in_view(self, point: Array) -> bool:
         local = se3.inverse(self.scene.home) @ np.append(point, 1)
-        return bool(local[2] > 0.8 * min(1.0, self.scene.mover_scale * 2) and np.all(np.abs(local[:2]) < 0.5 * local[2]))
+        return bool(
+            local[2] > 0.8 * min(1.0, self.scene.mover_scale * 2) and np.all(np.abs(local[:2]) < 0.5 * local[2])
+        )
 
 
 def _samples(solids: list[Primitive]) -> Array:
@@ -217,7 +219,9 @@ def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | 
         new = replace(old, material=replace(old.material, offset=other))
         return Thing(name, kind, float(2 * max(old.half)), [old], [new], np.eye(4))
     scaled = low < high and name != "shelf"
-    size = size or float(np.exp(rng.uniform(np.log(low), np.log(high * (min(1.0, 2 * scene.mover_scale) if scaled else 1)))))
+    size = size or float(
+        np.exp(rng.uniform(np.log(low), np.log(high * (min(1.0, 2 * scene.mover_scale) if scaled else 1))))
+    )
     solids = make(rng, size)
     if name == "door":
         first, second = scene.hinge, scene.hinge @ pose(yaw=-float(rng.uniform(20, 95)))
