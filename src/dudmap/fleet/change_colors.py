@@ -13,8 +13,8 @@ from dudmap.core.map import morton
 from dudmap.fleet.change_evidence import CONFIRMED, DEVIATIONS, Evidence
 from dudmap.fleet.change_objects import Piece, connected, is_wide
 
-CELL = 0.05
-"""Edge of the cells in which colours are averaged, metres: several pixels."""
+CELL, CELL_VOXELS = 0.05, 4
+"""Edge of the cells in which colours are averaged, metres, and in voxels at least: several pixels."""
 AROUND = 0.6
 """Radius in which the light is taken to be even, metres; a poster fills less than half of it."""
 LEAST_POINTS, LEAST_AROUND = 6, 12
@@ -29,15 +29,15 @@ SOLID = 0.7
 are scattered."""
 
 
-def recolored_pieces(found: Evidence, min_size: float) -> list[tuple[Piece, float]]:
+def recolored_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[tuple[Piece, float]]:
     """Pieces of the own mesh with other colours, and the share of their surface that has them."""
     known = np.flatnonzero((found.state == CONFIRMED) & (found.other_color.max(axis=1) > 0))
     known = known[found.mesh.colors[known].max(axis=1) > 0]
     if len(known) < LEAST_AROUND * LEAST_POINTS:
         return []
-    points = found.points[known]
+    points, edge = found.points[known], max(CELL, CELL_VOXELS * voxel_size)
     _, cell, counts = np.unique(
-        morton.encode(np.floor(points / CELL).astype(np.int64)), return_inverse=True, return_counts=True
+        morton.encode(np.floor(points / edge).astype(np.int64)), return_inverse=True, return_counts=True
     )
 
     def mean(values: NDArray) -> NDArray[np.float64]:
@@ -50,7 +50,7 @@ def recolored_pieces(found: Evidence, min_size: float) -> list[tuple[Piece, floa
     chosen = np.zeros(len(found.state), bool)
     chosen[known[different[cell]]] = True
     out, light = [], np.median(own, axis=0) / np.maximum(np.median(other, axis=0), 1)
-    for piece in connected(found.mesh, chosen, 2 * CELL):
+    for piece in connected(found.mesh, chosen, 2 * edge):
         low, high = piece.box
         inside = known[np.all((points >= low) & (points <= high), axis=1)]
         share = len(piece.vertices) / max(len(inside), 1)

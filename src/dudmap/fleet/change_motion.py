@@ -25,16 +25,20 @@ COARSE, REFINED = 300, 5
 """Points of a surface in the first step, and poses that are refined."""
 ICP_ROUNDS = 25
 COLOR_LENGTH = 0.3
-"""Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and Kang
-1997), in sizes of the thing."""
+"""Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
+Kang 1997), in sizes of the thing."""
+COLOR_GATE = 50.0
+"""Difference of colours at which points do not meet in the first step, grey levels."""
 PULL = 0.05
 """Weight of the distance to a point against that to its plane: holds flat surfaces from sliding."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
-LEAST_FIT, LEAST_SEEN = 0.8, 0.25
-"""Shares of the surface that must lie on the other's: of what is seen there, and of all of it."""
-MAX_COLOR = 25.0
-"""Largest median difference of the colours, grey levels, after one gain for other light."""
+LEAST_FIT, LEAST_SHAPE, LEAST_SEEN = 0.8, 0.6, 0.25
+"""Shares of the surface that must lie on the other's: of what would else hang in free space, of what would else hang
+there or lie under the other's surface (the back of a thin thing does), and of all of it."""
+MAX_COLOR, MAX_CHROMA = (4.0, 0.2), 0.04
+"""Largest median difference of the colours after one gain for other light: grey levels and share of the brightness; and
+of the shares of red, green and blue."""
 RING = 0.15
 """Width of the ring around a thing in which the planes that it stands on are looked for, metres."""
 LEAST_PLANE = 0.15
@@ -169,7 +173,7 @@ def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
                 break
             T = se3.exp(_icp_step(points[use], b.points[near[use]], b.normals[near[use]])) @ T
         _, near, use = met(T, 3 * b.tolerance)
-        alike = np.abs(a.colors - b.colors[near]).max(axis=1) < 2 * MAX_COLOR
+        alike = np.abs(a.colors - b.colors[near]).max(axis=1) < COLOR_GATE
         out.append((float((use & alike).mean()), T))
     out.sort(key=lambda found: -found[0])
     centre = np.eye(4)
@@ -182,7 +186,7 @@ def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
 
 
 def _icp_step(p: Array, q: Array, n: Array) -> Array:
-    """Twist (6,) that brings points (k, 3) to planes through others with normals n, and a little to these themselves."""
+    """Twist (6,) that brings points (k, 3) to planes through others with normals n, and a little to them."""
     J = np.hstack([n, np.cross(p, n)])
     r = ((p - q) * n).sum(axis=1)
     turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
@@ -200,11 +204,18 @@ def _fit(there: Visit, own: Body, other: Body, T: Array) -> float:
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
     samples = there.sample(points)
-    hangs = ~meets & ((samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > limit)))
-    if meets.sum() < LEAST_FIT * (meets.sum() + hangs.sum()) or meets.mean() < LEAST_SEEN:
+    known = ~meets & (samples.state == OBSERVED)
+    hangs = (~meets & (samples.state == EMPTY)) | (known & (samples.sdf > limit))
+    sunk = known & (samples.sdf < -limit)
+    fits, seen = int(meets.sum()), int(meets.sum() + hangs.sum())
+    if fits < LEAST_FIT * seen or fits < LEAST_SHAPE * (seen + sunk.sum()) or meets.mean() < LEAST_SEEN:
         return 0.0
-    mine, theirs = moved.colors[meets], other.colors[near[meets]]
+    return fits / max(seen, 1) if _alike(moved.colors[meets], other.colors[near[meets]]) else 0.0
+
+
+def _alike(mine: Array, theirs: Array) -> bool:
+    """Whether colours (n, 3) of two surfaces are those of one thing, but for one gain."""
     gain = np.clip(np.median(theirs) / max(np.median(mine), 1.0), 0.6, 1.7)
-    if np.median(np.abs(gain * mine - theirs)) > MAX_COLOR:
-        return 0.0
-    return float(meets.sum() / max(meets.sum() + hangs.sum(), 1))
+    shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
+    limit = MAX_COLOR[0] + MAX_COLOR[1] * theirs.mean()
+    return bool(np.median(np.abs(gain * mine - theirs)) < limit and np.abs(shares[0] - shares[1]).max() < MAX_CHROMA)

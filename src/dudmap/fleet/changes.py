@@ -84,7 +84,7 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     out = _moved(before, after, found, missing, new) if missing and new else []
     out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
     out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
-    out += [Change("recoloured", None, piece, share) for piece, share in recolored_pieces(found[1], min_size)]
+    out += [Change("recoloured", None, piece, share) for piece, share in recolored_pieces(found[1], voxel, min_size)]
     out.sort(key=lambda change: -len(change.points))
     return out + _unknown(found, voxel), found
 
