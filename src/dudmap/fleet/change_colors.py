@@ -29,7 +29,9 @@ SOLID = 0.7
 are scattered."""
 
 
-def recolored_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[tuple[Piece, float]]:
+def recolored_pieces(
+    found: Evidence, voxel_size: float, min_size: float, solid: float = SOLID
+) -> list[tuple[Piece, float]]:
     """Pieces of the own mesh with other colours, and the share of their surface that has them."""
     known = np.flatnonzero((found.state == CONFIRMED) & (found.other_color.max(axis=1) > 0))
     known = known[found.mesh.colors[known].max(axis=1) > 0]
@@ -56,7 +58,7 @@ def recolored_pieces(found: Evidence, voxel_size: float, min_size: float) -> lis
         share = len(piece.vertices) / max(len(inside), 1)
         is_large = piece.area > min_size**2 and is_wide(piece.points, min_size, min_size)
         rows = found.mesh.colors[piece.vertices].astype(float), found.other_color[piece.vertices].astype(float)
-        if share > SOLID and is_large and _is_paint(*rows, light):
+        if share > solid and is_large and _is_paint(*rows, light):
             out.append((piece, float(share)))
     return out
 

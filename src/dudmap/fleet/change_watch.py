@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 WATCH_FILE = "changes.jsonl"
 CELL = 0.05
 """Edge of the cells in which evidence is counted, metres."""
-COLUMNS = 40
+COLUMNS = 80
 """Readings of a row of the image that are looked at."""
 FRAMES, SECONDS = 6, 0.5
 """Frames that must show a change in a cell, more than show the opposite, and the time that they must span: who walks

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.fleet.change_colors import recolored_pieces
+from dudmap.fleet.change_colors import SOLID, recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import Body, Motion, motion_between
 from dudmap.fleet.change_objects import BRIDGE, Piece, connected, denied_pieces, gap_between, joined
@@ -84,7 +84,10 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     out = _moved(before, after, found, missing, new) if missing and new else []
     out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
     out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
-    out += [Change("recoloured", None, piece, share) for piece, share in recolored_pieces(found[1], voxel, min_size)]
+    painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
+    for piece, share in painted[1]:  # both visits must say so: their meshes have other vertices and other edges
+        if any(gap_between(piece, other) < ON_SURFACE + voxel for other, _ in painted[0]):
+            out.append(Change("recoloured", None, piece, share))
     out.sort(key=lambda change: -len(change.points))
     return out + _unknown(found, voxel), found
 
