@@ -2,78 +2,22 @@
 
 import json
 import shutil
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-
-def rotation(axis, angle):
-    return cv2.Rodrigues(np.array(axis, float) / np.linalg.norm(axis) * angle)[0]
-
-
-def pose(k):
-    """True T_world_camera of frame k, axes x right, y down, z forward."""
-    T = np.eye(4)
-    T[:3, :3] = rotation([0.3, 1.0, -0.2], 0.1 + 0.2 * k)
-    T[:3, 3] = [0.1 * k, -0.2 + 0.05 * k, 0.3 * k]
-    return T
-
-
-def quat_xyzw(R):
-    w = np.sqrt(1 + np.trace(R)) / 2
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 4 * w * w]) / (4 * w)
-
-
-def tum_line(first, T):
-    numbers = [*T[:3, 3], *quat_xyzw(T[:3, :3])]
-    return f"{first} " + " ".join(f"{number:.9f}" for number in numbers) + "\n"
-
-
-def color(k, width=64, height=48):
-    """RGB image, smooth so that JPEG keeps it; red, green and blue differ."""
-    x, y = np.meshgrid(np.arange(width) / width, np.arange(height) / height)
-    return np.stack([60 + 100 * x + 10 * k, 40 + 60 * y, np.full_like(x, 200)], axis=-1).astype(np.uint8)
-
-
-def millimetres(k, width=64, height=48):
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    depth = (1000 + 100 * k + 3 * (x % 50) + 2 * (y % 30)).astype(np.uint16)
-    depth[:5, :7] = 0
-    return depth
-
-
-def write_color(path, k, width=64, height=48):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else []
-    assert cv2.imwrite(str(path), color(k, width, height)[..., ::-1], options)
-
-
-def write_depth(path, k, scale=1000.0, width=64, height=48, missing=0):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    depth = np.round(millimetres(k, width, height) * (scale / 1000)).astype(np.uint16)
-    depth[:5, :7] = missing
-    assert cv2.imwrite(str(path), depth)
-
-
-def rows(matrix):
-    return "\n".join(" ".join(f"{number:.9f}" for number in row) for row in matrix) + "\n"
-
-
-@dataclass
-class Layout:
-    """What a written folder must be read as."""
-
-    format: str
-    intrinsics: tuple
-    shape: tuple = (48, 64)
-    stamps: list = field(default_factory=lambda: [0.0, 1 / 30, 2 / 30])
-    truth: list | None = field(default_factory=lambda: [pose(k) for k in range(3)])
-    numbers: list = field(default_factory=lambda: [0, 1, 2])
-    color: tuple | None = None  # fx, fy, cx, cy, shape of a camera of its own
-    T_color_depth: np.ndarray = field(default_factory=lambda: np.eye(4))
-    name: str = ""  # of the folder, where the layout prescribes one
+from device_layouts import arkit_scenes, azure_kinect, nerfstudio, polycam, realsense, stray_scanner, timed, zed
+from layout_images import (
+    Layout,
+    millimetres,
+    open3d_camera,
+    pose,
+    rows,
+    tum_line,
+    write_color,
+    write_depth,
+)
 
 
 def tum(folder):
@@ -274,11 +218,6 @@ def replica(folder):
     return Layout("Replica (NICE-SLAM)", (60, 60, 31.5, 23.5))
 
 
-def open3d_camera(**changes):
-    matrix = [60.0, 0, 0, 0, 61.0, 0, 31.0, 23.0, 1.0]  # column by column
-    return json.dumps({"width": 64, "height": 48, "intrinsic_matrix": matrix} | changes)
-
-
 def redwood(folder):
     text = ""
     for k in range(3):
@@ -357,151 +296,6 @@ def epfl(folder):
     return Layout(
         "EPFL RGB-D Pedestrian", camera, (424, 512), stamps=[33 / 30, 34 / 30, 35 / 30], truth=None,
         name="20140804_160621_00",
-    )  # fmt: skip
-
-
-def nerfstudio(folder):
-    frames = []
-    for k in (2, 0, 1):  # order of the file does not matter
-        write_color(folder / f"images/frame_{9 + k}.jpg", k, 128, 96)
-        write_depth(folder / f"depth/frame_{9 + k}.png", k)
-        T = pose(k) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        T[:3, 3] *= 2.0  # nerfstudio's applied_scale
-        frames.append(
-            {
-                "file_path": f"images/frame_{9 + k}.jpg",
-                "depth_file_path": f"depth/frame_{9 + k}.png",
-                "transform_matrix": T.tolist(),
-            }
-        )
-    tree = {
-        "camera_model": "OPENCV", "fl_x": 120.0, "fl_y": 122.0, "cx": 62.5, "cy": 46.5, "w": 128, "h": 96,
-        "applied_scale": 2.0, "frames": frames,
-    }  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps(tree))
-    # halves of 2x2 pixels: centre (c + 0.5) / 2 - 0.5
-    return Layout("nerfstudio", (60, 61, 31, 23), color=(120, 122, 62.5, 46.5, (96, 128)))
-
-
-def write_confidence(path, levels):
-    """All readings are trusted but those that ``millimetres`` leaves out."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    confidence = np.full((48, 64), levels[1], np.uint8)
-    confidence[24:] = levels[2]
-    confidence[:5, :7] = levels[0]
-    assert cv2.imwrite(str(path), confidence)
-
-
-def stray_scanner(folder):
-    """As OdometryEncoder, DepthEncoder, ConfidenceEncoder and DatasetEncoder of the application write it."""
-    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 60, (128, 96))
-    odometry = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
-    for k in range(3):
-        video.write(color(k, 128, 96)[..., ::-1])
-        write_depth(folder / f"depth/{k:06d}.png", k, missing=900)
-        write_confidence(folder / f"confidence/{k:06d}.png", (0, 1, 2))
-        odometry += f"{9052.25 + k / 60}, {k:06d}, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0\n"
-    video.release()
-    (folder / "odometry.csv").write_text(odometry)
-    (folder / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
-    (folder / "camera_matrix.csv").write_text("120.0, 0.0, 62.5\n0.0, 122.0, 46.5\n0.0, 0.0, 1.0")
-    stamps = [9052.25 + k / 60 for k in range(3)]
-    return Layout("Stray Scanner", (60, 61, 31, 23), stamps=stamps, truth=None, color=(120, 122, 62.5, 46.5, (96, 128)))
-
-
-def arkit_scenes(folder):
-    """As download_data.py of ARKitScenes unpacks it; not every image of a kind has one of the other kind."""
-    trajectory = ""
-    for k in range(4):
-        name = f"41069021_{305.377 + 0.1 * k:.3f}"
-        write_color(folder / f"lowres_wide/{name}.png", k)
-        if k < 3:
-            write_depth(folder / f"lowres_depth/{name}.png", k, missing=900)
-            write_confidence(folder / f"confidence/{name}.png", (0, 1, 2))
-            T = np.linalg.inv(pose(k))  # of points of the world into the camera
-            numbers = [305.377 + 0.1 * k, *cv2.Rodrigues(T[:3, :3])[0].ravel(), *T[:3, 3]]
-            trajectory += " ".join(f"{number:.9f}" for number in numbers) + "\n"
-        pincam = folder / f"lowres_wide_intrinsics/{name}.pincam"
-        pincam.parent.mkdir(exist_ok=True)
-        pincam.write_text(f"64 48 {59 + min(k, 2)} {60 + min(k, 2)} 31 23")
-    (folder / "lowres_wide.traj").write_text(trajectory)
-    stamps = [305.377 + 0.1 * k for k in range(3)]
-    return Layout("ARKitScenes", (60.5, 61.5, 31, 23), stamps=stamps, name="41069021")
-
-
-def polycam(folder):
-    """As the application exports it after its optimisation of the poses."""
-    for k in range(3):
-        name = f"keyframes/{{}}/{82_000_000 + 250_000 * k}"
-        for kind, shift in (("", 9), ("corrected_", 0)):
-            write_color(folder / f"{name.format(kind + 'images')}.jpg", k, 128, 96)
-            T = pose(k) @ np.diag([1.0, -1.0, -1.0, 1.0])
-            tree = {f"t_{i}{j}": T[i, j] + shift * (j == 3) for i in range(3) for j in range(4)}
-            tree |= {
-                "fx": 120.0 + k - 1 + shift,
-                "fy": 122.0 + k - 1,
-                "cx": 62.5,
-                "cy": 46.5,
-                "width": 128,
-                "height": 96,
-            }
-            file = folder / f"{name.format(kind + 'cameras')}.json"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(tree | {"blur_score": 71.5, "timestamp": 82_000_000 + 250_000 * k}))
-        write_depth(folder / f"{name.format('depth')}.png", k, missing=900)
-        write_confidence(folder / f"{name.format('confidence')}.png", (0, 127, 255))
-    (folder / "mesh_info.json").write_text(json.dumps({"faceCount": 0, "alignmentTransform": [0.0] * 16}))
-    stamps = [82 + 0.25 * k for k in range(3)]
-    return Layout("Polycam", (60, 61, 31, 23), stamps=stamps, color=(120, 122, 62.5, 46.5, (96, 128)))
-
-
-def realsense(folder):
-    """As Open3D's realsense_recorder writes it: depth aligned to colour."""
-    for k in range(3):
-        write_color(folder / f"color/{k:06d}.jpg", k)
-        write_depth(folder / f"depth/{k:06d}.png", k)
-    (folder / "camera_intrinsic.json").write_text(open3d_camera())
-    return Layout("numbered images", (60, 61, 31, 23), truth=None)
-
-
-def azure_kinect(folder):
-    """As Open3D's azure_kinect_mkv_reader writes it."""
-    for k in range(3):
-        write_color(folder / f"color/{k:05d}.jpg", k)
-        write_depth(folder / f"depth/{k:05d}.png", k)
-    (folder / "intrinsic.json").write_text(
-        open3d_camera(serial_number_="000123", color_mode="MJPG_720P", depth_mode="NFOV_UNBINNED", stream_length_usec=1)
-    )
-    return Layout("numbered images", (60, 61, 31, 23), truth=None)
-
-
-def zed(folder):
-    """As the ZED SDK's sample of SVO export writes it, with intrinsics of its calibration as JSON."""
-    for k in range(3):
-        write_color(folder / f"left{k:06d}.png", k)
-        write_color(folder / f"right{k:06d}.png", k + 1)
-        write_depth(folder / f"depth{k:06d}.png", k)
-    cameras = {side: {"fx": 60.0 + n, "fy": 61.0, "cx": 31.0, "cy": 23.0} for n, side in enumerate(("left", "right"))}
-    tree = {"calibration_parameters": {f"{side}_cam": values for side, values in cameras.items()}}
-    (folder / "calibration.json").write_text(json.dumps(tree))
-    return Layout("numbered images", (60, 61, 31, 23), truth=None)
-
-
-def timed(folder):
-    """Two cameras, names are times in microseconds."""
-    for k in range(3):
-        write_color(folder / f"rgb/{1_700_000_000_000_000 + 100_000 * k}.png", k, 96, 72)
-        write_depth(folder / f"depth/{1_700_000_000_004_000 + 100_000 * k}.png", k)
-    lens = [0.0] * 5
-    camera = {"fx": 60.0, "fy": 61.0, "ppx": 31.0, "ppy": 23.0, "width": 64, "height": 48, "coeffs": lens}
-    other = {"fx": 88.0, "fy": 89.0, "ppx": 47.0, "ppy": 35.0, "width": 96, "height": 72, "coeffs": lens}
-    T = np.eye(4)
-    T[:3, 3] = [0.015, 0, 0]
-    tree = {"depth": camera, "color": other, "depth_scale": 0.001, "depth_to_color": T.tolist()}
-    (folder / "camera.json").write_text(json.dumps(tree))
-    return Layout(
-        "numbered images", (60, 61, 31, 23), stamps=[1.7e9 + 0.004 + 0.1 * k for k in range(3)], truth=None,
-        color=(88, 89, 47, 35, (72, 96)), T_color_depth=T,
     )  # fmt: skip
 
 

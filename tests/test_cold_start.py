@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
 import dudmap
+from dudmap.core.backends import threads
+from dudmap.core.backends.cpu import filtering
 
 PROGRAM = """
 import sys
@@ -41,6 +45,16 @@ def test_an_empty_and_a_filled_kernel_cache_give_equal_results(tmp_path):
     assert results[0] == results[1]
 
 
+def test_a_kernel_is_compiled_again_when_another_file_of_kernels_has_changed(tmp_path, monkeypatch):
+    """Its own file may be the same while the text of a function that it inlines is not."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    for stamp, loaded in (("first", 0), ("first", 1), ("second", 0), ("second", 1)):
+        monkeypatch.setattr(threads, "sources", lambda stamp=stamp: stamp)
+        twice = threads.kernel(filtering.intensities.py_func)
+        twice(0, 1, np.ones((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
+        assert sum(twice.stats.cache_hits.values()) == loaded
+
+
 def test_what_kernels_call_is_inlined():
     """A function that is not exists twice, with other roundings, and it depends on the cache which one is called."""
     kinds, calls = {}, set()
@@ -48,9 +62,32 @@ def test_what_kernels_call_is_inlined():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef):
                 kind = {one.id for one in node.decorator_list if isinstance(one, ast.Name)}
-                if kind & {"kernel", "scalar", "written_out"}:
+                if kind & {"kernel", "scalar", "written_out", "exact", "exact_scalar"}:
                     kinds[node.name] = kind
                     called = (one.func for one in ast.walk(node) if isinstance(one, ast.Call))
                     calls |= {one.id for one in called if isinstance(one, ast.Name)}
     assert "linearize_pair" in calls
-    assert {name for name in calls if "kernel" in kinds.get(name, ())} == INTEGERS
+    assert {name for name in calls if kinds.get(name, set()) & {"kernel", "exact"}} == INTEGERS
+
+
+def test_kernels_of_the_first_frames_do_not_compile_numpys_sorting():
+    """A selection or a sort by NumPy takes seconds of a cold start to compile."""
+    slow, found, kernels = {"partition", "sort", "argsort", "unique", "median", "percentile"}, set(), 0
+    for path in sorted((Path(dudmap.__file__).parent / "core" / "backends" / "cpu").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            decorators = getattr(node, "decorator_list", [])
+            if {one.id for one in decorators if isinstance(one, ast.Name)} & {
+                "kernel",
+                "scalar",
+                "exact",
+                "exact_scalar",
+            }:
+                kernels += 1
+                called = {
+                    one.func.attr
+                    for one in ast.walk(node)
+                    if isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute)
+                }
+                found |= {(node.name, name) for name in called & slow}
+    assert kernels > 50
+    assert found == set()

@@ -50,7 +50,7 @@ def program(*arguments, cwd):
 def run_folder(tmp_path_factory):
     """What the README's second command leaves, on the real excerpt."""
     where = tmp_path_factory.mktemp("docs")
-    line = next(line for line in README.splitlines() if "--save-masks --out my_run" in line)
+    line = next(line for line in README.splitlines() if "--out my_run --set" in line)
     arguments = shlex.split(line.partition("#")[0].replace("SEQUENCE", str(EXCERPT)))[1:]
     done = program(*arguments, cwd=where)
     assert done.returncode == 0, done.stderr
@@ -62,6 +62,11 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), f"{page.name} links {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_link_texts_are_words_and_no_names_of_pages(page):
+    assert re.findall(r"\[[a-z/-]+\.md\]\(", page.read_text(encoding="utf-8")) == []
 
 
 def test_every_page_is_in_the_index():
@@ -93,10 +98,12 @@ def test_shown_parameters_exist():
             assert (key[0] or key[1]) in keys(), f"{page.name} names {key}"
 
 
-def test_every_part_of_the_configuration_is_described():
+def test_every_parameter_is_listed_with_its_part():
     page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    described = set(re.findall(r"^\| `([a-z]+)` \|", page, flags=re.MULTILINE))
-    assert described == {key.partition(".")[0] for key in keys()} - {"preset"}
+    rows = re.findall(r"^\| `([a-z]+)` \| .* \| (.*) \|$", page, flags=re.MULTILINE)
+    listed = {f"{part}.{key}" for part, names in rows for key in re.findall(r"`([a-z0-9_]+)`", names)}
+    assert listed == {key for key in keys() if "." in key}
+    assert {part for part, _ in rows} == {key.partition(".")[0] for key in keys()} - {"preset"}
 
 
 def test_the_printed_configuration_is_the_default(tmp_path):

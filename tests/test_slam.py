@@ -17,7 +17,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
-from dudmap.errors import DatasetError
+from dudmap.errors import FrameError
 from dudmap.lab import synthetic
 from off_course import LIMIT, off_course
 
@@ -187,9 +187,28 @@ def test_a_redundant_view_gets_a_pose_but_is_not_fused():
     assert len(slam.trajectory) == 24
 
 
-def test_frames_that_do_not_fit_the_camera_are_refused():
-    with pytest.raises(DatasetError, match="160x120"):
-        Slam(SMALL).process(Frame(0.0, np.ones((10, 10), np.float32), np.zeros((10, 10, 3), np.uint8)))
+def test_images_of_a_wrong_size_or_type_are_errors_of_one_class():
+    depth, rgb, slam = np.ones((120, 160), np.float32), np.zeros((120, 160, 3), np.uint8), Slam(SMALL)
+    for wrong, what in (
+        ({"depth": depth[:10]}, "160x120"),
+        ({"depth": depth.astype(np.int64)}, "int64"),
+        ({"rgb": rgb.astype(float)}, "float64"),
+        ({"timestamp": np.nan}, "nan"),
+    ):
+        with pytest.raises(FrameError, match=what):
+            slam.process(**{"depth": depth, "rgb": rgb, "timestamp": 0.0} | wrong)
+
+
+def test_what_is_printed_of_a_result_is_one_line():
+    slam = Slam(SMALL)
+    frame = Frame.from_arrays(np.full((120, 160), 2, np.float32), np.zeros((120, 160, 3), np.uint8), 1.5)
+    result = slam.process(frame)
+    printed = f"{frame} {result} {slam.trajectory} {slam.volume.extract_mesh()}"
+    assert printed.startswith(
+        "Frame(1.500000 s, depth (120, 160), colour (120, 160, 3)) FrameResult(1.500000 s, tracked"
+    )
+    assert "Trajectory(1 poses, 1.500000 to 1.500000 s) Mesh(" in printed
+    assert len(printed) < 300
 
 
 def digest():

@@ -18,7 +18,8 @@ from dudmap.lab.benchmark.limits import cells_table, limits_table
 from dudmap.lab.benchmark.measure import markdown
 from dudmap.lab.benchmark.report import published
 from dudmap.lab.benchmark.suites import ABLATION, SUITES, Entry, find_suite, systems
-from layouts import corbs, icl_nuim, pose, volume_deform, write
+from layout_images import pose
+from layouts import corbs, icl_nuim, volume_deform, write
 from recordings import write_recording
 
 PUBLIC = ("thesis", "tum-dynamic", "bonn", "icl-nuim")

@@ -58,7 +58,7 @@ def test_the_command_shows_the_table_and_fails(tmp_path, monkeypatch):
     measured = [{"sequence": "room-person", "ate_rmse_m": 0.004, "mask_iou_mean": 0.5, "lost": 0}]
     monkeypatch.setattr(gate, "measure_gate", lambda entries, config: measured)
     file = tmp_path / "gate.toml"
-    good = CliRunner().invoke(app, ["benchmark", "gate", "--figures", str(file), "--record"])
+    good = CliRunner().invoke(app, ["benchmark", "gate", "--figures", str(file), "--update"])
     assert good.exit_code == 0, good.output
     assert CliRunner().invoke(app, ["benchmark", "gate", "--figures", str(file)]).exit_code == 0
     measured[0]["mask_iou_mean"] = 0.4
@@ -89,7 +89,7 @@ def test_margins_leave_room_in_the_bad_direction_only():
 def test_unrecorded_and_unreadable_figures_are_one_sentence(tmp_path):
     with pytest.raises(ConfigError, match="no recorded figures of somewhere"):
         gate.compare([{"sequence": "somewhere"}], RECORDED)
-    with pytest.raises(ConfigError, match="--record creates the file"):
+    with pytest.raises(ConfigError, match="--update creates the file"):
         gate.load_figures(tmp_path / "none.toml")
     (tmp_path / "gate.toml").write_text("[margins]\n")
     with pytest.raises(ConfigError, match=r"no \[figures\]"):

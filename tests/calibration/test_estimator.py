@@ -8,7 +8,7 @@ import pytest
 
 from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
-from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.color_registration import color_pixels
 from dudmap.core.calibration.adjustment import Adjustment, Fit
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.core.calibration.keyframes import KeyframeCollector
@@ -97,9 +97,9 @@ def estimate(frames: list[Frame]):
 
 def displacement(one: Calibration, other: Calibration) -> float:
     """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
-    depth, backend = record(Calibration.registered(CAMERA), 0).depth, CpuBackend()
+    depth = record(Calibration.registered(CAMERA), 0).depth
     (u, v), (p, q) = (
-        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
+        color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
         for c in (one, other)
     )
     return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))

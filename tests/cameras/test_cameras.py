@@ -115,7 +115,7 @@ def test_without_a_name_all_are_tried_and_their_reasons_told(monkeypatch):
 def test_wrong_names_are_told():
     with pytest.raises(CameraError, match="no camera 'webcam'; expected one of realsense, oak, orbbec, iphone, openni"):
         open_camera("webcam")
-    with pytest.raises(CameraError, match="expected --camera replay:PATH"):
+    with pytest.raises(CameraError, match="expected replay:PATH"):
         open_camera("replay")
     with pytest.raises(DatasetError, match="there is no"):
         open_camera("replay:/nowhere")

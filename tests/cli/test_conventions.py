@@ -15,6 +15,7 @@ import typer
 from typer.testing import CliRunner
 
 from dudmap.cli import COMMANDS, app
+from dudmap.cli.options import GROUPS, arranged
 from dudmap.cli.output import answer, plain
 from exported_runs import make_run
 from run_folders import write_run
@@ -34,7 +35,9 @@ def leaves(name, command):
 ALL = {
     words: command
     for name in COMMANDS
-    for words, command in leaves(name, typer.main.get_command(import_module(f"dudmap.cli.{name}").app)).items()
+    for words, command in leaves(
+        name, arranged(typer.main.get_command(import_module(f"dudmap.cli.{name}").app))
+    ).items()
 }
 
 
@@ -65,7 +68,7 @@ def test_every_reporting_command_has_json():
 CALLS = {
     "run": ["run", "recording", "--out", "a"],
     "demo": ["demo", "--max-frames", 2, "--out", "b"],
-    "live": ["live", "--camera", "replay:recording", "--out", "c"],
+    "live": ["live", "replay:recording", "--out", "c"],
     "report": ["report", "seen"],
     "export": ["export", "run", "--out", "map.glb"],
     "render": ["render", "run", "--orbit", "--max-frames", 2, "--size", "32x24", "--out", "orbit.avi"],
@@ -75,6 +78,7 @@ CALLS = {
     "evaluate trajectory": ["evaluate", "run", "--reference", "recording"],
     "evaluate mesh": ["evaluate", "mesh", "run/mesh.ply", "run/mesh.ply", "--samples", 100, "--no-error-mesh"],
     "evaluate masks": ["evaluate", "masks", "run", "recording"],
+    "evaluate timings": ["evaluate", "timings", "seen"],
     "doctor": ["doctor"],
     "config": ["config", "--preset", "thesis"],
 }
@@ -104,6 +108,7 @@ FAKED = {
     ),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
     "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
+    "benchmark consistency": None,  # tests/benchmark/test_consistency.py
     "benchmark gate": (
         ["benchmark", "gate"],
         {
@@ -248,7 +253,7 @@ MISSING = {
     "merge": ["merge", "nowhere", "there"], "diff": ["diff", "nowhere", "there"],
     "export": ["export", "nowhere", "--out", "a.ply"],
     "render": ["render", "nowhere", "--orbit", "--out", "a.mp4"], "clean": ["clean", "nowhere", "out"],
-    "live": ["live", "--camera", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
+    "live": ["live", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
     "demo": ["demo", "--set", "no.such=1"], "synth": ["synth", "out", "--scene", "moon"],
     "evaluate": ["evaluate", "nowhere"], "evaluate mesh": ["evaluate", "mesh", "nowhere", "there"],
     "evaluate masks": ["evaluate", "masks", "nowhere", "there"], "config": ["config", "--preset", "none"],
@@ -339,7 +344,7 @@ def test_no_color_is_honoured_on_a_terminal(where, no_color):
         ("dudmap run --preset th", {"thesis"}),
         ("dudmap run --set tracker.hub", {"tracker.huber="}),
         ("dudmap config --preset ", {"default", "thesis"}),
-        ("dudmap live --camera real", {"realsense"}),
+        ("dudmap live real", {"realsense"}),
     ],
 )
 def test_the_shell_completes(line, expected):
@@ -369,9 +374,38 @@ def test_help_fits_80_columns_uncut(words):
     assert "…" not in done.output
 
 
-def test_help_of_run_is_grouped():
-    text = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, ["run", "--help"]).output
-    groups = re.findall(r"^╭─ (.*?) ─", text, flags=re.MULTILINE)
-    assert groups[2:] == ["Input", "Output", "Map", "Calibration", "Live and viewing", "Advanced"]
-    assert groups[:2] == ["Arguments", "Options"]  # the latter holds --help alone
-    assert "timings.csv and report.html into the run folder" in text  # wrapped as the terminal is wide
+# -- options -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_option_of_several_commands_means_one_thing_and_stands_in_the_table():
+    found = {}
+    for words, command in ALL.items():
+        for option in command.params:
+            if option.param_type_name == "option":
+                value = (option.metavar or "").split("|")[-1]
+                found.setdefault(option.opts[0], {})[words] = (
+                    f"{option.opts[0]} {value}".strip(),
+                    option.rich_help_panel,
+                )
+    shared = [set(meanings.values()) for meanings in found.values() if len(meanings) > 1]
+    assert [meanings for meanings in shared if len(meanings) > 1] == []
+    page = Path(__file__).parents[2] / "docs" / "conventions.md"
+    rows = re.findall(r"^\| ([A-Za-z ]+) \| (`--.*) \|$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert {group for group, _ in rows} == set(GROUPS)
+    assert {(name, group) for group, row in rows for name in re.findall(r"`([^`]+)`", row)} == set.union(*shared)
+
+
+@pytest.mark.parametrize("words", ALL)
+def test_help_is_grouped_and_uncut_in_80_columns(words):
+    text = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, [*words.split(), "--help"]).output
+    assert max(map(len, text.splitlines())) <= 80
+    assert "\N{HORIZONTAL ELLIPSIS}" not in text
+    titles = re.findall(
+        r"^\N{BOX DRAWINGS LIGHT ARC DOWN AND RIGHT}\N{BOX DRAWINGS LIGHT HORIZONTAL} ([A-Za-z ]+) ",
+        text,
+        flags=re.MULTILINE,
+    )
+    assert titles == [name for name in ("Arguments", "Options", *GROUPS) if name in titles]
+    assert titles[-1] == "Advanced"
+    for option in (name for part in ALL[words].params if part.param_type_name == "option" for name in part.opts):
+        assert re.search(rf"(?<!-){re.escape(option)}\b", text), option

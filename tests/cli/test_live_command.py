@@ -20,7 +20,7 @@ def live(*arguments):
 
 def test_a_replay_is_processed_and_recorded(slam, tmp_path):
     folder, file = write_recording(tmp_path / "desk", 4), tmp_path / "walk.mcap"
-    done = live("--camera", f"replay:{folder}", "--record", file, "--out", tmp_path / "out", "--json")
+    done = live(f"replay:{folder}", "--record", file, "--out", tmp_path / "out", "--json")
     assert done.exit_code == 0, done.output
     metrics = json.loads(done.stdout)
     assert metrics["frames"] + metrics["dropped"] == 4
@@ -31,9 +31,9 @@ def test_a_replay_is_processed_and_recorded(slam, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--camera", "webcam"], "dudmap: there is no camera 'webcam'; expected one of realsense"),
-        (["--camera", "replay"], "expected --camera replay:PATH"),
-        (["--camera", "replay:/nowhere"], "there is no folder or file /nowhere"),
+        (["webcam"], "dudmap: there is no camera 'webcam'; expected one of realsense"),
+        (["replay"], "expected replay:PATH"),
+        (["replay:/nowhere"], "there is no folder or file /nowhere"),
         (["--map", "/nowhere"], "/nowhere"),
     ],
 )
@@ -54,7 +54,7 @@ def test_ctrl_c_writes_the_results_of_a_real_run(tmp_path):
     )
     out, file = tmp_path / "out", tmp_path / "walk.mcap"
     run = subprocess.Popen(
-        [*dudmap, "live", "--camera", f"replay:{room}", "--out", out, "--record", file],
+        [*dudmap, "live", f"replay:{room}", "--out", out, "--record", file],
         stderr=subprocess.PIPE,
         text=True,
     )

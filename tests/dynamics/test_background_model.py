@@ -65,6 +65,16 @@ def test_what_was_seen_for_a_moment_or_in_another_world_is_no_background():
     assert not background.hidden(0.5, level, pose(5)).any()
 
 
+def test_the_background_follows_a_correction_of_the_world():
+    correction = se3.exp(np.array([0.3, -0.1, 0.2, 0.0, 0.1, 0.05]))
+    (level, disc), background, expected = with_hole(15, 0.05), seen(15), seen(15)
+    background.apply_correction(correction)
+    hidden = background.hidden(0.5, level, correction @ pose(15))
+    assert hidden[disc].mean() > 0.85
+    assert (hidden == expected.hidden(0.5, level, pose(15))).mean() > 0.999
+    assert not background.hidden(0.5, level, pose(15))[disc].all()
+
+
 def test_a_seam_is_not_hidden():
     """The sky above a wall: its edge wanders by a pixel or two."""
     background = seen(15)

@@ -8,10 +8,11 @@ import pytest
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.dynamics import dominant_motion as dominant
 from dudmap.core.dynamics.dominant_motion import dominant_motion
-from dudmap.core.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
+from dudmap.core.dynamics.ransac import reproject, rigid_motion
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
+from ransac_oracle import best_motion, flow_jacobian, refined, scores
 
 CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 
@@ -26,38 +27,52 @@ def test_the_flow_jacobian_is_the_derivative_of_the_projection():
         np.testing.assert_allclose(J[:, :, axis], numeric, rtol=1e-5, atol=1e-4)
 
 
-def test_the_refining_step_is_that_of_least_squares():
-    rng = np.random.default_rng(5)
-    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (200, 3))
-    T = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
-    targets = reproject(T, points, CAMERA) + rng.normal(0, 1, (200, 2))
-    guess = se3.exp(np.array([0.018, -0.01, 0.028, 0.011, 0.019, -0.01]))
-    residual = targets - reproject(guess, points, CAMERA)
-    near = np.linalg.norm(residual, axis=1) < 2 * NOISE_PX
-    assert 20 < np.count_nonzero(near) < 180
-    J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
-    found = correspondences(points, targets, np.eye(4))
-    H, gradient, inliers = consensus.linearized(np.stack([guess] * 8), found, np.full(8, 2 * NOISE_PX))
-    assert set(inliers) == {np.count_nonzero(near)}
-    expected = np.linalg.lstsq(J, residual[near].reshape(-1), rcond=None)[0]
-    for g in (0, 7):
-        np.testing.assert_allclose(np.linalg.solve(H[g], gradient[g]), expected, rtol=1e-5, atol=1e-9)
-    assert not any(values.any() for values in consensus.linearized(guess[None], found, np.zeros(1)))
+def noisy(rng, count):
+    """Points, and their targets after a small motion, some of them wrong."""
+    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (count, 3))
+    targets = reproject(se3.exp(0.02 * rng.normal(size=6)), points, CAMERA) + rng.normal(0, 0.2, (count, 2))
+    targets[: count // 4] += rng.uniform(-20, 20, (count // 4, 2))
+    return points, targets
 
 
-def test_the_scores_of_motions_are_those_of_the_formula():
-    rng = np.random.default_rng(6)
-    points, expected = rng.uniform([-1, -1, 0.5], [1, 1, 5], (150, 3)), se3.exp(0.02 * rng.normal(size=6))
-    motions = se3.exp_all(0.01 * rng.normal(size=(70, 6)))
-    targets = reproject(motions[0], points, CAMERA) + rng.normal(0, 1, (150, 2))
+@pytest.mark.parametrize("seed", range(5))
+def test_the_best_motion_is_that_of_all_hypotheses_and_their_refinement(seed):
+    rng = np.random.default_rng(seed)
+    points, targets = noisy(rng, 300)
+    T_expected, draws = se3.exp(0.02 * rng.normal(size=6)), rng.integers(0, 300, (200, 3))
+    draws[7] = draws[8] = 5  # degenerate
     params = consensus.ConsensusParams((1.5, 0.8), (3.0, 4.0), 5.0)
-    scores = consensus.msac_scores(motions, correspondences(points, targets, expected), params)
-    for T, found in zip(motions, scores, strict=True):
-        pixels = reproject(T, points, CAMERA)
-        d = np.linalg.norm(pixels - reproject(expected, points, CAMERA), axis=1).mean() / 5.0
-        for score, inlier_px, gain in zip(found, (1.5, 0.8), (3.0, 4.0), strict=True):
-            square = np.minimum(np.sum((pixels - targets) ** 2, axis=1) / inlier_px**2, 1)
-            assert score == pytest.approx(gain * np.sum(points[:, 2] ** 2 * (1 - square)) * (0.5 + 0.5 / (1 + d**2)))
+    expected = best_motion(draws, points, targets, params, T_expected, CAMERA)
+    found = consensus.best_motion(draws, correspondences(points, targets, T_expected), params, T_expected)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_the_search_is_the_same_with_any_number_of_threads(monkeypatch):
+    rng = np.random.default_rng(9)
+    points, targets = noisy(rng, 500)
+    found = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("DUDMAP_THREADS", threads)
+        found.append(rigid_motion(points, targets, CAMERA, np.eye(4)))
+    assert np.array_equal(*found)
+
+
+def test_motions_are_refined_and_scored_as_by_the_formulas():
+    rng = np.random.default_rng(6)
+    points, targets = noisy(rng, 150)
+    T_expected, motions = se3.exp(0.02 * rng.normal(size=6)), se3.exp_all(0.01 * rng.normal(size=(20, 6)))
+    params, found = consensus.ConsensusParams((1.5, 0.8), (3.0, 4.0), 5.0), correspondences(points, targets, T_expected)
+    out = np.full((20, 2), np.nan)
+    consensus.score(5, 20, motions, found, params, out)
+    expected = scores(motions, points, targets, reproject(T_expected, points, CAMERA), params, CAMERA)
+    np.testing.assert_allclose(out[5:], expected[5:], rtol=1e-9)
+    assert np.isnan(out[:5]).all()
+    T = motions[0].copy()
+    consensus.refine(T, found, 3.0)
+    np.testing.assert_allclose(T, refined(motions[0], points, targets, 3.0, CAMERA), atol=1e-9)
+    unchanged = motions[1].copy()
+    consensus.refine(unchanged, found, 0.0)  # without inliers
+    assert np.array_equal(unchanged, motions[1])
 
 
 def correspondences(points, targets, T_expected):
@@ -128,8 +143,12 @@ def test_the_weighted_median_is_that_of_repeated_values():
 
 def test_the_nearest_points_of_the_same_group_vote():
     rng = np.random.default_rng(3)
-    points, group_of, moving = rng.normal(size=(60, 3)), rng.integers(1, 4, 60).astype(np.int32), rng.random(60) < 0.5
-    queries, groups = rng.normal(size=(40, 3)), rng.integers(1, 4, 40).astype(np.int32)
+    points, group_of = rng.normal(size=(300, 3)), rng.integers(1, 4, 300).astype(np.int32)
+    moving = rng.random(300) < 0.5
+    queries, groups = (
+        np.cumsum(0.02 * rng.normal(size=(1500, 3)), axis=0),
+        np.repeat([1, 3, 2, 3], 375).astype(np.int32),
+    )
     votes = consensus.neighbour_votes(queries, groups, points, group_of, moving, 5)
     for query, group, vote in zip(queries, groups, votes, strict=True):
         known = np.flatnonzero(group_of == group)

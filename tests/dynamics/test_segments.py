@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import segment_counts
-from dudmap.core.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
+from dudmap.core.backends.cpu.segment_motion import classify_segments, counts_in, split_mixed_segments
+from dudmap.core.dynamics.segments import segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
@@ -59,20 +60,23 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
 
 
 def split(segmentation, before):
-    counts = segment_counts(segmentation.labels, segmentation.count, [before])
-    return split_mixed_segments(segmentation, before, *counts)
+    labels, count = segmentation.labels, segmentation.count
+    total, part, _ = counts_in(labels, count, before, before)
+    return split_mixed_segments(labels, count, before, total, part, segmentation.min_pixels)
 
 
 def test_segments_that_have_merged_are_split_by_their_last_labels():
     whole = segment(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
     body = np.zeros(CAMERA.shape, bool)
-    assert split(whole, body) is whole
+    assert split(whole, body)[1] == whole.count
     body[:, :60] = True
-    two = split(whole, body)
-    assert two.count == whole.count + 1
-    assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
+    labels, count = split(whole, body)
+    assert count == whole.count + 1
+    assert len(np.unique(labels[body])) == len(np.unique(labels[~body])) == 1
     body[:, 6:60] = False  # a strip that came into view
-    assert split(whole, body) is whole
+    labels, count = split(whole, body)
+    assert count == whole.count
+    assert np.array_equal(labels, whole.labels)
 
 
 def scene(x):
@@ -97,7 +101,7 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        before = memory.last_dynamic(image, np.eye(4), 0.1)
+        before = memory.last_dynamic(image, np.eye(4))
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
         assert before[inner].mean() > 0.9
@@ -105,6 +109,38 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
     assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
+
+
+def test_what_is_remembered_follows_a_correction_of_the_world():
+    """As if the world had been the corrected one from the first frame on."""
+    correction, sigma = se3.exp(np.array([0.3, -0.1, 0.2, 0.0, 0.1, 0.05])), np.full(CAMERA.shape, 0.01, np.float32)
+    memory, (image, board) = TemporalMemory(DynamicsConfig(settle_time=1.0)), scene(0.0)
+    surface = segment(image, TOLERANCE)
+    for i in range(35):
+        memory.update(i / 30, image, np.eye(4), board, surface)
+    memory.apply_correction(correction)
+    frame = 35 / 30, image, correction, surface, sigma, board
+    assert memory.settled(*frame)[board].mean() > 0.9
+    assert memory.last_dynamic(image, correction)[board].mean() > 0.9
+    assert not free_space(memory, 35 / 30, image, correction).any()
+    memory.apply_correction(correction)
+    assert not memory.settled(*frame).any()
+
+
+@pytest.mark.parametrize(("speed", "marked", "stands"), [(0.0, False, True), (0.3, False, False), (0.0, True, False)])
+def test_images_are_not_believed_on_what_older_frames_have_seen_in_its_place(speed, marked, stands):
+    """Unless it was taken to move in them: a crowd that drags the camera along also seems to stand still."""
+    memory = TemporalMemory(DynamicsConfig())
+    sigma = np.full(CAMERA.shape, 0.01, np.float32)
+    for i in range(20):
+        image, board = scene(speed * i / 30)
+        surface = segment(image, TOLERANCE)
+        stayed = memory.stayed(i / 30, image, np.eye(4), surface, sigma, board)
+        assert not stayed[~board].any()
+        if i < 12:  # images show motion over up to 0.4 s
+            assert not stayed.any()
+        memory.update(i / 30, image, np.eye(4), board if marked else np.zeros_like(board), surface)
+    assert (stayed[board].mean() > 0.9) == stands
 
 
 def free_space(memory, timestamp, image, T, unknown=0.0):
@@ -212,23 +248,12 @@ def test_an_object_that_stops_becomes_static_after_the_settle_time():
 )
 def test_motion_is_decided_per_segment(share, before, distance, mismatch, whole):
     """A segment some of which moves is dynamic if the rest of it fits less well than static segments do."""
-    evidence = SegmentEvidence(
-        size=np.array([0, 500.0, 20000]),
-        compared=np.ones(3),
-        dynamic=np.array([0, share, 0]),
-        distance=np.array([0, distance, 0.1]),
-        mismatch=np.array([0, mismatch, 0.05]),
-    )
-    assert classify_segments(evidence, np.array([0, before, 0])).tolist() == [False, whole, False]
+    evidence = np.array([[0.0] * 5, [500, 1, share, distance, mismatch], [20000, 1, 0, 0.1, 0.05]])
+    found = classify_segments(evidence, np.array([0.0, before, 0]), 60.0)
+    assert found.tolist() == [False, whole, False]
 
 
 def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
     for share, whole in ((0.5, False), (0.9, True)):
-        evidence = SegmentEvidence(
-            size=np.array([0, 5000.0, 15000]),
-            compared=np.ones(3),
-            dynamic=np.array([0, share, 0]),
-            distance=np.array([0, 3.0, 0.1]),
-            mismatch=np.array([0, 1.0, 0.05]),
-        )
-        assert classify_segments(evidence, np.zeros(3)).tolist() == [False, whole, False]
+        evidence = np.array([[0.0] * 5, [5000, 1, share, 3, 1], [15000, 1, 0, 0.1, 0.05]])
+        assert classify_segments(evidence, np.zeros(3), 60.0).tolist() == [False, whole, False]

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.viewing.run_files import RunFiles
 from dudmap.cli import app
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
-from layouts import bonn, pose, replica, tum_line, write
+from layout_images import pose, tum_line
+from layouts import bonn, replica, write
+from run_folders import write_run
 
 
 def evaluate(*arguments):
@@ -107,7 +110,7 @@ def test_mesh_of_a_run_is_moved_into_the_true_world(folders):
     assert len(Mesh.load(run / "mesh_error.ply").faces) == 4
     apart = figures("mesh", run / "mesh.ply", recording / "surface.ply", "--samples", 2000, "--no-error-mesh")
     assert apart["accuracy_rmse_m"] > 0.1
-    aligned = figures("mesh", run, recording, "--align", "--samples", 2000, "--distances", "0.002")
+    aligned = figures("mesh", run, recording, "--register", "--samples", 2000, "--distances", "0.002")
     assert aligned["icp_rmse_m"] < 1e-3
     assert aligned["precision_2mm"] > 0.99
 
@@ -132,6 +135,10 @@ def test_pictures(folders):
     assert re.search(r"ate_rmse +│ [\d.]+ mm", outcome.stdout)
     assert evaluate("mesh", run, recording, "--plots", "--samples", 2000).exit_code == 0
     assert evaluate("masks", run, recording, "--plots").exit_code == 0
+    assert evaluate("masks", run, recording, "--plot-format", "pdf").exit_code == 0
+    assert (run / "masks.pdf").read_bytes().startswith(b"%PDF")
+    assert evaluate(run, "--reference", recording, "--plot-format", "svg").exit_code == 0
+    assert "<svg" in (run / "trajectory.svg").read_text(encoding="utf-8")
     for name in ("trajectory", "error", "rpe", "residuals", "mesh_error", "masks"):
         image = cv2.imread(str(run / f"{name}.png"))
         assert image is not None, name
@@ -150,6 +157,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
         ((run, "--reference", tmp_path / "empty"), "there is no true trajectory"),
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
         ((run, "--plots"), "name one with --reference"),
+        ((run, "--plot-format", "gif"), "found --plot-format gif; expected png, pdf or svg"),
         (("mesh", tmp_path / "empty", recording), "there is no mesh"),
         (("mesh", tmp_path / "broken.ply", recording), "cannot read the mesh"),
         (("mesh", run, recording, "--distances", "1cm"), "expected numbers separated by commas"),
@@ -188,3 +196,17 @@ def test_errors_are_printed_in_millimetres():
     assert _shown("ate_rmse_m", 0.00745755) == ("ate_rmse", "7.5 mm")
     assert _shown("rpe_trans_rmse_m_per_s", 0.0123) == ("rpe_trans_rmse per s", "12.3 mm")
     assert _shown("path_length_m", 3.25) == ("path_length_m", "3.25")
+    assert _shown("rpe_rot_rmse_deg_per_m", 0.7146) == ("rpe_rot_rmse per m", "0.71 deg")
+    assert _shown("ate_rot_rmse_deg", 2.7328) == ("ate_rot_rmse (see rotation_rmse)", "2.73 deg")
+
+
+def test_times_per_stage_are_a_table_for_a_paper(tmp_path):
+    write_run(tmp_path / "run")
+    figures = json.loads(evaluate("timings", tmp_path / "run", "--json").stdout)
+    columns = RunFiles.load(tmp_path / "run")
+    for stage in ("total", *columns.stages):
+        assert figures[f"{stage}_median_ms"] == pytest.approx(np.median(columns.column(stage)), abs=1e-3)
+        assert figures[f"{stage}_p95_ms"] == pytest.approx(np.percentile(columns.column(stage), 95), abs=1e-3)
+    rows = (tmp_path / "run" / "timings.tex").read_text(encoding="utf-8").splitlines()
+    assert rows[2].startswith(f"total & {figures['total_median_ms']:.1f} & ")
+    assert len(rows) == 3 + len(columns.stages) + 1

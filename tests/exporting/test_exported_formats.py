@@ -18,14 +18,13 @@ from pxr import Usd, UsdGeom
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-import dudmap
 from dudmap.cli import app
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting.exporters import EXPORTERS, export_run
 from dudmap.io.exporting.gravity import find_floor
-from dudmap.io.exporting.mesh_editing import without_specks
+from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.mesh_files import linear_light
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from exported_runs import CAMERA, VOXEL, make_run
@@ -45,7 +44,7 @@ def run(made):
 
 @pytest.fixture(scope="module")
 def mesh(run):
-    return without_specks(Mesh.load(run / "mesh.ply"))
+    return without_small_pieces(Mesh.load(run / "mesh.ply"))
 
 
 @pytest.fixture(scope="module")
@@ -368,31 +367,6 @@ def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r'^--max-triangles needs the extra export .*"\.\[export\]"'):
         exported(run, tmp_path / "map.ply", max_triangles=100)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_incomplete_and_newer_run_folders(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    Trajectory(np.array([1.0]), np.eye(4)[None]).save(folder / "trajectory.txt")
-    with pytest.raises(MapError, match=r"holds no mesh\.ply"):
-        exported(folder, tmp_path / "map.ply")
-    points = np.zeros((3, 3), np.float32)
-    Mesh(points, np.empty((0, 3), np.int32), points.astype(np.uint8), points).save(folder / "mesh.ply")
-    with pytest.raises(MapError, match="has no triangles"):
-        exported(folder, tmp_path / "map.ply")
-    Mesh(points + np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), points.astype(np.uint8), points).save(
-        folder / "mesh.ply"
-    )
-    with pytest.raises(MapError, match=r"holds no map\.npz"):
-        exported(folder, tmp_path / "map.npz", up=(0, -1, 0))
-    whole = (folder / "mesh.ply").read_bytes()
-    (folder / "mesh.ply").write_bytes(whole[:-3])
-    with pytest.raises(MapError, match="cut off or damaged"):
-        exported(folder, tmp_path / "map.ply")
-    (folder / "mesh.ply").write_bytes(whole)
-    (folder / "metrics.json").write_text(json.dumps({"versions": {"dudmap": "99.1.0"}}))
-    with pytest.raises(DatasetError, match=rf"was written by dudmap 99\.1\.0 and this is {dudmap.__version__}"):
-        exported(folder, tmp_path / "map.ply")
 
 
 def test_command(run, tmp_path):

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from verdict import check_sentence
 
-import layouts
+import layout_images
 from dudmap.errors import DudmapError, FrameError
 
 
@@ -43,7 +43,7 @@ def load_calibration(path):
 
 
 def trajectory():
-    return "# t x y z qx qy qz qw\n" + "".join(layouts.tum_line(k, layouts.pose(k)) for k in range(5))
+    return "# t x y z qx qy qz qw\n" + "".join(layout_images.tum_line(k, layout_images.pose(k)) for k in range(5))
 
 
 def load_trajectory(path):
@@ -54,7 +54,7 @@ def load_trajectory(path):
 
 
 def camera_files(folder):
-    (folder / "camera.json").write_text(layouts.open3d_camera())
+    (folder / "camera.json").write_text(layout_images.open3d_camera())
     return folder / "camera.json"
 
 
@@ -84,7 +84,9 @@ IMAGES = "depth", "color", "tiff", "webp", "pnm", "bmp"
 def image(kind, folder):
     extension = {"depth": ".png", "color": ".jpg", "tiff": ".tiff", "webp": ".webp", "pnm": ".pgm", "bmp": ".bmp"}[kind]
     path = folder / f"image{extension}"
-    (layouts.write_depth if kind in ("depth", "tiff", "pnm") else layouts.write_color)(path, 0, width=32, height=16)
+    (layout_images.write_depth if kind in ("depth", "tiff", "pnm") else layout_images.write_color)(
+        path, 0, width=32, height=16
+    )
     return path
 
 
@@ -144,9 +146,9 @@ def run_folder(folder):
     (run / "movers.jsonl").write_text(json.dumps(row) + "\n")
     mesh("ply", run)
     np.savez(run / "residuals.npz", edges=np.arange(5.0), counts=np.arange(4), prior=[0.5, 0.5], sigma=[1.0, 9.0])
-    layouts.write_color(run / "masks/0.000000.png", 0)
+    layout_images.write_color(run / "masks/0.000000.png", 0)
     (run / "thumbnails").mkdir()
-    layouts.write_color(run / "thumbnails/0.000000.color.jpg", 0)
+    layout_images.write_color(run / "thumbnails/0.000000.color.jpg", 0)
     return run
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from verdict import Loader, check_sentence
 
+import layout_images
 import layouts
 from dudmap.errors import FrameError
 from dudmap.io.sequences import numbered_folders, open_sequence, tum
@@ -88,7 +89,7 @@ def tum_with_masks(folder):
     lines = ""
     for k in range(3):
         stamp = f"{100 + 0.1 * k:.6f}"
-        layouts.write_color(path / f"mask/{stamp}.png", k)
+        layout_images.write_color(path / f"mask/{stamp}.png", k)
         lines += f"{stamp} mask/{stamp}.png\n"
     (path / "mask.txt").write_text(lines)
     return path

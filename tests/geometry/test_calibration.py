@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.color_registration import color_pixels
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
@@ -42,9 +42,7 @@ def test_each_depth_pixel_is_found_where_the_colour_camera_saw_it():
     rng = np.random.default_rng(1)
     depth = rng.uniform(0.8, 3.0, DEPTH.shape).astype(np.float32)
     offset = 0.004
-    us, vs = CpuBackend().color_pixels(
-        depth, DEPTH.intrinsics, color_projection(calibration(), TWIST, offset), 1.0, 0, DEPTH.height
-    )
+    us, vs = color_pixels(depth, DEPTH.intrinsics, color_projection(calibration(), TWIST, offset), 1.0, 0, DEPTH.height)
     points = DEPTH.backproject(depth).reshape(-1, 3).astype(np.float64)
     tau = np.full(len(points), offset + 0.02)
     for _ in range(6):  # the row gives the time, and the time the row
@@ -60,9 +58,7 @@ def test_pixels_without_a_reading_take_the_depth_of_a_neighbour_in_their_row():
     holes = depth.copy()
     holes[10, 30:60] = holes[20, :40] = holes[30, 50:] = holes[40] = 0
     projection = color_projection(calibration(delay=0.0, readout=0.0), np.zeros(6), 0.0)
-    full, filled = (
-        CpuBackend().color_pixels(d, DEPTH.intrinsics, projection, 2.0, 0, DEPTH.height) for d in (depth, holes)
-    )
+    full, filled = (color_pixels(d, DEPTH.intrinsics, projection, 2.0, 0, DEPTH.height) for d in (depth, holes))
     assert np.array_equal(full[0], filled[0])
     assert np.array_equal(full[1], filled[1])
 
@@ -83,7 +79,7 @@ def test_a_plane_seen_by_two_cameras_has_one_colour():
 
     depth, color = view(camera, np.eye(4))
     _, elsewhere = view(other.camera, se3.inverse(other.T_color_depth))
-    registered = register_color(elsewhere, depth, camera, color_projection(other, np.zeros(6), 0.0), CpuBackend())
+    registered = register_color(elsewhere, depth, camera, color_projection(other, np.zeros(6), 0.0))
     difference = np.abs(registered[20:-20, 20:-20].astype(int) - color[20:-20, 20:-20])
     assert difference.mean() < 0.5
     assert difference.max() <= 2

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.filtering import intensity
 from dudmap.core.backends.device import make_backend
 from dudmap.core.backends.parameters import RegistrationParameters
 from dudmap.core.frames.preprocess import Preprocessor
@@ -28,7 +29,7 @@ def linearized(volume, recording, tukey=0.0, index=4):
     T = recording.ground_truth.Ts_world_camera[index].copy()
     T[:3, 3] += [0.01, -0.005, 0.008]
     frame = recording[index]
-    depth, shade = frame.depth.astype(np.float32), volume.backend.intensity(np.ascontiguousarray(frame.color))
+    depth, shade = frame.depth.astype(np.float32), intensity(np.ascontiguousarray(frame.color))
     weights = np.linspace(0, 1, depth.size, dtype=np.float32).reshape(depth.shape)
     volume.look_at(T)
     images = depth, shade, weights, CAMERA.intrinsics

@@ -6,8 +6,10 @@ import pytest
 from dudmap import Config
 from dudmap.core.backends import threads
 from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.registration import write_lattice
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, run_team, take, wait_for_all, wait_for_work
 from dudmap.core.backends.descent import descend
+from dudmap.core.backends.parameters import to_lattice
 from dudmap.core.backends.threads import kernel
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -62,7 +64,7 @@ def registration():
     config = Config().override(["volume.voxel_size=0.05", "volume.truncation_noise=0"])
     backend = CpuBackend()
     volume = TsdfVolume(CAMERA, config.volume, config.sensor, backend=backend)
-    observation = Preprocessor(CAMERA, config.preprocess, backend)(wall(2.0))
+    observation = Preprocessor(CAMERA, config.preprocess)(wall(2.0))
     volume.integrate(wall(2.0), np.eye(4))
     level = Pyramid.of(observation, CAMERA, config).fine
     tracker = Tracker(config.tracker, config.sensor)
@@ -93,3 +95,9 @@ def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, column
     np.testing.assert_allclose(found.equations.residuals, expected.equations.residuals, atol=1e-4)
     again = volume.backend.register(volume.grid, *images, T, first, rules, parameters)
     np.testing.assert_array_equal(found.T_world_camera, again.T_world_camera)
+
+
+def test_a_pose_is_written_in_the_lattice():
+    T, origin, out = np.arange(16.0).reshape(4, 4) / 7, np.array([3, -20, 8]), np.empty((3, 4), np.float32)
+    write_lattice(T, 0.01, origin, out)
+    np.testing.assert_allclose(out, to_lattice(T, 0.01, origin), rtol=1e-6)

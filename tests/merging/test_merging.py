@@ -244,7 +244,8 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, same_roo
     np.testing.assert_allclose(Trajectory.load(out / "trajectory-2.txt").Ts_world_camera[1], tree["T_a_b"], atol=1e-6)
     shown = RunFiles.load(out)
     assert [frame.timestamp for frame in shown.figures()] == [0.0, 1.0]
-    assert len(shown.mesh.faces) == tree["mesh_triangles"]
+    assert shown.mesh is not None
+    assert 0.99 * tree["mesh_triangles"] < len(shown.mesh.faces) <= tree["mesh_triangles"]  # without the loose pieces
     assert "5 of 5 frames were tracked" in write_report(out, tmp_path / "report.html").read_text()
     merged = SavedMap.load(out)
     assert len(merged.keyframes) == len(room.saved.keyframes) + len(same_room.saved.keyframes)

@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from device_layouts import arkit_scenes, polycam, stray_scanner
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import open_sequence
 from dudmap.io.sequences.phones import Video
-from layouts import arkit_scenes, color, polycam, stray_scanner, write
+from layout_images import color
+from layouts import write
 
 
 def red(frame):

@@ -9,7 +9,8 @@ import pytest
 
 from dudmap.errors import DatasetError
 from dudmap.io.sequences import open_sequence
-from layouts import bop, scannet, seven_scenes, tsdf_fusion, tum, with_matrices, write, write_color, write_depth
+from layout_images import write_color, write_depth
+from layouts import bop, scannet, seven_scenes, tsdf_fusion, tum, with_matrices, write
 
 MATRIX = np.array([[60.0, 0, 31.0], [0, 61.0, 23.0], [0, 0, 1]])
 ROS_CALIBRATION = """image_width: 64

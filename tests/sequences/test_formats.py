@@ -10,25 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from device_layouts import nerfstudio, realsense, zed
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import Recording, open_sequence, readers
-from layouts import (
-    LAYOUTS,
-    color,
-    corbs,
-    icl_nuim,
-    millimetres,
-    nerfstudio,
-    pose,
-    realsense,
-    replica,
-    scannet,
-    seven_scenes,
-    tum,
-    write,
-    zed,
-)
+from layout_images import color, millimetres, pose
+from layouts import LAYOUTS, corbs, icl_nuim, replica, scannet, seven_scenes, tum, write
 
 SUFFIXES = (".zip", ".tar", ".tgz")
 

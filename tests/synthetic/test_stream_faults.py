@@ -8,7 +8,6 @@ import pytest
 
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
-from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.frames.observation import Observation
 from dudmap.core.frames.stream_check import AGREEING, StreamCheck, sudden_factor
 from dudmap.core.geometry.camera import Camera
@@ -83,7 +82,7 @@ def observation(stamp, seed=None, scale=1.0):
     rng = np.random.default_rng(abs(hash(stamp)) if seed is None else seed)
     depth = (scale * (1.5 + 0.001 * rng.normal(size=(60, 80)))).astype(np.float32)
     color = rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)
-    return Observation(stamp, SMALL, depth, np.zeros((60, 80), np.float32), color, CpuBackend())
+    return Observation(stamp, SMALL, depth, np.zeros((60, 80), np.float32), color)
 
 
 def kinds(check, stamps):

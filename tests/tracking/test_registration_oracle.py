@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config, TrackerConfig, VolumeConfig
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.parameters import NormalEquations
-from dudmap.core.frames.exposure import chained, exposed, fit_exposure
+from dudmap.core.frames.exposure import chained, exposed
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3

@@ -13,6 +13,7 @@ import pytest
 from browsers import SOFTWARE, find_chromium
 from dudmap.app.viewing.report import write_report
 from dudmap.app.viewing.run_files import RunFiles
+from dudmap.app.viewing.snapshot import DEPTH_RANGE, RESIDUAL_RANGE
 from run_folders import write_run
 from security.hostile_runs import MARKUP, write_hostile_run
 
@@ -91,6 +92,28 @@ def test_a_report_of_a_hostile_run_runs_nothing_but_its_own_script(browser, tmp_
     tab.page.wait_for_selector("html[data-ready=true]", timeout=30000)
     assert tab.page.evaluate("window.harmed") is None
     assert sum("Content Security Policy" in error for error in tab.errors) >= 2
+
+
+def test_the_first_view_of_the_report_holds_the_whole_map_and_trajectory(report):
+    places = """() => {
+      const { mesh, poses, camera } = window.dudmapView, corners = mesh.geometry.getAttribute("position");
+      const points = poses.map((pose) => new THREE.Vector3().setFromMatrixPosition(pose));
+      for (let i = 0; i < corners.count; i++) points.push(new THREE.Vector3().fromBufferAttribute(corners, i));
+      return points.map((point) => point.project(camera).toArray());
+    }"""
+    seen = np.abs(report.page.evaluate(places))
+    assert seen.max() <= 1.0  # inside of the picture, in front of the camera
+    assert seen[:, :2].max() > 0.9  # and no farther away than that takes
+
+
+def test_the_images_of_a_frame_have_captions(report):
+    set_time(report, 0)
+    captions = report.page.locator("#now figcaption").all_text_contents()
+    reach = f"{100 * RESIDUAL_RANGE:.0f} cm"
+    assert captions == [
+        "colour; 0.00 s", "what moves, red; 0.00 s", f"depth, blue 0 to red {DEPTH_RANGE:.0f} m; 0.00 s",
+        f"residuals, blue -{reach} to red {reach}, dark off the map; 0.00 s",
+    ]  # fmt: skip
 
 
 def test_the_report_draws_the_map(report):

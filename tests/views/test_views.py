@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from dudmap.app.views.background import BackgroundRenderer, continued, exposure_gain
 from dudmap.app.views.cleaning import clean_recording, unlike, with_shadow
-from dudmap.app.views.rendering import looking_at, orbit, render_run, video_file
+from dudmap.app.views.rendering import EMPTY, orbit, render_run, video_file
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
@@ -241,19 +241,36 @@ def test_a_picture_needs_no_trajectory(made, run, tmp_path):
     assert np.std(picture) > 10
 
 
-def test_orbit_looks_at_the_scene_upright(run):
-    up = np.array([0.0, -1.0, 0.0])
-    path = orbit(run, up, 360, 8, 30)
-    middle = np.median(run.surface.vertices, axis=0)
-    for T in path.Ts_world_camera:
+@pytest.mark.parametrize("sweep", [60, 360])
+def test_an_orbit_holds_the_whole_map_upright_and_is_no_farther_than_that_takes(run, sweep):
+    up, nearest = np.array([0.0, -1.0, 0.0]), []
+    for T in orbit(run, up, sweep, 8, 30, CAMERA).Ts_world_camera:
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-        seen = T[:3, :3].T @ (middle - T[:3, 3])
-        np.testing.assert_allclose(seen[:2], 0, atol=1e-6)
-        assert seen[2] > 0
         assert -T[:3, 1] @ up > 0.3
-    with pytest.raises(ConfigError, match="looks straight along --up"):
-        looking_at(np.zeros(3), np.array([0.0, -2.0, 0.0]), up)
+        x, y, z = ((run.surface.vertices - T[:3, 3]) @ T[:3, :3]).T
+        assert z.min() > 0.29
+        nearest.append(
+            max(np.abs(x / z).max() * CAMERA.fx / CAMERA.width, np.abs(y / z).max() * CAMERA.fy / CAMERA.height)
+        )
+    assert max(nearest) <= 0.5
+    assert max(nearest) > 0.47
+
+
+def test_an_orbit_of_a_camera_that_looked_straight_down_is_upright(run):
+    up = run.trajectory.Ts_world_camera[:, :3, 2].mean(axis=0)
+    up /= -np.linalg.norm(up)
+    for T in orbit(run, up, 60, 3, 30, CAMERA).Ts_world_camera:
+        assert -T[:3, 1] @ up > 0.3
+
+
+def test_a_picture_of_the_whole_map_is_not_cut_off_where_the_readings_ended(made, tmp_path):
+    path = tmp_path / "map.png"
+    assert call("render", made[0] / "run", "--size", "96x64", "--out", path).exit_code == 0
+    filled = (cv2.imread(str(path)) != EMPTY).any(axis=2)
+    assert filled.mean() > 0.2
+    rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
+    assert len(rows) > 0.8 * 64 or len(columns) > 0.8 * 96
 
 
 def test_bad_targets_are_one_sentence(made, run, tmp_path):

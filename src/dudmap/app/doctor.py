@@ -15,7 +15,7 @@ from typing import Literal
 from dudmap import __version__
 from dudmap.extras import install
 
-COMPILING = "compiling the kernels (once, about a minute; dudmap warmup does it in advance)"
+COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
 """What is said before a first frame where none is compiled."""
 
 PYTHON = ((3, 11), (3, 14))

@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from dudmap import __version__
+from dudmap.cli.options import arranged
 from dudmap.errors import DudmapError
 
 COMMANDS = {
@@ -51,7 +52,7 @@ class CommandGroup(TyperGroup):
         """Replace the placeholder of the called command by the command itself."""
         if args and args[0] in COMMANDS:
             module = import_module(f"dudmap.cli.{args[0]}")
-            self.commands[args[0]] = _flowing(typer.main.get_command(module.app))
+            self.commands[args[0]] = arranged(typer.main.get_command(module.app))
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
@@ -76,14 +77,6 @@ class CommandGroup(TyperGroup):
             fail(str(report_crash(error, Path.cwd())))
         except KeyboardInterrupt as interrupt:
             fail(str(interrupt) or "interrupted", code=130)
-
-
-def _flowing(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-    """The command, whose help is wrapped at the width of the terminal and not where the source wraps its docstring."""
-    command.help = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
-    for part in getattr(command, "commands", {}).values():
-        _flowing(part)
-    return command
 
 
 def not_enough_memory(error: MemoryError | ImportError) -> str:

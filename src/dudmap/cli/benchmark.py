@@ -28,12 +28,16 @@ SystemsOption = Annotated[
     ),
 ]
 
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Folder of the recordings; nothing is downloaded.", metavar="FOLDER")
+]
+
 
 def suite_command(
     context: typer.Context,
     systems: SystemsOption = "",
     out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of the recordings; nothing is downloaded.")] = None,
+    data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     score: Annotated[
@@ -79,7 +83,7 @@ def _print_outcome(row: dict[str, Any]) -> None:
 def sensors(
     out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
     only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
-    data: Annotated[Path | None, typer.Option(help="Measure the recordings in this folder instead.")] = None,
+    data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     assignments: o.SetOption = None,
@@ -105,7 +109,7 @@ def sensors(
 @app.command()
 def random(
     count: Annotated[int, typer.Option(min=1, help="Number of worlds.")] = 40,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the worlds.")] = 0,
+    seed: o.SeedOption = 0,
     only: Annotated[str, typer.Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
     out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = RUNS / "random",
     jobs: o.JobsOption = 1,
@@ -195,6 +199,32 @@ def bias(
         answer({"corrections_mm_deg": found}, "", as_json=True)
 
 
+@app.command()
+def consistency(
+    recording: Annotated[Path, typer.Argument(help="Recording.")],
+    trajectories: Annotated[
+        list[Path] | None, typer.Argument(help="Trajectories of it in TUM text, or folders of runs.")
+    ] = None,
+    max_frames: Annotated[int | None, typer.Option(min=2, help="Number of frames from the start.")] = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""
+    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.errors import DatasetError
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.consistency import measure_consistency
+
+    source = open_sequence(recording)
+    truth = {} if source.ground_truth is None else {"published": source.ground_truth}
+    files = [path / "trajectory.txt" if path.is_dir() else path for path in trajectories or []]
+    found = truth | {str(path): Trajectory.load(path) for path in files}
+    if not found:
+        raise DatasetError(f"{recording} comes without poses; name the trajectories to compare, such as a run's folder")
+    result = measure_consistency(source, found, max_frames=max_frames)
+    low, high = result.intervals()
+    answer(result._asdict() | {"means": result.means(), "low": low, "high": high}, result.table(), as_json=as_json)
+
+
 @app.command("first-second")
 def first_second(
     seeds: Annotated[int, typer.Option(min=1, help="Number of worlds of each scene.")] = 3,
@@ -208,7 +238,7 @@ def first_second(
     config = o.read_config(None, None, assignments)
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
     runs = [
-        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES, noise="none", seed=seed), config)
+        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES + 1, noise="none", seed=seed), config)
         for scene, seed in worlds
     ]
     tree = {
@@ -245,7 +275,7 @@ def faults(
     ] = None,
     max_frames: Annotated[int, typer.Option(min=20, help="Number of frames of the recording.")] = 120,
     width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the synthetic room.")] = 0,
+    seed: o.SeedOption = 0,
     only: Annotated[str, typer.Option(help="Comma-separated faults; default: all.")] = "",
     out: Annotated[Path | None, typer.Option(help="Also write the table to this file (Markdown).")] = None,
     assignments: o.SetOption = None,
@@ -316,16 +346,16 @@ def gate(
     fixtures: Annotated[Path, typer.Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path(
         "tests/fixtures"
     ),
-    record: Annotated[bool, typer.Option("--record", help="Record the measured figures; margins are kept.")] = False,
+    update: Annotated[bool, typer.Option("--update", help="Record the measured figures; margins are kept.")] = False,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
     from dudmap.lab.benchmark import gate as gates
 
-    old = gates.load_figures(figures) if figures.is_file() or not record else None
+    old = gates.load_figures(figures) if figures.is_file() or not update else None
     rows = gates.measure_gate(gates.gate_entries(fixtures), o.read_config(None, None, assignments))
-    if record:
+    if update:
         gates.save_figures(figures, rows, old["margins"] if old else None)
         text = f"recorded in {figures}; review the difference before committing it"
         answer({"recorded": figures, "rows": rows}, text, as_json=as_json)

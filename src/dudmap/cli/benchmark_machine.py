@@ -19,13 +19,17 @@ QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for 
 
 
 def gpu(
-    device: Annotated[str, typer.Option(help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
+    device: Annotated[
+        str, typer.Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")
+    ] = "auto",
     max_frames: Annotated[int, typer.Option(min=2, help="Number of frames of each run.")] = 120,
     voxels: Annotated[str, typer.Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
     sizes: Annotated[
         str, typer.Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
     ] = "640x480,1280x720",
-    recording: Annotated[list[Path] | None, typer.Option(help="Also measure this recording; repeatable.")] = None,
+    sequence: Annotated[
+        list[Path] | None, typer.Option(help="Also measure this recording; repeatable.", metavar="SEQUENCE")
+    ] = None,
     open3d: Annotated[
         Path | None,
         typer.Option(metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."),
@@ -46,7 +50,7 @@ def gpu(
     steps, shapes = measurements.numbers(voxels, sizes)
     if quick:
         steps, shapes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
-    for name, each in measurements.recordings(shapes, max_frames, recording or []):
+    for name, each in measurements.recordings(shapes, max_frames, sequence or []):
         for step in steps:
             for one in measurements.devices(device):
                 say(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
@@ -74,8 +78,9 @@ def speed(
         Path | None,
         typer.Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."),
     ] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="Recording of that comparison; default: a synthetic room.")
+    sequence: Annotated[
+        Path | None,
+        typer.Option(help="Recording of that comparison; default: a synthetic room.", metavar="SEQUENCE"),
     ] = None,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
@@ -91,7 +96,7 @@ def speed(
         long_frames if long else 0,
         lambda what: say(f"measuring {what}", err=True),
         find_open3d(open3d),
-        recording,
+        sequence,
     )
     text = markdown(figures)
     out.mkdir(parents=True, exist_ok=True)
@@ -121,8 +126,8 @@ def roofline(
 
 def soak(
     max_frames: Annotated[int, typer.Option(min=20, help="Number of frames, at 15 Hz.")] = 20_000,
-    size: Annotated[str, typer.Option(help="Image size in pixels.", metavar="WxH")] = "320x240",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the synthetic room.")] = 0,
+    size: o.SizeOption = "320x240",
+    seed: o.SeedOption = 0,
     as_json: o.JsonOption = False,
 ) -> None:
     """Process many frames of one room; fail if time, memory or error grows from the second tenth to the last."""

@@ -18,20 +18,14 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
+@o.grouped
 def calibrate(
-    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder, file or archive.")],
+    reading: o.ReadingOptions,
+    parameters: o.ParameterOptions,
+    sequence: o.SequenceArgument,
     out: Annotated[Path | None, typer.Option(help="Write the calibration to this TOML file.")] = None,
-    config: o.ConfigOption = None,
-    assignments: o.SetOption = None,
-    preset: o.PresetOption = None,
-    camera: o.CameraOption = None,
-    fps: o.FpsOption = None,
-    depth_unit: o.DepthUnitOption = None,
-    color: o.ColorOption = None,
-    depth: o.DepthOption = None,
-    topics: o.TopicsOption = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration to start from: TOML file of an earlier one.")
+        Path | None, typer.Option(help="Calibration to start from: TOML file of an earlier one.", metavar="FILE")
     ] = None,
     max_frames: o.MaxFramesOption = None,
     as_json: o.JsonOption = False,
@@ -42,14 +36,14 @@ def calibrate(
     the images do not prove stays as the files give it.
     """
     from dudmap.app.pipeline.calibration import calibrate_sequence
-    from dudmap.app.terminal import plain_console
+    from dudmap.app.terminal import counted, plain_console
     from dudmap.core.geometry.calibration import Calibration
-    from dudmap.io.sequences import open_sequence
 
-    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
+    recording = reading.open(sequence)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
-    estimate = calibrate_sequence(recording, o.read_config(config, preset, assignments), given, max_frames)
+    with counted("calibrating", quiet=as_json) as progress:
+        estimate = calibrate_sequence(recording, parameters.read(), given, max_frames, progress=progress)
     if out is not None:
         estimate.calibration.save(out)
     if as_json:

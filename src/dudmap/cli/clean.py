@@ -14,21 +14,19 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
+@o.grouped
 def clean(
-    sequence: o.RecordingArgument,
-    out: Annotated[Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.")],
+    reading: o.ReadingOptions,
+    parameters: o.ParameterOptions,
+    sequence: o.SequenceArgument,
+    out: Annotated[
+        Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
+    ],
     run: Annotated[
-        Path | None, typer.Option(help="Run over this recording with --save-masks; by default one is made in OUT/run.")
+        Path | None,
+        typer.Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
     ] = None,
-    config: o.ConfigOption = None,
-    assignments: o.SetOption = None,
-    preset: o.PresetOption = None,
-    camera: o.CameraOption = None,
-    fps: o.FpsOption = None,
-    depth_unit: o.DepthUnitOption = None,
-    color: o.ColorOption = None,
-    depth: o.DepthOption = None,
-    passes: Annotated[int, typer.Option(min=1, max=2, help="Passes of the run that is made; 2 finds more.")] = 2,
+    passes: o.PassesOption = 2,
     max_frames: o.MaxFramesOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
@@ -39,15 +37,13 @@ def clean(
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.views.cleaning import clean_recording
     from dudmap.io.exporting.run_content import RunContent
-    from dudmap.io.sequences import open_sequence
 
-    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth)
+    recording = reading.open(sequence)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
-        parameters = o.read_config(config, preset, assignments)
         run_sequence(
-            recording, parameters, out / "run",
+            recording, parameters.read(), out / "run",
             max_frames=max_frames, save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,
         )  # fmt: skip
     with counted("cleaning", quiet=quiet or as_json) as progress:

@@ -1,7 +1,7 @@
 """``dudmap config``: all parameters with their meanings."""
 
 import textwrap
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -16,13 +16,11 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def config(
-    preset: Annotated[str, typer.Option(help="default or thesis.", autocompletion=o.preset_names)] = "default",
+    preset: o.PresetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Print all parameters with their meanings as TOML, the format of --config."""
-    from dudmap.config import Config
-
-    found = Config.from_tree({"preset": preset})
+    found = o.read_config(None, preset, None)
     answer(found.model_dump(mode="json"), commented(found).rstrip("\n"), as_json=as_json)
 
 

@@ -24,16 +24,12 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
+@o.grouped
 def demo(
+    watching: o.WatchingOptions,
     out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/demo.")] = None,
     max_frames: o.FramesOption = 120,
     assignments: o.SetOption = None,
-    report: o.ReportOption = True,
-    view: o.ViewOption = False,
-    host: o.HostOption = "127.0.0.1",
-    port: o.PortOption = 8080,
-    token: o.TokenOption = None,
-    rerun: o.RerunOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -49,9 +45,9 @@ def demo(
     recording = sequence(scene="room", movers=("person",), frames=max_frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
-    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun) as watching:
+    with observers(watching) as watchers:
         done = run(
-            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watching, keeper),
+            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watchers, keeper),
         )  # fmt: skip
         keeper.save_picture(out, recording.camera)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)

@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
 
 from dudmap.app.terminal import plain_console, say
+from dudmap.cli import options as o
 
 app = typer.Typer(add_completion=False)
 
@@ -15,7 +15,7 @@ MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", 
 
 @app.command()
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a list.")] = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Check the installation and say what to do: versions, processor, threads, GPU, caches, extras, port of the page.
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -11,7 +12,7 @@ from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text, writing
 from dudmap.cli import options as o
 from dudmap.cli.output import DefaultGroup
-from dudmap.errors import DatasetError
+from dudmap.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
@@ -25,11 +26,14 @@ app = typer.Typer(
     cls=DefaultGroup,
     add_completion=False,
     no_args_is_help=True,
-    help="Score a trajectory, a mesh or dynamic masks against the ground truth.\n\n"
+    help="Score a trajectory, a mesh or dynamic masks against the ground truth, or the time per frame.\n\n"
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
-PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
+PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots.")]
+FormatOption = Annotated[
+    str | None, typer.Option("--plot-format", help="Write plots as png (default), pdf or svg.", metavar="FORMAT")
+]
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Output folder for figures and plots; default: the folder of the estimate.")
 ]
@@ -43,13 +47,16 @@ def trajectory(
     estimate: Annotated[
         Path, typer.Argument(help="Run folder, or trajectory in TUM format.", metavar="RUN|TRAJECTORY")
     ],
-    reference: Annotated[Path | None, typer.Option(help="True trajectory in TUM format, or the recording.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="True trajectory in TUM format, or the recording.", metavar="FILE|FOLDER")
+    ] = None,
     align: Annotated[
         str, typer.Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
     ] = "se3",
     max_difference: GapOption = 0.02,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
+    plot_format: FormatOption = None,
     out: OutOption = None,
 ) -> None:
     """Score a trajectory: ATE, RPE per second and per metre, share of frames tracked.
@@ -60,6 +67,7 @@ def trajectory(
     from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
     from dudmap.evaluation.trajectory import path_figures, trajectory_figures
 
+    ending = _plot_ending(plots, plot_format)
     file, folder = find_trajectory(estimate)
     found = Trajectory.load(file)
     truth = find_reference(reference, folder)
@@ -72,14 +80,14 @@ def trajectory(
         true = load_reference(truth)
         errors = trajectory_figures(found, true, alignment, max_difference)
         figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
-        if plots:
-            pictures = _plot_trajectory(target, found, true, alignment, max_difference)
-    if plots and folder is not None and (folder / "residuals.npz").is_file():
+        if ending:
+            pictures = _plot_trajectory(target, ending, found, true, alignment, max_difference)
+    if ending and folder is not None and (folder / "residuals.npz").is_file():
         from dudmap.evaluation.plots import plot_residuals
 
-        plot_residuals(target / "residuals.png", folder / "residuals.npz")
-        pictures.append(target / "residuals.png")
-    if plots and not pictures:
+        pictures.append(target / f"residuals.{ending}")
+        plot_residuals(pictures[-1], folder / "residuals.npz")
+    if ending and not pictures:
         raise DatasetError("there is nothing to plot without a reference; name one with --reference")
     name = "evaluation.json" if folder is not None else f"{file.stem}.evaluation.json"
     _report(figures, target / name, pictures, as_json=as_json, title="trajectory")
@@ -91,7 +99,9 @@ def mesh(
     reference: Annotated[
         Path, typer.Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
     ],
-    align: Annotated[bool, typer.Option("--align", help="Register the mesh to the reference first (ICP).")] = False,
+    register_first: Annotated[
+        bool, typer.Option("--register", help="Register the mesh to the reference first (ICP).")
+    ] = False,
     thresholds: Annotated[
         str,
         typer.Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,..."),
@@ -106,17 +116,19 @@ def mesh(
     ] = True,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
+    plot_format: FormatOption = None,
     out: OutOption = None,
 ) -> None:
     """Score a mesh: accuracy, completeness, precision, recall, F-score and ghosts.
 
-    A run folder and a recording with groundtruth.txt are aligned at their first pose. Anything else must share one
+    A run folder and a recording with groundtruth.txt are aligned at their first pose. Other surfaces must share one
     coordinate frame.
     """
     from dudmap.evaluation import reconstruction
     from dudmap.evaluation.files import first_pose_alignment, load_mesh
     from dudmap.evaluation.surface import moved, register
 
+    ending = _plot_ending(plots, plot_format)
     file = estimate / "mesh.ply" if estimate.is_dir() else estimate
     true_file = reference / "surface.ply" if reference.is_dir() else reference
     found, true = load_mesh(file), load_mesh(true_file)
@@ -125,7 +137,7 @@ def mesh(
     figures: Figures = {"estimate": str(file), "reference": str(true_file)}
     figures["observed"] = str(observed_file) if observed is not None else None
     T = first_pose_alignment(estimate, reference)
-    if align:
+    if register_first:
         registration = register(found, true, T)
         T = registration.T_reference_estimate
         figures |= {
@@ -156,10 +168,10 @@ def mesh(
     if error_mesh:
         pictures.append(target / f"{stem}_error.ply")
         reconstruction.error_mesh(found, true, largest=ghost_distance, points=points).save(pictures[-1])
-    if plots:
+    if ending:
         from dudmap.evaluation.plots import plot_surface
 
-        pictures.append(target / f"{stem}_error.png")
+        pictures.append(target / f"{stem}_error.{ending}")
         plot_surface(pictures[-1], result)
     _report(figures, target / f"{stem}.evaluation.json", pictures, as_json=as_json, title="mesh")
 
@@ -175,11 +187,13 @@ def masks(
     ] = False,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
+    plot_format: FormatOption = None,
     out: OutOption = None,
 ) -> None:
     """Score dynamic masks: precision, recall and IoU, per frame and overall."""
     from dudmap.evaluation.segmentation import SCORED_COVERAGE, compare_masks, mask_pairs
 
+    ending = _plot_ending(plots, plot_format)
     result = compare_masks(*mask_pairs(estimate, reference))
     figures: Figures = {"estimate": str(estimate), "reference": str(reference), "frames": len(result.timestamps)}
     for key in ("overall_precision", "overall_recall", "overall_iou", "mean_iou", "false_alarm_share"):
@@ -190,30 +204,62 @@ def masks(
         columns = ("timestamps", "coverage", "found_share", "precision", "recall", "iou")
         figures["per_frame"] = {key: [_rounded(x, 6) for x in getattr(result, key)] for key in columns}
     target, pictures = _output_folder(out, estimate), []
-    if plots:
+    if ending:
         from dudmap.evaluation.plots import plot_masks
 
-        pictures = [target / "masks.png"]
+        pictures = [target / f"masks.{ending}"]
         plot_masks(pictures[0], result)
     _report(figures, target / "masks.evaluation.json", pictures, as_json=as_json, title="masks")
 
 
+@app.command()
+def timings(run: o.RunArgument, as_json: o.JsonOption = False, out: OutOption = None) -> None:
+    """Score the time per frame: median, mean and 95 % quantile of every stage, also as a LaTeX table (timings.tex)."""
+    import numpy as np
+
+    from dudmap.app.viewing.run_files import RunFiles
+
+    found = RunFiles.load(run)
+    if not found.frames:
+        raise DatasetError(f"{run} holds no times per frame (timings.csv); name a folder of dudmap run")
+    figures: Figures = {"estimate": str(run), "frames": len(found.frames)}
+    lines = [r"\begin{tabular}{lrrr}", r"stage & median & mean & 95\,\% \\ \hline"]
+    for stage in ["total", *found.stages]:
+        times = found.column(stage)
+        row = float(np.median(times)), float(times.mean()), float(np.percentile(times, 95))
+        for name, value in zip(("median", "mean", "p95"), row, strict=True):
+            figures[f"{stage}_{name}_ms"] = round(value, 3)
+        cells = " & ".join(f"{value:.1f}" for value in row)
+        lines.append(f"{stage.replace('_', ' ')} & {cells} \\\\")
+    target = _output_folder(out, run)
+    write_text(target / "timings.tex", "\n".join([*lines, r"\end{tabular} % milliseconds per frame"]) + "\n")
+    _report(figures, target / "timings.evaluation.json", [target / "timings.tex"], as_json=as_json, title="timings")
+
+
+def _plot_ending(plots: bool, plot_format: str | None) -> str:
+    """Ending of the files of plots, empty if none are wanted."""
+    ending = (plot_format or "png").lower()
+    if ending not in ("png", "pdf", "svg"):
+        raise ConfigError(f"found --plot-format {plot_format}; expected png, pdf or svg")
+    return ending if plots or plot_format else ""
+
+
 def _plot_trajectory(
-    target: Path, found: "Trajectory", true: "Trajectory", align: "Align", max_difference: float
+    target: Path, ending: str, found: "Trajectory", true: "Trajectory", align: "Align", max_difference: float
 ) -> list[Path]:
     from dudmap.evaluation import plots
     from dudmap.evaluation.trajectory import ate, rpe
 
     absolute = ate(found, true, align, max_difference)
-    pictures = [target / "trajectory.png", target / "error.png"]
+    pictures = [target / f"trajectory.{ending}", target / f"error.{ending}"]
     plots.plot_trajectories(pictures[0], found, true, absolute)
     plots.plot_errors(pictures[1], absolute)
     try:
         relative = rpe(found, true, 1.0, "s", max_difference)
     except DatasetError:  # the reason is among the figures
         return pictures
-    plots.plot_errors(target / "rpe.png", relative)
-    return [*pictures, target / "rpe.png"]
+    plots.plot_errors(target / f"rpe.{ending}", relative)
+    return [*pictures, target / f"rpe.{ending}"]
 
 
 def _output_folder(out: Path | None, default: Path) -> Path:
@@ -245,13 +291,14 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
 
 
 def _shown(key: str, value: object) -> tuple[str, str]:
-    """Name and value of a figure for people: errors in metres, and per second or metre, in millimetres."""
-    if not isinstance(value, float):
-        return key, str(value)
-    name, _, per = key.partition("_m_per_") if "_m_per_" in key else (key.removesuffix("_m"), "", "")
-    if name == key or not name.startswith(("ate_", "rpe_", "drift_")):
-        return key, f"{value:.6g}"
-    return f"{name} per {per}" if per else name, f"{1000 * value:.1f} mm"
+    """Name and value of a figure for people: errors of a trajectory in millimetres and degrees."""
+    match = re.fullmatch(r"((?:ate|rpe|drift|rotation)_\w+?)_(m|deg)(?:_per_(m|s))?", key)
+    if not isinstance(value, float) or match is None:
+        return key, f"{value:.6g}" if isinstance(value, float) else str(value)
+    name, unit, per = match.groups()
+    text = f"{1000 * value:.1f} mm" if unit == "m" else f"{value:.2f} deg"
+    note = " (see rotation_rmse)" if name.startswith("ate_rot") else ""
+    return (f"{name} per {per}" if per else name) + note, text
 
 
 def _rounded(value: float, digits: int = 9) -> float | None:

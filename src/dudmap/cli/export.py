@@ -8,6 +8,7 @@ import typer
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.io.exporting.exporters import EXPORTERS
+from dudmap.io.exporting.run_content import SPECK, ExportOptions
 
 app = typer.Typer(add_completion=False)
 _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS.items())
@@ -17,18 +18,15 @@ _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS
 def export(
     run: o.RunArgument,
     out: Annotated[Path, typer.Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],
-    max_triangles: Annotated[int | None, typer.Option(min=4, help="Decimate the mesh to so many triangles.")] = None,
+    max_triangles: Annotated[
+        int | None, typer.Option(min=4, help="Decimate the mesh to so many triangles.", metavar="N")
+    ] = None,
     crop: Annotated[
         str | None, typer.Option(help="Keep a box of the map, metres.", metavar="X0,Y0,Z0,X1,Y1,Z1")
     ] = None,
     drop_pieces_below: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            help="Leave out smaller connected pieces; default: those less than 2 cm across; 0 keeps all.",
-            metavar="M2",
-        ),
-    ] = None,
+        float, typer.Option(min=0, help="Leave out connected pieces with less surface; 0 keeps all.", metavar="M2")
+    ] = SPECK,
     fill_holes: Annotated[
         float | None, typer.Option(min=0, help="Close holes with a shorter border.", metavar="METRES")
     ] = None,
@@ -38,16 +36,18 @@ def export(
         str, typer.Option(help="Lower and upper end of the robot above the floor.", metavar="LOW,HIGH")
     ] = "0.1,1.8",
     sequence: Annotated[
-        Path | None, typer.Option(help="The recording of the run, for images and masks; default: the one it names.")
+        Path | None,
+        typer.Option(
+            help="The recording of the run, for images and masks; default: the one it names.", metavar="SEQUENCE"
+        ),
     ] = None,
     camera: o.CameraOption = None,
-    every: Annotated[int, typer.Option(min=1, help="Every so many frames of the recording.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Every so many frames of the recording.", metavar="N")] = 1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
     """Write trajectory, surface, space or images of a run for another program."""
     from dudmap.io.exporting.exporters import export_run
-    from dudmap.io.exporting.run_content import ExportOptions
 
     low, high = o.numbers(heights, 2, "--heights")
     options = ExportOptions(

@@ -18,15 +18,13 @@ SHOWN_GAPS = 5
 
 
 @app.command()
+@o.grouped
 def info(
-    path: o.RecordingArgument,
-    camera: o.CameraOption = None,
-    fps: o.FpsOption = None,
-    depth_unit: o.DepthUnitOption = None,
-    color: o.ColorOption = None,
-    depth: o.DepthOption = None,
-    topics: o.TopicsOption = None,
-    sheet: Annotated[Path | None, typer.Option(help="Write a contact sheet (PNG) of twelve frames.")] = None,
+    reading: o.ReadingOptions,
+    sequence: o.SequenceArgument,
+    sheet: Annotated[
+        Path | None, typer.Option(help="Write a contact sheet (PNG) of twelve frames.", metavar="FILE")
+    ] = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
@@ -41,9 +39,8 @@ def info(
     from dudmap.app.pipeline.inspection import inspect, repeats, sample
     from dudmap.app.terminal import plain_console
     from dudmap.app.viewing.snapshot import save_overview
-    from dudmap.io.sequences import open_sequence
 
-    recording = open_sequence(path, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
+    recording = reading.open(sequence)
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     found.repeats = repeats(recording)

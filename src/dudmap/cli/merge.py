@@ -18,7 +18,8 @@ def merge(
         list[Path], typer.Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="New folder; default: runs/<A>-<B>, or runs/world with more runs.")
+        Path | None,
+        typer.Option(help="New folder; default: runs/<A>-<B>, or runs/world with more runs."),
     ] = None,
     world: Annotated[
         bool, typer.Option("--world", help="Write map parts and tiles also for two runs, as for more.")

@@ -3,11 +3,14 @@
 A text that cannot be understood is a ``ConfigError``.
 """
 
+import inspect
 import re
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,14 +18,43 @@ from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from dudmap.config import Config
+    from dudmap.io.sequences import Recording
 
-input_option = partial(typer.Option, rich_help_panel="Input")
-output_option = partial(typer.Option, rich_help_panel="Output")
-map_option = partial(typer.Option, rich_help_panel="Map")
-calibration_option = partial(typer.Option, rich_help_panel="Calibration")
-live_option = partial(typer.Option, rich_help_panel="Live and viewing")
-advanced_option = partial(typer.Option, rich_help_panel="Advanced")
-"""Options in the groups of the help page of ``run``, which the other commands share."""
+GROUPS = {
+    "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --run --trajectory "
+    "--reference --max-frames --every",
+    "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
+    "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
+    "--resolution --heights --world",
+    "Calibration": "--calibration",
+    "Live and viewing": "--live --view --host --port --token --orbit --sweep",
+    "Experiment": "--seed --seeds --only --quick --systems --score --open3d --width --cluster --cost-per-core-hour "
+    "--keep --max-runs",
+    "Advanced": "--config --preset --set --device --jobs --resume --checkpoint-every --help",
+}
+"""Options by the group of the help pages that they stand in; those of a single command stand before them."""
+
+METAVARS = {
+    "--out": "PATH", "--max-frames": "N", "--jobs": "N", "--seeds": "N", "--only": "NAMES", "--systems": "NAMES",
+    "--width": "PIXELS", "--cost-per-core-hour": "PRICE", "--max-runs": "N",
+}  # fmt: skip
+"""What stands in the help pages for the value of options that commands explain in their own words."""
+
+
+def arranged(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
+    """The command with its options in ``GROUPS``, and its help wrapped at the width of the terminal and not where the
+    source wraps its docstring."""
+    group_of = {name: group for group, names in GROUPS.items() for name in names.split()}
+    order = list(group_of)
+    command.help = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
+    for option in (*command.params, command.get_help_option(command.context_class(command))):
+        if option.param_type_name == "option":
+            option.rich_help_panel = option.rich_help_panel or group_of.get(option.opts[0])
+            option.metavar = option.metavar or METAVARS.get(option.opts[0])
+    command.params.sort(key=lambda option: order.index(option.opts[0]) if option.opts[0] in group_of else -1)
+    for part in getattr(command, "commands", {}).values():
+        arranged(part)
+    return command
 
 
 def preset_names(incomplete: str) -> list[str]:
@@ -46,89 +78,50 @@ def camera_names(incomplete: str) -> list[str]:
     return [name for name in CAMERAS if name.startswith(incomplete)]
 
 
-JsonOption = Annotated[bool, output_option("--json", help="Print the result as one JSON object, and nothing else.")]
-QuietOption = Annotated[bool, output_option("--quiet", help="No progress bar and no table.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
 RunArgument = Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")]
-RecordingArgument = Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")]
+SequenceArgument = Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="SEQUENCE")]
 CameraOption = Annotated[
     str | None,
-    input_option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS"),
+    typer.Option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS"),
 ]
-TopicsOption = Annotated[
-    str | None,
-    input_option(
-        help="Of a bag: color=, depth=, color_info=, depth_info= and world= (the frame), separated by commas.",
-        metavar="KEY=TOPIC",
-    ),
-]
-FpsOption = Annotated[
-    float | None, input_option(help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ")
-]
-DepthUnitOption = Annotated[
-    float | None, input_option(help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES")
-]
-ColorOption = Annotated[
-    str | None, input_option(help="Colour images of a folder in no known layout, e.g. 'left/*.png'.", metavar="PATTERN")
-]
-DepthOption = Annotated[
-    str | None, input_option(help="Depth images of a folder in no known layout, e.g. 'range/*.png'.", metavar="PATTERN")
-]
-MaxFramesOption = Annotated[int | None, input_option(min=1, help="Stop after this many frames.", metavar="N")]
+RateOption = Annotated[float, typer.Option("--fps", min=0.1, help="Frames per second.", metavar="HZ")]
+MaxFramesOption = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.", metavar="N")]
 FramesOption = Annotated[int, typer.Option("--max-frames", min=1, help="Number of frames.", metavar="N")]
+PassesOption = Annotated[
+    int, typer.Option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="N")
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all that is random.", metavar="N")]
+SizeOption = Annotated[str, typer.Option(help="Image size in pixels.", metavar="WxH")]
 
-ConfigOption = Annotated[Path | None, advanced_option(help="TOML file of parameters.", metavar="FILE")]
 PresetOption = Annotated[
     str | None,
-    advanced_option(help="Preset of the parameters: default or thesis.", metavar="NAME", autocompletion=preset_names),
+    typer.Option(help="Preset of the parameters: default or thesis.", metavar="NAME", autocompletion=preset_names),
 ]
 SetOption = Annotated[
     list[str] | None,
-    advanced_option(
+    typer.Option(
         "--set",
         help="Set a parameter, e.g. tracker.huber=0.02; repeatable.",
         metavar="KEY=VALUE",
         autocompletion=parameter_names,
     ),
 ]
-DeviceOption = Annotated[
-    str | None,
-    advanced_option(
-        help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU.", metavar="DEVICE"
-    ),
-]
 JobsOption = Annotated[
     int, typer.Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
-MapOption = Annotated[
-    Path | None,
-    map_option("--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"),
+SaveMasksOption = Annotated[
+    bool, typer.Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")
 ]
-LocalizeOption = Annotated[
-    bool, map_option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
-]
-MaxMemoryOption = Annotated[
-    str | None,
-    map_option(help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"),
-]
-SaveMasksOption = Annotated[bool, output_option("--save-masks", help="Write the dynamic mask of every frame.")]
-ReportOption = Annotated[
-    bool, output_option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
-]
-RerunOption = Annotated[
-    Path | None, output_option(help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd")
-]
-LogOption = Annotated[
-    Path | None, output_option(help="File for one JSON object per line and event of the run.", metavar="FILE")
-]
-ViewOption = Annotated[bool, live_option("--view", help="Show the run in the browser while it goes on (extra view).")]
 HostOption = Annotated[
-    str, live_option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
+    str, typer.Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
 ]
-PortOption = Annotated[int, live_option(help="Port of the page.", min=1, max=65535, metavar="PORT")]
+PortOption = Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535, metavar="PORT")]
 TokenOption = Annotated[
     str | None,
-    live_option(
+    typer.Option(
         help="Secret part of the page's address; default: none on this machine, a random one with another --host.",
         metavar="TEXT",
     ),
@@ -139,6 +132,125 @@ UpOption = Annotated[
         help="Direction against gravity in the world of the run, by default that of its floor.", metavar="X,Y,Z"
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """Options that say how a recording is read, as far as its files do not."""
+
+    camera: CameraOption = None
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ"),
+    ] = None
+    depth_unit: Annotated[
+        float | None, typer.Option(help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES")
+    ] = None
+    color: Annotated[
+        str | None,
+        typer.Option(help="Colour images of a folder in no known layout, e.g. 'left/*.png'.", metavar="PATTERN"),
+    ] = None
+    depth: Annotated[
+        str | None,
+        typer.Option(help="Depth images of a folder in no known layout, e.g. 'range/*.png'.", metavar="PATTERN"),
+    ] = None
+    topics: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a bag: color=, depth=, color_info=, depth_info= and world= (the frame), separated by commas.",
+            metavar="KEY=TOPIC",
+        ),
+    ] = None
+
+    def open(self, path: Path) -> "Recording":
+        """The recording."""
+        from dudmap.io.sequences import open_sequence
+
+        return open_sequence(
+            path, self.camera, self.fps, self.depth_unit, color=self.color, depth=self.depth, topics=self.topics
+        )
+
+
+@dataclass(frozen=True)
+class ParameterOptions:
+    """Options that give the parameters."""
+
+    config: Annotated[Path | None, typer.Option(help="TOML file of parameters.", metavar="FILE")] = None
+    preset: PresetOption = None
+    assignments: SetOption = None
+
+    def read(self, *more: str) -> "Config":
+        """The parameters, some of them set by ``more``."""
+        return read_config(self.config, self.preset, [*(self.assignments or []), *more])
+
+
+@dataclass(frozen=True)
+class WatchingOptions:
+    """Options on how a run is watched and recorded."""
+
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
+    ] = True
+    rerun: Annotated[
+        Path | None, typer.Option(help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd")
+    ] = None
+    log: Annotated[
+        Path | None, typer.Option(help="File for one JSON object per line and event of the run.", metavar="FILE")
+    ] = None
+    view: Annotated[bool, typer.Option("--view", help="Show the run in the browser while it goes on (extra view).")] = (
+        False
+    )
+    host: HostOption = "127.0.0.1"
+    port: PortOption = 8080
+    token: TokenOption = None
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """Options on the map that a run goes on in, and where its map is kept."""
+
+    saved: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"
+        ),
+    ] = None
+    localize: Annotated[
+        bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
+    ] = False
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"
+        ),
+    ] = None
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU.", metavar="DEVICE"
+        ),
+    ] = None
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with single options in place of its arguments that are dataclasses of options."""
+    signature = inspect.signature(command)
+    annotations: dict[str, Any] = {name: found.annotation for name, found in signature.parameters.items()}
+    groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
+
+    @wraps(command)
+    def flat(**given: Any) -> None:  # noqa: ANN401
+        for name, kind in groups.items():
+            given[name] = kind(**{field.name: given.pop(field.name) for field in fields(kind)})
+        command(**given)
+
+    single = [
+        option.replace(kind=option.KEYWORD_ONLY)
+        for name, found in signature.parameters.items()
+        for option in (inspect.signature(groups[name]).parameters.values() if name in groups else [found])
+    ]
+    vars(flat)["__signature__"] = signature.replace(parameters=single)
+    return flat
 
 
 def numbers(text: str, count: int | None, option: str) -> list[float]:

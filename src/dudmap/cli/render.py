@@ -17,17 +17,18 @@ app = typer.Typer(add_completion=False)
 def render(
     run: o.RunArgument,
     out: Annotated[
-        Path, typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout.")
+        Path,
+        typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout."),
     ],
     trajectory: Annotated[
-        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
+        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
     ] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the middle of the map.")] = False,
+    orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the whole map.")] = False,
     sweep: Annotated[
         float, typer.Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
     max_frames: o.FramesOption = 120,
-    fps: Annotated[float, typer.Option(min=0.1, help="Frames per second.")] = 30.0,
+    fps: o.RateOption = 30.0,
     size: Annotated[str | None, typer.Option(help="Image size in pixels.", metavar="WxH")] = None,
     up: o.UpOption = None,
     quiet: o.QuietOption = False,
@@ -35,7 +36,7 @@ def render(
 ) -> None:
     """Render the map as a camera would see it: a picture, a video, or a recording without anything that moves.
 
-    A picture shows the first pose of the trajectory, or without one the map from the middle of the orbit.
+    A picture shows the first pose of the trajectory, or without one the whole map.
     """
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory
@@ -46,12 +47,12 @@ def render(
     if (trajectory is None) == (not orbit):
         raise ConfigError("name either a --trajectory or --orbit")
     content = RunContent.load(run)
-    if trajectory is not None:
-        path = Trajectory.load(trajectory)
-    else:
-        path = rendering.orbit(content, up_of(content, ExportOptions(up=o.direction(up))), sweep, max_frames, fps)
+    pixels = None if size is None else o.image_size(size)
     with counted("rendering", quiet=quiet or as_json) as progress:
-        count = rendering.render_run(
-            content, path, out, size=None if size is None else o.image_size(size), fps=fps, progress=progress
-        )
+        if trajectory is not None:
+            path = Trajectory.load(trajectory)
+        else:
+            upright, camera = up_of(content, ExportOptions(up=o.direction(up))), rendering.view_camera(content, pixels)
+            path = rendering.orbit(content, upright, sweep, max_frames, fps, camera)
+        count = rendering.render_run(content, path, out, size=pixels, fps=fps, progress=progress, whole=orbit)
     answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)

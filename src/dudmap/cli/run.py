@@ -1,5 +1,6 @@
 """``dudmap run``: process a recording into a run folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,66 +20,50 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
+@o.grouped
 def run(
+    reading: o.ReadingOptions,
+    parameters: o.ParameterOptions,
+    mapped: o.MapOptions,
+    watching: o.WatchingOptions,
     sequence: Annotated[
-        Path | None, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+        Path | None,
+        typer.Argument(
+            help="Recording: folder, file or archive; `dudmap info` says what is found.", metavar="SEQUENCE"
+        ),
     ] = None,
-    camera: o.CameraOption = None,
-    fps: o.FpsOption = None,
-    depth_unit: o.DepthUnitOption = None,
-    color: o.ColorOption = None,
-    depth: o.DepthOption = None,
-    topics: o.TopicsOption = None,
     masks: Annotated[
         Path | None,
-        o.input_option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
+        typer.Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
     ] = None,
     max_frames: o.MaxFramesOption = None,
-    out: Annotated[
-        Path | None, o.output_option(help="Run folder; default: runs/<recording>.", metavar="FOLDER")
-    ] = None,
-    save_masks: o.SaveMasksOption = False,
-    report: o.ReportOption = True,
-    rerun: o.RerunOption = None,
-    log: o.LogOption = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<recording>.")] = None,
+    save_masks: o.SaveMasksOption = True,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
-    saved: o.MapOption = None,
-    localize: o.LocalizeOption = False,
     watch: Annotated[
         bool,
-        o.map_option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl)."),
+        typer.Option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl)."),
     ] = False,
-    passes: Annotated[
-        int, o.map_option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="1|2")
-    ] = 1,
-    max_memory: o.MaxMemoryOption = None,
+    passes: o.PassesOption = 1,
     calibration: Annotated[
         str,
-        o.calibration_option(
+        typer.Option(
             help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while "
             "it runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
             metavar="auto|given|FILE",
         ),
     ] = "auto",
     live: Annotated[
-        bool, o.live_option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
+        bool, typer.Option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
     ] = False,
-    view: o.ViewOption = False,
-    host: o.HostOption = "127.0.0.1",
-    port: o.PortOption = 8080,
-    token: o.TokenOption = None,
-    config: o.ConfigOption = None,
-    preset: o.PresetOption = None,
-    assignments: o.SetOption = None,
-    device: o.DeviceOption = None,
     resume: Annotated[
         Path | None,
-        o.advanced_option(help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"),
+        typer.Option(help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"),
     ] = None,
     checkpoint_every: Annotated[
         float | None,
-        o.advanced_option(
+        typer.Option(
             help="Seconds from one checkpoint to the next; 0 for none. Default: as often as takes 2 % of the time.",
             min=0,
             metavar="SECONDS",
@@ -96,62 +81,55 @@ def run(
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.pipeline.storing import Storing
     from dudmap.core.geometry.calibration import Calibration
-    from dudmap.io.sequences import open_sequence
 
-    page = (host, port, token) if view else None
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
-        with observers(report=False, page=page, rerun=rerun, log=log) as watching:
-            done = resume_run(resume, device=device, progress=not quiet, observers=watching)
+        with observers(replace(watching, report=False)) as watchers:
+            done = resume_run(resume, device=mapped.device, progress=not quiet, observers=watchers)
             print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
-    parameters, saved_map = run_parameters(config, preset, assignments, device, saved, out)
-    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
+    config, saved_map = run_parameters(parameters, mapped, out)
+    recording = reading.open(sequence)
     warnings = inspect(recording).warnings
     for warning in warnings:
         say(f"warning: {warning}", err=True)
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
-        parameters = parameters.override(["sensor.self_calibration=false"])
-    storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, report)
-    if watch and saved is None:
+        config = config.override(["sensor.self_calibration=false"])
+    storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, watching.report)
+    if watch and mapped.saved is None:
         raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
-    with observers(report=report, page=page, rerun=rerun, log=log) as watching:
-        if watch:
+    with observers(watching) as watchers:
+        if watch and mapped.saved is not None:
             from dudmap.core.places.saved_map import SavedMap
             from dudmap.fleet.change_watch import ChangeWatch
 
-            assert saved is not None
-            watching += (ChangeWatch(SavedMap.load(saved), watching),)
+            watchers += (ChangeWatch(SavedMap.load(mapped.saved), watchers),)
         done = run_sequence(
-            recording, parameters, out,
+            recording, config, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
             calibration=given, calibrate=calibration == "auto" and not live,
-            saved_map=saved_map, localize=localize, max_memory=o.memory_size(max_memory), observers=watching,
-            storing=storing, warnings=warnings,
+            saved_map=saved_map, localize=mapped.localize, max_memory=o.memory_size(mapped.max_memory),
+            observers=watchers, storing=storing, warnings=warnings,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
 def run_parameters(
-    file: Path | None,
-    preset: str | None,
-    assignments: list[str] | None,
-    device: str | None,
-    saved: Path | None,
-    out: Path | None,
+    parameters: o.ParameterOptions, mapped: o.MapOptions, out: Path | None
 ) -> "tuple[Config, SavedMap | None]":
     """Configuration of a run, by default that of the run whose map it goes on in, and this map."""
     from dudmap.core.backends.device import resolve
     from dudmap.core.places.saved_map import SavedMap
 
-    if saved is not None and file is None and preset is None and (saved / "config.toml").is_file():
-        file = saved / "config.toml"
-    config = o.read_config(file, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
+    saved = mapped.saved
+    if saved is not None and parameters.config is parameters.preset is None and (saved / "config.toml").is_file():
+        parameters = replace(parameters, config=saved / "config.toml")
+    config = parameters.read(*([f"device={mapped.device}"] if mapped.device else []))
     resolve(config.device, adaptive=config.volume.adaptive)  # refused before anything takes time
     if saved is None:
         return config, None

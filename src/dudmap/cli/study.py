@@ -25,7 +25,7 @@ app = typer.Typer(
 )
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="Study folder; an interrupted study in it goes on.")]
-JobsOption = Annotated[int, typer.Option("--jobs", min=0, help="Runs at a time; 0: one per core.")]
+JobsOption = Annotated[int, typer.Option("--jobs", min=0, help="Runs at a time; 0: one per core.", metavar="N")]
 MaxRunsOption = Annotated[int, typer.Option("--max-runs", min=1, help="Refuse a design with more runs.")]
 KeepOption = Annotated[bool, typer.Option("--keep", help="Keep trajectory, mesh and map of every run.")]
 ClusterOption = Annotated[

@@ -42,7 +42,7 @@ def synth(
         typer.Option(help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away."),
     ] = None,
     max_frames: o.FramesOption = 120,
-    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
+    fps: o.RateOption = 30.0,
     sensor: Annotated[
         str | None,
         typer.Option(
@@ -57,8 +57,8 @@ def synth(
             "iphone, or none."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of path, appearance and noise.", min=0)] = 0,
-    size: Annotated[str, typer.Option(help="Image size in pixels.", metavar="WxH")] = "640x480",
+    seed: o.SeedOption = 0,
+    size: o.SizeOption = "640x480",
     motion_blur: Annotated[
         float | None, typer.Option(help="Exposure time as a share of the frame interval, by default 0.")
     ] = None,
@@ -85,7 +85,7 @@ def synth(
         ),
     ] = "none",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
     """Render a synthetic recording with exact ground truth.

@@ -36,35 +36,31 @@ def view(
 
 
 @contextmanager
-def observers(
-    *, report: bool, page: tuple[str, int, str | None] | None, rerun: Path | None, log: Path | None = None
-) -> "Iterator[tuple[RunObserver, ...]]":
-    """Observers of a run as wanted: its report, the page at host and port with a token, the log for Rerun, the log
-    of events.
+def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
+    """Observers of a run as wanted.
 
     An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
     until ctrl-C, unless nobody sits at the terminal.
     """
     from dudmap.app.pipeline.observer import EventLog, report_crash
 
-    events = EventLog(log)
+    events = EventLog(wanted.log)
     with ExitStack() as stack:
         stack.callback(events.close)
         watching: list[RunObserver] = [events]
-        if report:
+        if wanted.report:
             from dudmap.app.viewing.report import ReportObserver
 
             watching.append(ReportObserver())
-        if rerun is not None:
+        if wanted.rerun is not None:
             from dudmap.app.viewing.rerun_log import RerunLog
 
-            watching.append(RerunLog(rerun))
-        if page is not None:
+            watching.append(RerunLog(wanted.rerun))
+        if wanted.view:
             from dudmap.app.viewing.live_view import LiveView
             from dudmap.app.viewing.window import Window
 
-            host, port, token = page
-            window = Window(host, port, "dudmap", token)
+            window = Window(wanted.host, wanted.port, "dudmap", wanted.token)
             stack.callback(window.stop)
             live_view = LiveView(window)
             stack.callback(live_view.close)
@@ -76,7 +72,7 @@ def observers(
             raise
         except Exception as error:  # a defect of ours, whatever it is
             raise report_crash(error, events.out or Path.cwd(), events.recent) from error
-        if page is not None and sys.stdin.isatty():
+        if wanted.view and sys.stdin.isatty():
             say("the page stays open; ctrl-C ends it", err=True)
             _wait()
 

@@ -1,7 +1,6 @@
 """``dudmap warmup``: compile all kernels into the cache."""
 
 import time
-from typing import Annotated
 
 import typer
 
@@ -12,9 +11,7 @@ app = typer.Typer(add_completion=False)
 
 
 @app.command()
-def warmup(
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False, as_json: o.JsonOption = False
-) -> None:
+def warmup(quiet: o.QuietOption = False, as_json: o.JsonOption = False) -> None:
     """Compile all kernels in advance.
 
     Processes a small synthetic recording with every part of the system; the compiled kernels are cached on disk.

@@ -12,6 +12,8 @@ from dudmap.core.frames.pyramid import reduced
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 
+WINDOW, WINDOW_STEP = 30, 2
+"""Fused frames after which the poses of a new map are estimated once more, of every second one."""
 MIN_READINGS = 0.02
 """Share of the pixels of a first frame that must have a static depth reading."""
 
@@ -41,6 +43,8 @@ class Bootstrap:
     soon as it shows, and the map begins anew with it. The frames since then are fused once slow motion can be seen,
     without what is seen from there to have moved in them.
 
+    The first frames were registered to a map that had seen little: they are remembered to be registered once more.
+
     Attributes:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
@@ -48,6 +52,8 @@ class Bootstrap:
     def __init__(self) -> None:
         self.textureless = False
         self._frames: list[StartFrame] = []
+        self._window: list[StartFrame] = []
+        self._num_fused = 0
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:
@@ -58,7 +64,26 @@ class Bootstrap:
 
     def start(self, view: FrameView, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember the frame that a map was made of."""
-        self._frames = [StartFrame(view, PoseEstimate.at_origin(), dynamic_mask, fused=True)]
+        first = StartFrame(view, PoseEstimate.at_origin(), dynamic_mask, fused=True)
+        self._frames, self._window, self._num_fused = [first], [first], 1
+
+    def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Remember what was fused after the first frame, or that the map began anew with it."""
+        if not self._window:
+            return
+        if view.timestamp <= self._window[0].view.timestamp:
+            self._window, self._num_fused = [], 0
+        if self._num_fused % WINDOW_STEP == 0:
+            self._window.append(StartFrame(view, estimate, dynamic_mask, fused=True))
+        self._num_fused += 1
+
+    def complete_window(self) -> list[StartFrame]:
+        """Every ``WINDOW_STEP``-th fused frame, in the order of time, once these are ``WINDOW``; they are forgotten
+        then. Before, none."""
+        if not self._window or self._num_fused < WINDOW:
+            return []
+        window, self._window = self._window, []
+        return sorted(window, key=lambda frame: frame.view.timestamp)
 
     def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
         """Remember another frame of the first moments."""
@@ -116,4 +141,4 @@ class Bootstrap:
 
     def abandon(self) -> None:
         """Forget the frames: the camera is tracked in another map."""
-        self._frames = []
+        self._frames, self._window = [], []

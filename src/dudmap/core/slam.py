@@ -87,8 +87,7 @@ class Slam(SlamResults):
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
-        backend = make_backend(self.device)
-        self.preprocess = Preprocessor(camera, config.preprocess, backend, given)
+        self.preprocess = Preprocessor(camera, config.preprocess, given)
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
@@ -168,8 +167,7 @@ class Slam(SlamResults):
 
         Raises:
             ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
-            DatasetError: The arrays have another shape or type.
-            FrameError: The images do not fit the camera or each other; the frame changed nothing.
+            FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
         if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
             raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
@@ -188,6 +186,7 @@ class Slam(SlamResults):
         view = replace(view, blind=self._is_blind(view))
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
+            self._refine_start()
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
@@ -246,6 +245,12 @@ class Slam(SlamResults):
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
+
+    def _refine_start(self) -> None:
+        """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
+        correction = None if self.prior_map else self.mapper.refine_start(self.tracker)
+        if correction is not None:
+            self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
@@ -340,6 +345,7 @@ class Slam(SlamResults):
         self.bootstrap.abandon()  # frames held back have poses of before
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
+        self.detector.apply_correction(correction)
         return correction @ T_world_camera, True
 
     def _calibrate(

@@ -1,10 +1,10 @@
-"""Plots of trajectory, surface and mask errors. Each function writes one PNG file.
+"""Plots of trajectory, surface and mask errors. Each function writes one file: PNG, PDF or SVG, as its name ends.
 
 A plot that cannot be written is a ``DudmapError``.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
+LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2, "frameon": False}
+"""Place of a legend: above the axes on the right, where it covers no curve; titles stand on the left."""
 
 
 def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, result: AteResult) -> None:
@@ -35,17 +37,19 @@ def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, r
     view.plot(true[:, across], true[:, up], color=REFERENCE, linewidth=1.5, label="reference")
     _line_with_gaps(view, estimate.timestamps, aligned[:, across], aligned[:, up], "estimate, aligned")
     view.plot(*true[0, [across, up]], "o", color=REFERENCE, markersize=6, label="start")
-    view.set(xlabel=f"{'xyz'[across]}, m", ylabel=f"{'xyz'[up]}, m", title=f"ATE RMSE {1000 * result.rmse:.1f} mm")
+    view.set(xlabel=f"{'xyz'[across]}, m", ylabel=f"{'xyz'[up]}, m")
+    view.set_title(f"ATE RMSE {1000 * result.rmse:.1f} mm", loc="left")
     view.set_aspect("equal", adjustable="datalim")
-    view.legend()
+    view.legend(**LEGEND)
     for axis, color in enumerate(("#b03a2e", "#2e8b57", "#2f6fb5")):
         offset = true[0, axis]
         by_time.plot(reference.timestamps[during] - t0, true[:, axis] - offset, color=color, alpha=0.45, linewidth=2.5)
         by_time.plot(
             estimate.timestamps - t0, aligned[:, axis] - offset, ".", color=color, markersize=2.5, label="xyz"[axis]
         )
-    by_time.set(xlabel="time, s", ylabel="position from the start, m", title="band: reference; dots: estimate")
-    by_time.legend(markerscale=4)
+    by_time.set(xlabel="time, s", ylabel="position from the start, m")
+    by_time.set_title("band: reference; dots: estimate", loc="left")
+    by_time.legend(markerscale=4, **LEGEND | {"ncols": 3})
     _save(figure, path)
 
 
@@ -61,18 +65,20 @@ def plot_errors(path: Path, result: AteResult | RpeResult) -> None:
     figure, (translation, rotation) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     translation.plot(t, 1000 * result.trans_errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
-    _rules(translation, {"RMSE": 1000 * result.trans.rmse, "median": 1000 * result.trans.median})
-    translation.set(ylabel=labels[0], title=title)
+    _rules(translation, {"RMSE": 1000 * result.trans.rmse, "median": 1000 * result.trans.median}, "mm")
+    translation.set_ylabel(labels[0])
+    translation.set_title(title, loc="left")
     rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
-    _rules(rotation, {"RMSE": result.rot_deg.rmse, "median": result.rot_deg.median})
+    _rules(rotation, {"RMSE": result.rot_deg.rmse, "median": result.rot_deg.median}, "deg")
     rotation.set(xlabel=labels[2], ylabel=labels[1])
     _save(figure, path)
 
 
 def plot_residuals(path: Path, residuals: Path) -> None:
-    """Plot of the registration residuals as a PNG file; see ``draw_residuals``."""
+    """Plot of the registration residuals as a file; see ``draw_residuals``."""
     figure, (axes,) = _figure(1)
     draw_residuals(axes, residuals)
+    axes.set_title("registration", loc="left")
     _save(figure, path)
 
 
@@ -100,8 +106,7 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
     low = counts[counts > 0].min() / counts.sum() / widths.max() if counts.any() else 1e-6
     highest = counts.max() / max(counts.sum(), 1) / widths.min()
     axes.set_ylim(low / 2, 3 * max(highest, low))
-    axes.set_title("residuals of the registration and the fitted mixture")
-    axes.legend()
+    axes.legend(**LEGEND)
 
 
 def plot_surface(path: Path, result: SurfaceResult) -> None:
@@ -118,7 +123,7 @@ def plot_surface(path: Path, result: SurfaceResult) -> None:
         cumulated.plot(edges[1:-1], 100 * np.cumsum(shares)[:-1], color=color, label=name)
     histogram.set(xlabel=f"distance, mm (last bin: {edges[-2]:.0f} and more)", yscale="log")
     histogram.set_ylabel(f"% of the surface per {width:.0f} mm")
-    histogram.legend()
+    histogram.legend(**LEGEND)
     for row, score in enumerate(result.scores):
         cumulated.axvline(1000 * score.distance, color="#999999", linewidth=0.8)
         text = f"{1000 * score.distance:g} mm: F {score.f_score:.3f}"
@@ -126,8 +131,8 @@ def plot_surface(path: Path, result: SurfaceResult) -> None:
         cumulated.annotate(text, at, xytext=(4, 0), textcoords="offset points", fontsize=9)
     area = "" if result.ghost_area_m2 is None else f" ({result.ghost_area_m2:.2f} m2)"
     beyond = f"{100 * result.ghost_share:.2f} %{area} farther than {1000 * result.ghost_distance:g} mm"
-    cumulated.set(xlabel="distance, mm", ylabel="% of the surface within", ylim=(0, 101), title=f"ghosts: {beyond}")
-    cumulated.legend(loc="center right")
+    cumulated.set(xlabel="distance, mm", ylabel="% of the surface within", ylim=(0, 101))
+    cumulated.set_title(f"ghosts: {beyond}", loc="left")
     _save(figure, path)
 
 
@@ -140,12 +145,12 @@ def plot_masks(path: Path, result: MaskResult) -> None:
     quality.plot(t[scored], result.recall[scored], color=SECOND, linewidth=0.8, label="recall")
     quality.plot(t[scored], result.precision[scored], color="#2e8b57", linewidth=0.8, label="precision")
     quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * SCORED_COVERAGE:g} % dynamic")
-    quality.set_title(f"mean IoU {result.mean_iou:.3f} over {result.num_scored} frames")
-    quality.legend(loc="lower left")
+    quality.set_title(f"mean IoU {result.mean_iou:.3f} over {result.num_scored} frames", loc="left")
+    quality.legend(**LEGEND | {"ncols": 3})
     shares.fill_between(t, 100 * result.coverage, color="#b9c4d0", label="true mask")
     shares.plot(t, 100 * result.found_share, color=ESTIMATE, linewidth=1, label="estimated mask")
     shares.set(xlabel="time, s", ylabel="% of the image")
-    shares.legend()
+    shares.legend(**LEGEND)
     _save(figure, path)
 
 
@@ -169,12 +174,12 @@ def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, label
     axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=ESTIMATE, linewidth=1.2, label=label)
 
 
-def _rules(axes: "Axes", levels: dict[str, float]) -> None:
+def _rules(axes: "Axes", levels: dict[str, float], unit: str) -> None:
     """Horizontal lines at named levels."""
     for style, (name, level) in zip(("--", ":"), levels.items(), strict=True):
-        axes.axhline(level, color=REFERENCE, linestyle=style, linewidth=1, label=f"{name} {level:.3g}")
+        axes.axhline(level, color=REFERENCE, linestyle=style, linewidth=1, label=f"{name} {level:.3g} {unit}")
     axes.set_ylim(bottom=0)
-    axes.legend()
+    axes.legend(**LEGEND)
 
 
 def _save(figure: "Figure", path: Path) -> None:

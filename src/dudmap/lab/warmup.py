@@ -1,6 +1,7 @@
 """The parts of the system that have kernels, run once on a small synthetic recording to compile them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
@@ -8,7 +9,13 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     import tempfile
     from pathlib import Path
 
+    import numpy as np
+
     from dudmap.config import Config
+    from dudmap.core.calibration.adjustment import Adjustment, Fit
+    from dudmap.core.calibration.keyframes import keyframe
+    from dudmap.core.calibration.pairs import Pair, PairSet
+    from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.map.volume import TsdfVolume
     from dudmap.core.slam import Slam
     from dudmap.lab.synthetic import sequence
@@ -16,6 +23,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
     camera = DEFAULT_CAMERA.resized(160, 120)
     recording = sequence(frames=4, camera=camera, start_dynamic=True)
+    poses = recording.ground_truth.Ts_world_camera
     frames = []
     small = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
     slam = Slam(camera, Config().override(small))
@@ -33,9 +41,19 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
     def several_voxel_sizes() -> None:
         adaptive = Slam(camera, Config().override(["volume.adaptive=true", "volume.adaptive_bend=0.05", *small]))
-        process(adaptive)
+        for frame, T_world_camera in zip(frames, poses, strict=True):
+            adaptive.volume.integrate(frame, T_world_camera)
         adaptive.volume.extract_mesh()
-        adaptive.volume.raycast(adaptive.trajectory.Ts_world_camera[-1], camera)
+        adaptive.volume.raycast(poses[-1], camera)
+
+    def color_camera() -> None:
+        registered = Calibration.registered(camera)
+        system = Slam(camera, Config().override(small), calibration=replace(registered, delay=0.01))
+        process(system)
+        static = np.zeros(camera.shape, bool)
+        first, second = (keyframe(slam.preprocess(frames[n]), camera, poses[n], np.zeros(6), static) for n in (0, -1))
+        pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, Config().sensor)
+        adjustment.with_poses(pairs, Fit.tracked(pairs, registered), adjustment.levels)
 
     def save_and_load() -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -46,6 +64,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("synthetic frames", render),
         ("tracking, labels and map", lambda: process(slam)),
         ("variants of the method", process_variants),
+        ("colour camera", color_camera),
         ("mesh", lambda: slam.volume.extract_mesh()),
         ("view", lambda: slam.volume.raycast(slam.trajectory.Ts_world_camera[-1], camera)),
         ("several voxel sizes", several_voxel_sizes),

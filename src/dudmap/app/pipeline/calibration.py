@@ -9,7 +9,7 @@ import numpy as np
 
 from dudmap.app.pipeline.frame_source import read_ahead
 from dudmap.config import Config
-from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.estimator import (
     EVIDENCE,
@@ -214,10 +214,10 @@ class _Excerpt:
         return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
-        frame, backend = self._sequence[self._numbers[index]], CpuBackend()
+        frame = self._sequence[self._numbers[index]]
         depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.color
         for _ in range(self._halvings):
-            depth, _ = backend.halve(depth, np.zeros_like(depth), HALVING_BAND)
+            depth, _ = halve(depth, np.zeros_like(depth), HALVING_BAND)
             height, width = (size // 2 for size in color.shape[:2])
             color = cv2.resize(color[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
         return replace(frame, depth=depth, color=np.asarray(color, np.uint8))

@@ -19,8 +19,8 @@ CLASSES = """
 app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 core.backends.cpu.consensus:ConsensusParams,Correspondences
-core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
-core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
+core.backends.cpu.evidence:NoiseParameters,MixtureRules,RegionRules
+core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segment_motion:SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FreeSpace,TouchedBlocks,FusedBlocks,NormalEquations,MapSample,RaycastResult
 core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
@@ -30,7 +30,7 @@ core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCa
 core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
 core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
-core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
+core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation
 core.dynamics.temporal_memory:RememberedFrame,TemporalMemory
 core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level core.frames.preprocess:Preprocessor
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.viewing.run_files import RunFiles
 from dudmap.errors import printable
-from dudmap.evaluation.plots import draw_residuals
+from dudmap.evaluation.plots import LEGEND, draw_residuals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,8 +32,8 @@ def plots(run: RunFiles) -> dict[str, str]:
     if (run.folder / "residuals.npz").is_file():
         with _drawing("residuals") as (figure, picture):
             axes = figure.subplots()
+            figure.subplots_adjust(top=0.8)  # room for the legend
             draw_residuals(axes, run.folder / "residuals.npz")
-            axes.set_title("")
         out["Residuals"] = picture[0]
     return out
 
@@ -69,7 +69,8 @@ def _dynamic_share(run: RunFiles) -> str:
         axes.fill_between(at, share, color="#d95f02", alpha=0.6, linewidth=0)
         if len(lost):
             axes.plot(lost, np.zeros(len(lost)), "|", color="black", markersize=12, label=f"{len(lost)} frames lost")
-            axes.legend(frameon=False)
+            figure.subplots_adjust(top=0.88)  # room for the legend
+            axes.legend(**LEGEND)
         axes.set(xlabel="time, s", ylabel="%", xlim=_limits(t), ylim=(0, None))
     return picture[0]
 

@@ -95,7 +95,7 @@ class RerunLog(RunObserver):
         stream.log("world/camera", rr.Pinhole(image_from_camera=view.K, width=width, height=height))
         stream.log("world/camera/color", rr.EncodedImage(contents=jpeg(images.color), media_type="image/jpeg"))
         stream.log("world/camera/depth", rr.DepthImage(images.depth.astype(np.float32), meter=1.0))
-        for kind in ("mask", "residuals"):
+        for kind in pictures.keys() & {"mask", "residuals"}:
             stream.log(f"images/{kind}", rr.EncodedImage(contents=jpeg(pictures[kind]), media_type="image/jpeg"))
 
     def _log_map(self, changes: MeshChanges) -> None:

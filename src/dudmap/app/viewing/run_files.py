@@ -13,6 +13,7 @@ from dudmap.core.geometry.mesh_pieces import load_simplified
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, damaged, read_bytes, read_text
+from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 FOLDER = "thumbnails"
@@ -54,14 +55,14 @@ class RunFiles(RunContent):
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The mesh; a very large one is simplified as it is read, so that it need not fit into the memory. None if no
-        frame was fused."""
+        """The mesh without its smallest loose pieces; a very large one is simplified as it is read, so that it need not
+        fit into the memory. None if no frame was fused."""
         path = self.folder / "mesh.ply"
         if not path.is_file() or not self.metrics.get("mesh_triangles"):
             return None
         layout = ply_layout(path)
         large = layout is not None and len(layout[1]) > MAX_TRIANGLES
-        return load_simplified(path, MAX_TRIANGLES) if large else Mesh.load(path)
+        return without_small_pieces(load_simplified(path, MAX_TRIANGLES) if large else Mesh.load(path))
 
     @property
     def config(self) -> str:

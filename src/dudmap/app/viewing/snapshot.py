@@ -105,13 +105,14 @@ class FrameImages:
         return cls(*(_reduced(part, width) for part in parts))
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """Images (h, w, 3) uint8 by the names of ``KINDS``: colour, depth in colours, mask over colour, residuals."""
-        return {
+        """Images (h, w, 3) uint8 by the names of ``KINDS``: colour, depth in colours, mask over colour, and residuals
+        where there are any, which the first frame of a map has not."""
+        pictures = {
             "color": self.color,
             "depth": depth_colors(self.depth),
             "mask": mask_overlay(self.color, self.mask),
-            "residuals": residual_colors(self.residuals),
         }
+        return pictures | ({"residuals": residual_colors(self.residuals)} if np.isfinite(self.residuals).any() else {})
 
     def files(self) -> dict[str, bytes]:
         """JPEG files of the ``pictures``."""

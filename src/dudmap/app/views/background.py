@@ -101,7 +101,7 @@ class BackgroundRenderer:
         values[seen] = found[seen] * gain
         color, known = np.zeros_like(frame.color), np.zeros_like(wanted)
         color[rows, columns] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-        known[rows, columns] = True
+        known[rows, columns] = seen | _inner(distances > 0)[rows, columns]
         return color, known
 
     def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -154,6 +154,13 @@ class BackgroundRenderer:
             return float(np.linalg.norm(T[:3, 3])) + ANGLE_LENGTH * se3.rotation_angle(T)
 
         return sorted(self.sources, key=distance)
+
+
+def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (h, w) all of whose neighbours are seen: at the borders of the map its colours fade into black."""
+    import cv2
+
+    return cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.views.background import BackgroundRenderer, continued
+from dudmap.app.views.hanging import remove_hanging_pieces
 from dudmap.app.views.rendering import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DatasetError, FrameError
@@ -112,6 +113,8 @@ class Cleaner:
         if run.calibration is None and not self.registered:
             raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
         color_camera = sequence.camera if run.calibration is None else run.calibration.camera
+        if run.mesh is not None:
+            remove_hanging_pieces(run.volume, run.mesh)
         self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera, registered=self.registered)
         for index in self.indices[:: max(1, -(-len(self.indices) // SOURCES))]:
             try:

@@ -1,6 +1,7 @@
 """Artificial views (thesis section 4.5.3): the map seen along a trajectory, as picture, video or recording."""
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,12 +13,16 @@ from dudmap.atomic_file import atomic_path, write_bytes, write_text
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, printable
+from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
 """Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
 PICTURE = ".png"
 """Ending of a single picture."""
+NEAREST, EDGE = 0.3, 0.04
+"""Least distance of the camera of an orbit from the map (metres), and the margin of its pictures as a share of half
+their size."""
 EMPTY = 32
 """Grey value of pixels that show no surface."""
 
@@ -89,42 +94,57 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callab
             writer.release()
 
 
-def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float) -> Trajectory:
-    """Trajectory on an arc about the middle of what the cameras looked at, at their mean distance and height.
+def orbit(
+    run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float, camera: Camera
+) -> Trajectory:
+    """Trajectory on an arc from which a camera sees the whole mesh, as near as that permits, from 27 degrees above.
 
-    The arc lies about the mean place of the cameras, ``sweep_deg`` wide, there and back; from 360 on it is a circle.
-    ``up`` (3,) is a unit vector against gravity.
+    The middle of the arc is where the cameras were, and it is ``sweep_deg`` wide, there and back; from 360 on it is a
+    circle. ``up`` (3,) is a unit vector against gravity.
     """
-    middle = np.median(run.surface.vertices.astype(np.float64), axis=0)
-    arm = run.trajectory.Ts_world_camera[:, :3, 3].mean(axis=0) - middle
-    height = float(arm @ up)
-    level = arm - height * up
-    if np.linalg.norm(level) < 0.5:  # a camera among what it sees: look at it from a metre away
-        level = -run.trajectory.Ts_world_camera[:, :3, 2].mean(axis=0)
-        level -= (level @ up) * up
-        level /= max(float(np.linalg.norm(level)), 1e-9)
-    side = np.cross(up, level)
+    points = without_small_pieces(run.surface).vertices.astype(np.float64)
+    Ts = run.trajectory.Ts_world_camera
+    arm = Ts[:, :3, 3].mean(axis=0) - np.median(points, axis=0)
+    choices = [arm, -Ts[:, :3, 2].mean(axis=0), Ts[:, :3, 1].mean(axis=0)]
+    level = [choice - (choice @ up) * up for choice in choices]
+    # a camera among what it sees is behind its mean view; one that looks straight up or down, below its image
+    first = next((one for one, least in zip(level, (0.5, 0.1, 0.0), strict=True) if np.linalg.norm(one) > least), up)
+    first /= np.linalg.norm(first)
     share = np.arange(frames) / frames
     angles = 2 * np.pi * share if sweep_deg >= 360 else np.radians(sweep_deg) / 2 * np.sin(2 * np.pi * share)
-    places = [middle + np.cos(a) * level + np.sin(a) * side + height * up for a in angles]
-    return Trajectory(np.arange(frames) / fps, np.array([looking_at(place, middle, up) for place in places]))
+    poses, distances = [], []
+    for angle in angles:
+        T, distance = _framing(
+            points, np.cos(angle) * first + np.sin(angle) * np.cross(up, first) + 0.5 * up, up, camera
+        )
+        poses.append(T)
+        distances.append(distance)
+    for T, distance in zip(poses, distances, strict=True):
+        T[:3, 3] -= (max(distances) - distance) * T[:3, 2]
+    return Trajectory(np.arange(frames) / fps, np.array(poses))
 
 
-def looking_at(place: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pose (4, 4) of a camera at a place that looks at a target, with ``up`` towards the upper edge of the image.
+def _framing(
+    points: NDArray[np.float64], back: NDArray[np.float64], up: NDArray[np.float64], camera: Camera
+) -> tuple[NDArray[np.float64], float]:
+    """Pose (4, 4) of a camera that looks against ``back`` and just holds all points (n, 3), and its place along it.
 
-    Raises:
-        ConfigError: It would look straight up or down.
+    A point with the coordinates (x, y, z) along the axes of the camera is in the picture of a camera at (cx, cy, cz) if
+    |x - cx| <= r (z - cz) with r the tangent of half the field of view, and likewise for y.
     """
-    forward = target - place
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6 * max(float(np.linalg.norm(forward)), 1.0):
-        raise ConfigError("the orbit looks straight along --up; give another direction, or a trajectory")
+    forward = -back / np.linalg.norm(back)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
     T = np.eye(4)
-    T[:3, 2], T[:3, 0] = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
-    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-    T[:3, 3] = place
-    return T
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    x = points @ T[:3, :3]
+    place = np.array([0.0, 0.0, x[:, 2].min() - NEAREST])
+    for axis, tangent in enumerate((camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)):
+        reach = tangent * (1 - EDGE)
+        low, high = (x[:, 2] + x[:, axis] / reach).min(), (x[:, 2] - x[:, axis] / reach).min()
+        place[axis] = reach * (low - high) / 2
+        place[2] = min(place[2], (low + high) / 2)
+    T[:3, 3] = T[:3, :3] @ place
+    return T, -float(place[2])
 
 
 def render_run(
@@ -135,13 +155,15 @@ def render_run(
     size: tuple[int, int] | None = None,
     fps: float = 30.0,
     progress: Callable[[int, int], None] | None = None,
+    whole: bool = False,
 ) -> int:
     """Write the map as a camera on a trajectory sees it; returns the number of frames.
 
     A file name ending with .png gives one picture, of the first pose, and one with another known ending a video. A name
     without an ending is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists,
     intrinsics.txt and groundtruth.txt. ``size`` is width and height in pixels, None for those of the recording; ``fps``
-    that of a video. ``progress`` receives the numbers of finished frames and of all.
+    that of a video. ``progress`` receives the numbers of finished frames and of all. Views end where the readings of
+    the run did, those of the ``whole`` map at its far end.
 
     Raises:
         ConfigError: The ending is unknown.
@@ -149,17 +171,25 @@ def render_run(
         MapError: There is no map.
         OSError: A file cannot be written.
     """
-    camera = run.volume.camera if size is None else run.volume.camera.resized(*size)
+    camera = view_camera(run, size)
+    if whole:
+        run.volume.see_farther(_farthest(run, trajectory))
     if out.suffix.lower() == PICTURE and not out.is_dir():
         color, _ = _view(run, trajectory.Ts_world_camera[0], camera)
         write_bytes(out, cv2.imencode(PICTURE, color[..., ::-1])[1].tobytes())
         return 1
     if out.suffix and not out.is_dir():
-        with video_file(out, (camera.width, camera.height), fps) as add:
+        with video_file(out, (camera.width, camera.height), fps) as add, ThreadPoolExecutor(1) as encoder:
+            added = None
             for number, T in enumerate(trajectory.Ts_world_camera, start=1):
-                add(_view(run, T, camera)[0])
+                color = _view(run, T, camera)[0]
+                if added is not None:
+                    added.result()
+                added = encoder.submit(add, color)
                 if progress is not None:
                     progress(number, len(trajectory))
+            if added is not None:
+                added.result()
         return len(trajectory)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(
@@ -176,6 +206,17 @@ def render_run(
     folder.finish(camera)
     trajectory.save(out / "groundtruth.txt")
     return len(trajectory)
+
+
+def view_camera(run: RunContent, size: tuple[int, int] | None) -> Camera:
+    """The camera of the run, for images of a size (width, height)."""
+    return run.volume.camera if size is None else run.volume.camera.resized(*size)
+
+
+def _farthest(run: RunContent, trajectory: Trajectory) -> float:
+    """Largest depth of the mesh in the views of a trajectory, metres."""
+    points = run.surface.vertices.astype(np.float64)
+    return max(float(((points - T[:3, 3]) @ T[:3, 2]).max()) for T in trajectory.Ts_world_camera)
 
 
 def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

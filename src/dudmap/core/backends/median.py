@@ -1,9 +1,36 @@
-"""Median of few values, ten times as fast as NumPy's."""
+"""Median of few values, ten times as fast as NumPy's, and what kernels find it with."""
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dudmap.core.backends.threads import scalar
 
 
 def median(rows: NDArray) -> NDArray:
     """Median of values (n,), or of each column of (n, m); the upper one of an even number. NaN sorts last."""
     return np.sort(rows, axis=0)[len(rows) // 2]
+
+
+@scalar
+def nth(values: NDArray[np.floating], k: int) -> float:
+    """Value number ``k`` of finite ones (n,) in ascending order, by Hoare's selection; compiles in a tenth of the time
+    of NumPy's partition."""
+    left, right, v = 0, len(values) - 1, values.copy()
+    while left < right:
+        pivot, i, j = v[(left + right) // 2], left, right
+        while i <= j:
+            while v[i] < pivot:
+                i += 1
+            while v[j] > pivot:
+                j -= 1
+            if i <= j:
+                v[i], v[j] = v[j], v[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            right = j
+        elif k >= i:
+            left = i
+        else:
+            break
+    return v[k]

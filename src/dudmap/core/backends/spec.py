@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.parameters import (
-    ColorProjection,
     DepthView,
-    FilterParameters,
     FreeSpace,
     FusedBlocks,
     FusionParameters,
@@ -26,53 +24,10 @@ from dudmap.core.backends.parameters import (
 class Backend(Protocol):
     """Operations of a compute device.
 
-    A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
-    must not run at the same time. Results do not depend on the number of threads.
+    A back end may reuse buffers between calls, so each map has one of its own, and calls on one must not run at the
+    same time. Results do not depend on the number of threads. Images are prepared, labels found and meshes extracted on
+    the CPU, whatever the device.
     """
-
-    # -- filter ------------------------------------------------------------------------------------------------------
-
-    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
-        """Depth (H, W) in metres, limited, with small holes filled and smoothed.
-
-        Args:
-            depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
-            parameters: Limits and filter (thesis section 4.3).
-        """
-        ...
-
-    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Intensities (H, W) in [0, 1] of colours (H, W, 3)."""
-        ...
-
-    def color_pixels(
-        self,
-        depth: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        projection: ColorProjection,
-        fallback: float,
-        start: int,
-        stop: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
-
-        Calls may run at the same time.
-
-        Args:
-            depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
-            intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
-            projection: Of the colour camera.
-            fallback: Depth of rows without a reading, metres.
-            start, stop: First row, and that after the last.
-        """
-        ...
-
-    def halve(
-        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
-        ``max(tolerance, tolerance z)`` behind the nearest one z."""
-        ...
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 

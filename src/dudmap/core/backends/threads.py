@@ -4,15 +4,18 @@ Kernels are serial and release the GIL; a call is cut into bands that do not dep
 sums are added in band order, so that the result is the same, bit for bit, on one core and on sixteen.
 """
 
+import hashlib
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cache
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from numba import njit
+from numba.core.dispatcher import Dispatcher
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 _OPTIONS: dict[str, Any] = {
@@ -21,12 +24,44 @@ _OPTIONS: dict[str, Any] = {
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
     "error_model": "numpy",
 }
-kernel = njit(**_OPTIONS)
-scalar = njit(**_OPTIONS, forceinline=True)
+
+
+@cache
+def sources() -> str:
+    """Digest of name, time of change and size of all files whose text or constants kernels are compiled from."""
+    folder = Path(__file__).parent
+    folders = folder, folder / "cpu", folder.parent / "formulas"
+    files = sorted(path for each in folders for path in each.glob("*.py"))
+    stamps = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files]
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()
+
+
+def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator that compiles a kernel and stores it until one of the ``sources`` changes.
+
+    Numba itself only asks whether the file of the kernel has changed, and not those of the functions inlined into it.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        compiled = njit(**(_OPTIONS | options))(function)
+        if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
+            index: Any = vars(compiled)["_cache"]._cache_file
+            index._source_stamp = index._source_stamp, sources()
+        return compiled
+
+    return decorate
+
+
+kernel = _compiled()
+exact = _compiled(fastmath=False)
+"""Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
+exact_scalar = _compiled(fastmath=False, forceinline=True)
+"""Compiles what such loops call; ``py_func`` is the same formula for whole images."""
+scalar = _compiled(forceinline=True)
 """Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
 function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
 of the two is called depends on whether the caller was compiled in this process or loaded from the cache."""
-written_out = njit(**_OPTIONS, inline="always")
+written_out = _compiled(inline="always")
 """Compiles scalar mathematics as if it were written out where it is called, so that the compiler orders its sums and
 products together with those around it; takes longer to compile than ``scalar``."""
 
@@ -93,7 +128,7 @@ def bands(n: int, size: int) -> list[tuple[int, int]]:
 def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *each: Sequence[Any]) -> list[Any]:
     """Results, in order, of ``function(start, stop, *items)`` over all ranges; ``each`` holds one item per range."""
     calls = list(zip(ranges, *each, strict=True))
-    threads = min(num_threads(), len(calls))
+    threads = min(num_threads(), len(calls)) if len(calls) > 1 else 1
     if threads <= 1:
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)

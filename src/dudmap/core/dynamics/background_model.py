@@ -101,6 +101,12 @@ class BackgroundModel:
         static = ~dynamic[::stride, ::stride]
         overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, _intrinsics(level))
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the points with a correction (4, 4) of the world."""
+        if self._background is not None:
+            points = self._background.points @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+            self._background = self._background._replace(points=points.astype(np.float32))
+
     def _seen_from(
         self, timestamp: float, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
     ) -> PointImage:
@@ -115,7 +121,8 @@ def _subsampled(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]
     """Depth of one pixel per stride across and down, and mean intensity around it."""
     import cv2
 
-    depth = level.depth[:: _stride(level), :: _stride(level)]
+    stride = _stride(level)
+    depth = level.depth[::stride, ::stride]
     return depth, np.asarray(cv2.resize(level.intensity, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 

@@ -1,42 +1,38 @@
 """Labelling of dynamic pixels: mixture of residual densities, known free space, segments (thesis section 4.6)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig, SensorConfig
-from dudmap.core.backends.cpu import evidence, labeling
+from dudmap.core.backends.cpu import labeling
 from dudmap.core.backends.cpu.evidence import (
-    EDGES,
-    EvidenceParameters,
+    BINS,
+    CENTERS,
     NoiseParameters,
-    ReadingNoise,
+    RegionRules,
     edge_tolerance,
+    moving_pixels,
     noise_limit,
     static_sigma,
+    weigh_readings,
 )
+from dudmap.core.backends.cpu.segment_motion import moving_segments
+from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.background_model import BackgroundModel
-from dudmap.core.dynamics.label_scale import pixel_scale
-from dudmap.core.dynamics.masks import Labels, elliptical_kernel, opened_mask
-from dudmap.core.dynamics.mixture import Mixture, fit_mixture
-from dudmap.core.dynamics.segments import (
-    Segmentation,
-    classify_segments,
-    evidence_of,
-    segment,
-    split_mixed_segments,
-)
+from dudmap.core.dynamics.label_scale import pixel_scale, scaled_length
+from dudmap.core.dynamics.masks import SEAM, Labels, elliptical_kernel
+from dudmap.core.dynamics.mixture import RULES, Mixture
+from dudmap.core.dynamics.segments import Segmentation, segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.exposure import exposed
 from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
 
-MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
 MAX_GAP = 1.5
 """Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
 MAP_ROUGHNESS = 0.4
@@ -55,11 +51,12 @@ MIN_REGION = 0.0008
 """Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
 SEEDED_SHARE = 0.25
 """Share of a grown region that must be seeds for it to move."""
-STARTED_SHARE = 0.1
-"""Share of a segment that must be seeds for its pixels in unknown space to move."""
 EROSION, DILATION, FLOOD_STEP = 15 / 640, 10 / 640, 0.007
 """Radii of the threshold rule's structuring elements, as shares of the image width, and the largest depth step to a
 neighbouring pixel in its flood, as a share of the depth, in an image 640 pixels wide (Palazzolo et al. 2019, code)."""
+
+NONE = np.empty((0, 0), dtype=np.bool_)
+"""No pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +69,8 @@ class _Comparison:
         T_world_camera: (4, 4).
         exposure: Gain and offset that make the image's intensities those of the map.
         sample: The map at the points of the image.
-        noise: Of the readings.
+        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+        noise: What the noise of the readings follows from.
     """
 
     timestamp: float
@@ -80,7 +78,8 @@ class _Comparison:
     T_world_camera: NDArray[np.float64]
     exposure: tuple[float, float]
     sample: MapSample
-    noise: ReadingNoise
+    sigma: NDArray[np.float32]
+    noise: NoiseParameters
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -161,26 +160,40 @@ class DynamicDetector:
             moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
             exposure: Gain and offset that make the image's intensities those of the map.
         """
-        sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        noise = evidence.reading_noise(level.depth, self._noise_parameters(level, volume.voxel_size))
-        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, noise)
-        histogram, unknown = evidence.residual_counts(sample, level.depth, noise.sigma)
-        if self.config.method == "threshold":
+        config, depth, noise = (
+            self.config,
+            level.depth,
+            noise_parameters(self.config, self.sensor, level, volume.voxel_size),
+        )
+        sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
+        sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
+        histogram = np.zeros(BINS, np.int64)
+        unknown, (prior, static, moves) = weigh_readings(
+            depth, sample.distance, sample.occupancy, noise, RULES, CENTERS, sigma, tolerance, histogram
+        )
+        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise)
+        if config.method == "threshold":
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
-        mixture = fit_mixture(histogram, EDGES)
-        log_odds = self._log_odds(frame, mixture, unknown)
-        probability = labeling.mean_field(log_odds, level.depth, noise.tolerance, COUPLING, SWEEPS)
-        dynamic = (probability < 0.5) & (level.depth > 0)
+        mixture = Mixture((1 - prior, prior), (static, moves))
+        offset, slope = mixture.coefficients
+        dynamic, seeds = np.empty(depth.shape, np.bool_), np.empty(depth.shape, np.bool_)
+        rules = RegionRules(
+            MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, SEEDED_SHARE,
+            config.free_space, config.regions,
+        )  # fmt: skip
+        moving_pixels(
+            depth, sample.distance, sample.occupancy, sigma, tolerance, self._seen_free(frame, unknown), offset,
+            np.float32(slope), noise, rules, dynamic, seeds, probability,
+        )  # fmt: skip
         segments = None
-        if self.config.regions:
-            seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
-            least = MIN_REGION * seeds.size
-            dynamic = evidence.moving_regions(seeds, log_odds, level.depth, noise.tolerance, least, SEEDED_SHARE)
-            if self.config.pieces:
+        if config.regions:
+            if config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
-            if moving is not None:
-                dynamic = dynamic | moving
+            if moving is not None and moving.any():
+                least = config.noise_threshold / 3
+                image = timestamp, level, T_world_camera, segmentation(), sigma
+                dynamic = dynamic | (moving & ~self.memory.stayed(*image, moving, least))
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -209,33 +222,23 @@ class DynamicDetector:
         if self.config.free_space:
             self.background.update(timestamp, exposed(level, exposure), T_world_camera, labels.dynamic)
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move what is remembered with a correction (4, 4) of the world."""
+        self.memory.apply_correction(T_new_old)
+        self.background.apply_correction(T_new_old)
+
     def reset(self) -> None:
         """Forget the remembered frames after a loss of tracking."""
         self.memory.reset()
         self.background.reset()
 
-    def _noise_parameters(self, level: Level, voxel_size: float) -> NoiseParameters:
-        """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
-        config, sensor = self.config, self.sensor
-        return NoiseParameters(
-            sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
-            DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas, MAX_GAP,
-            config.noise_threshold / 3,
-        )  # fmt: skip
-
-    def _log_odds(self, frame: _Comparison, mixture: Mixture, unknown: float) -> NDArray[np.float32]:
-        """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown.
-
-        Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
-        free space they are -MAX_LOG_ODDS; ``unknown`` is the share of the readings in space unknown to the map.
-        """
-        config, level, seen_free = self.config, frame.level, None
-        if config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown)):
-            seen_free = self.memory.seen_free(level, frame.T_world_camera, frame.noise.gap, older)
-        parameters = EvidenceParameters(
-            *mixture.coefficients, MAX_LOG_ODDS, config.noise_threshold, config.noise_sigmas
-        )
-        return evidence.log_odds(frame.sample, frame.noise.sigma, parameters, config.free_space, seen_free)
+    def _seen_free(self, frame: _Comparison, unknown: float) -> NDArray[np.bool_]:
+        """Pixels (h, w) in space that single frames have seen to be free, of size 0 where they are not asked;
+        ``unknown`` is the share of the readings in space unknown to the map."""
+        if not (self.config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown))):
+            return NONE
+        gap = np.float32(MAX_GAP) * noise_threshold(self.config, frame.sigma)
+        return self.memory.seen_free(frame.level, frame.T_world_camera, gap, older)
 
     def _segments(
         self,
@@ -244,27 +247,18 @@ class DynamicDetector:
         seeds: NDArray[np.bool_],
         segmentation: Segmentation,
     ) -> tuple[NDArray[np.bool_], Segmentation]:
-        """Dynamic pixels (h, w) decided by segment, and the segments.
-
-        1. Pixels in unknown space are dynamic only in a segment at least STARTED_SHARE of which are seeds.
-        2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
-        3. Segments that have settled are static.
-        """
-        level, T_world_camera = frame.level, frame.T_world_camera
-        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
-        counts = evidence.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
-        split = split_mixed_segments(segmentation, before, *counts[:2])
-        if split is not segmentation:
-            segmentation, counts = split, evidence.segment_counts(split.labels, split.count, (before, seeds))
-        size, labels = np.maximum(counts[0], 1), segmentation.labels
-        sigma = frame.noise.bounded_sigma
-        dynamic, sums = evidence.compare_segments(
-            frame.sample, segmentation.with_noise(sigma), counts[2] / size >= STARTED_SHARE, dynamic, level.intensity,
-            frame.exposure,
+        """Dynamic pixels (h, w) decided by segment (``moving_segments``), without those that have settled, and the
+        segments."""
+        level, T_world_camera, sigma = frame.level, frame.T_world_camera, frame.sigma
+        before = self.memory.last_dynamic(level, T_world_camera)
+        least, (gain, offset) = self.config.noise_threshold / 3, frame.exposure
+        labels, count = moving_segments(
+            segmentation.with_noise(sigma, least), before, seeds, frame.sample, level.intensity,
+            np.float32(1 - gain), np.float32(offset), dynamic,
         )  # fmt: skip
-        moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
-        dynamic = dynamic | moving[labels]
-        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
+        if count > segmentation.count:
+            segmentation = replace(segmentation, labels=labels, count=count)
+        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic, least)
         return dynamic & ~settled, segmentation
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
@@ -276,7 +270,7 @@ class DynamicDetector:
 
         level = frame.level
         distance = np.abs(np.nan_to_num(frame.sample.distance))
-        noise = noise_threshold(self.config, frame.noise.sigma)
+        noise = noise_threshold(self.config, frame.sigma)
         rim = 0.95 * truncation  # a stored distance never exceeds the truncation
         marked = (distance > min(self.config.threshold, rim)) | frame.free
         width = level.camera.width
@@ -287,18 +281,27 @@ class DynamicDetector:
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0
 
 
+def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
+    """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
+    parameters = NoiseParameters(
+        sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
+        DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas,
+    )  # fmt: skip
+    return single(parameters)
+
+
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
     """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
     map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
-    return np.asarray(static_sigma(depth, sensor.sigma_base, sensor.sigma_scale, map_variance), np.float32)
+    return np.asarray(static_sigma.py_func(depth, sensor.sigma_base, sensor.sigma_scale, map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
     """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w) is that of the depth."""
     slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
-    return np.asarray(edge_tolerance(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
+    return np.asarray(edge_tolerance.py_func(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
 
 
 def noise_threshold(config: DynamicsConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
     """Distance (h, w) to the map below which nothing is called motion (theta in eq. 4.57), metres."""
-    return noise_limit(sigma, np.float32(config.noise_threshold), np.float32(config.noise_sigmas))
+    return noise_limit.py_func(sigma, np.float32(config.noise_threshold), np.float32(config.noise_sigmas))

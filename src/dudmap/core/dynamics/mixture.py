@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import labeling
-from dudmap.core.backends.cpu.evidence import MAX_RESIDUAL, mixture_log_odds
+from dudmap.core.backends.cpu.evidence import MAX_RESIDUAL, MixtureRules, mixture_log_odds
 
 START = 0.1, 1.0, 6.0
 """Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
@@ -16,6 +16,9 @@ STATIC_BOUNDS = 0.5, 2.0
 """Bounds of the standard deviation of the static density, which is 1 where the sensor model is exact."""
 SEPARATION = 3.0
 """Least ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
+
+RULES = MixtureRules(30, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION)
+"""Rules of the fit of a frame."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Mixture:
     def log_odds(self, residual: NDArray[np.floating]) -> NDArray[np.float32]:
         """Log odds static : dynamic of normalised residuals >= 0."""
         offset, slope = self.coefficients
-        return mixture_log_odds(np.square(residual, dtype=np.float32), offset, np.float32(slope))
+        return mixture_log_odds.py_func(np.square(residual, dtype=np.float32), offset, np.float32(slope))
 
     def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
         """Densities (2, ...) of both components, priors included."""
@@ -52,7 +55,9 @@ class Mixture:
         )
 
 
-def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = 30) -> Mixture:
+def fit_mixture(
+    histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = RULES.iterations
+) -> Mixture:
     """Expectation maximisation on a histogram of normalised residuals (eq. 4.52-4.56; Dempster et al. 1977).
 
     Args:

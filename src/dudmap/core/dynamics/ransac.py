@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams
-from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 
 REFERENCE_WIDTH = 320
@@ -13,8 +12,6 @@ REFERENCE_WIDTH = 320
 NOISE_PX = 0.7
 """Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
-REFINED = 5
-"""Hypotheses of each noise level that are refined: three noisy corners seldom give the best one outright."""
 NOISE_LEVELS = 1.0, 0.5, 0.25
 """Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
 corners of a right motion are measured with 0.07 px per coordinate."""
@@ -62,41 +59,16 @@ def rigid_motion(
         camera: Camera of both images.
         T_expected: (4, 4) predicted motion.
     """
-    areas = points[:, 2] ** 2
-    params = _params(camera)
-    start, expected = (reproject(T, points, camera) for T in (np.eye(4), T_expected))
-    flow, J = targets - start, flow_jacobian(points, camera)
+    areas, n = points[:, 2] ** 2, len(points)
     rng = np.random.default_rng(0)
-    n = len(points)
     draws = np.concatenate([
         rng.integers(0, n, (HYPOTHESES, 3)),
         rng.choice(n, (HYPOTHESES, 3), p=areas / areas.sum()),
     ])  # fmt: skip
-    A = J[draws].reshape(-1, 6, 6)
-    A = A + 1e-9 * np.eye(6)  # samples with a repeated point are degenerate; their hypotheses have no support
-    motions = se3.exp_all(np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64))
-    points, targets, expected = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
-    found = consensus.Correspondences(points, targets, expected, areas, camera.intrinsics)
-    scores = consensus.msac_scores(motions, found, params)
-    best = np.argpartition(scores, -REFINED, axis=0)[-REFINED:]
-    levels = [np.concatenate([T_expected[None], motions[highest]]) for highest in best.T]
-    refined = _refined(np.concatenate(levels), np.repeat(params.inlier_px, REFINED + 1), found)
-    return refined[consensus.msac_scores(refined, found, params).max(axis=1).argmax()]
-
-
-def _refined(
-    motions: NDArray[np.float64], inlier_px: NDArray[np.float64], found: consensus.Correspondences
-) -> NDArray[np.float64]:
-    """Least-squares motions (g, 4, 4) of the inliers of motions near them, by Gauss-Newton; ``inlier_px`` (g,) is the
-    reprojection error from which on a correspondence is an outlier of each."""
-    for scale in (2.0, 1.0, 1.0):  # a hypothesis comes from three noisy corners: begin with a wider inlier threshold
-        H, gradient, inliers = consensus.linearized(motions, found, scale * inlier_px)
-        determined = inliers >= 6
-        H = H[determined]
-        damped = H + 1e-9 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-        steps = np.linalg.solve(damped, gradient[determined][..., None])[..., 0]
-        motions[determined] = se3.exp_all(steps) @ motions[determined]
-    return motions
+    expected = reproject(T_expected, points, camera)
+    at, seen_at, expected_at = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
+    found = consensus.Correspondences(at, seen_at, expected_at, areas, camera.intrinsics)
+    return consensus.best_motion(draws, found, _params(camera), T_expected)
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
@@ -109,15 +81,6 @@ def _params(camera: Camera) -> ConsensusParams:
     gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
     limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
     return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(NEAR_PX, camera))
-
-
-def flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Derivative (n, 2, 6) of the pixels of points (n, 3) by a twist (v, omega) applied to the points, at zero."""
-    z = np.maximum(points[:, 2], 1e-6)
-    x, y, one, zero = points[:, 0] / z, points[:, 1] / z, np.ones_like(z), np.zeros_like(z)
-    du = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
-    dv = camera.fy * np.stack([zero, one / z, -y / z, -1 - y * y, x * y, x], axis=1)
-    return np.stack([du, dv], axis=1)
 
 
 def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import compare_with_frame, free_space, seen_marked
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget
+from dudmap.core.backends.cpu.evidence import free_space, seen_marked
+from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
+from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.label_scale import scaled_side
-from dudmap.core.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
+from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 
@@ -25,11 +27,13 @@ YOUNG_UNKNOWN_SHARE = 0.1
 """Share of the readings in space unknown to the map from which on single frames give free space at any age."""
 SEAM = 1
 """Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+MAX_DISPLACEMENT = 0.1
+"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
 DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RememberedFrame:
     """A tracked frame with its labels.
 
@@ -118,6 +122,12 @@ class TemporalMemory:
         while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
             settle_frames.popleft()
 
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Move the frames with a correction (4, 4) of the world."""
+        frames = [*self._settle_frames, *self._recent_frames, *(() if self._imported else self._start_frames)]
+        for frame in {id(frame): frame for frame in [*frames, self._last] if frame is not None}.values():
+            frame.T_world_camera = T_new_old @ frame.T_world_camera
+
     def reset(self) -> None:
         """Forget all frames after a loss of tracking; those imported from another pass stay."""
         self._last = None
@@ -125,18 +135,17 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
-            max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
         """
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, dtype=bool)
         (target,) = _targets(T_world_camera, [self._last])
-        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
+        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, MAX_DISPLACEMENT)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
@@ -183,41 +192,76 @@ class TemporalMemory:
         segmentation: Segmentation,
         sigma: NDArray[np.float32],
         dynamic: NDArray[np.bool_],
+        least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
         """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
 
-        The dynamic part of a segment has settled if, compared with every frame kept of ``settle_time``, more than 0.7
-        of its pixels are visible, less than 0.1 of them lie off by more than 4 sigma, the mean distance is below one
-        sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
+        The dynamic part of a segment has settled if it has stood still (``stand_still``) since every frame kept of
+        ``settle_time``.
 
         Args:
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
             segmentation: Its segments.
-            sigma: (h, w) float32, standard deviation of a distance, metres.
+            sigma: (h, w) float32, standard deviation of a distance, metres; ``least_sigma`` at least.
             dynamic: (h, w) bool.
+            least_sigma: Metres.
         """
-        none = np.zeros_like(dynamic)
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
-            return none
-        count = segmentation.count
-        labels = segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0))
-        parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
-        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
-        settled[: count + 1] = False
-        for target in _targets(T_world_camera, frames):
-            image = level.depth, level.intensity, level.camera.intrinsics
-            sums = compare_with_frame(*image, target, parts.with_noise(sigma), 4)
-            evidence = evidence_of(sums, parts.min_pixels)
-            visible = evidence.compared > 0.7
-            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
-            settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
-            settled &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
-            if not settled.any():
-                return none
-        return settled[parts.labels]
+            return np.zeros_like(dynamic)
+        segments = segmentation.with_noise(sigma, least_sigma)
+        return _still(frames, level, T_world_camera, segments, dynamic)
+
+    def stayed(
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        segmentation: Segmentation,
+        sigma: NDArray[np.float32],
+        moving: NDArray[np.bool_],
+        least_sigma: float = 0.0,
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) that images show to move, but whose segment is where older frames have seen it.
+
+        Corners go astray where colours lie beside their depth. The frames are older than images are compared over, so
+        that a motion that they show would have shown; a frame in which the segment was taken to move proves nothing.
+
+        Args:
+            timestamp, level, T_world_camera, segmentation, sigma, least_sigma: As for ``settled``.
+            moving: (h, w) bool.
+        """
+        frames = [frame for frame in self._recent_frames if timestamp - frame.timestamp >= LONGEST_BASELINE]
+        if not frames or not moving.any():
+            return np.zeros_like(moving)
+        segments = segmentation.with_noise(sigma, least_sigma)
+        return _still(frames, level, T_world_camera, segments, moving, unmarked=True)
+
+
+def _still(
+    frames: Sequence[RememberedFrame],
+    level: Level,
+    T_world_camera: NDArray[np.float64],
+    segments: SegmentImage,
+    chosen: NDArray[np.bool_],
+    *,
+    unmarked: bool = False,
+) -> NDArray[np.bool_]:
+    """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
+    ``unmarked``: and that no frame took to be dynamic."""
+    labels, image = segments.labels, (level.depth, level.intensity, level.camera.intrinsics)
+    still = np.arange(segments.count + 1) > 0
+    size = np.bincount(labels[chosen], minlength=len(still))
+    for target in _targets(T_world_camera, frames):
+        if unmarked and target.marks.any():
+            marked = chosen & seen_marked(*image, target, MAX_DISPLACEMENT)
+            still &= np.bincount(labels[marked], minlength=len(still)) < DYNAMIC_SHARE * size
+        ((gap, difference, _),) = reproject(*image, [target])
+        if not stand_still(segments, chosen, gap, difference, still):
+            return np.zeros_like(chosen)
+    return chosen & still[labels]
 
 
 def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:

@@ -5,9 +5,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.color_registration import color_pixels
+from dudmap.core.backends.cpu.filtering import intensity
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import ColorProjection
-from dudmap.core.backends.spec import Backend
 from dudmap.core.backends.threads import bands, run_bands
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
@@ -53,7 +54,7 @@ def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.fl
     known = observation._recorded_halvings
     if not known:
         recorded = observation.rgb if observation.recorded_rgb is None else observation.recorded_rgb
-        known.append(observation.backend.intensity(recorded))
+        known.append(intensity(recorded))
     while len(known) <= halvings:
         h, w = (size // 2 for size in known[-1].shape)
         whole = known[-1][: 2 * h, : 2 * w]
@@ -66,7 +67,6 @@ def register_color(
     depth: NDArray[np.float32],
     camera: Camera,
     projection: ColorProjection,
-    backend: Backend,
 ) -> NDArray[Pixel]:
     """Colour (H, W[, 3]) of each depth pixel, interpolated; outside the colour image that of its nearest pixel.
 
@@ -77,7 +77,6 @@ def register_color(
         depth: (H, W) float32, metres, 0 = none.
         camera: Of the depth image, without distortion.
         projection: Of ``color_projection``.
-        backend: Compute device.
     """
     import cv2
 
@@ -87,7 +86,7 @@ def register_color(
     out = np.empty(depth.shape + color.shape[2:], color.dtype)
 
     def fill(start: int, stop: int) -> None:
-        us, vs = backend.color_pixels(depth, camera.intrinsics, projection, fallback, start, stop)
+        us, vs = color_pixels(depth, camera.intrinsics, projection, fallback, start, stop)
         cv2.remap(color, us, vs, cv2.INTER_LINEAR, dst=out[start:stop], borderMode=cv2.BORDER_REPLICATE)
 
     run_bands(fill, bands(len(depth), BAND_ROWS))

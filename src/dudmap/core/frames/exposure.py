@@ -3,11 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import kernel
 from dudmap.core.frames.observation import Level
-
-LARGE_GAIN, MORE_ROUNDS, MAX_GAIN = 1.25, 3, 4.0
-"""A gain above this is fitted again, at most so often, and grows no further beyond the last."""
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
@@ -33,59 +29,3 @@ def exposed(level: Level, exposure: tuple[float, float]) -> Level:
 def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
     """Gain and offset of two exposures applied one after the other."""
     return then[0] * first[0], then[0] * first[1] + then[1]
-
-
-def fit_exposure(
-    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
-) -> tuple[float, float]:
-    """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
-
-    Auto-exposure changes all intensities at once; without this model such a change would look like motion. The prior of
-    the gain outweighs the low contrast of an image that is suddenly dark, so a large gain is applied and fitted again.
-    A small one is not: it is also what an image gives that shows something else.
-
-    Args:
-        intensity: (h, w) float32 of the image.
-        difference: (h, w) float32 map minus image, NaN off the map.
-        weights: (h, w) float32 static weights.
-    """
-    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
-    if len(used) < 100:
-        return 1.0, 0.0
-    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels determine two numbers well
-    x = intensity.reshape(-1)[used].astype(np.float64)
-    y = x + difference.reshape(-1)[used]
-    change = exposure = _fit(x, y)
-    for _ in range(MORE_ROUNDS):
-        if change[0] < LARGE_GAIN or exposure[0] > MAX_GAIN / change[0]:
-            break
-        change = _fit(exposure[0] * x + exposure[1], y)
-        exposure = chained(exposure, change)
-    return exposure
-
-
-@kernel
-def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
-    middle, count = len(x) // 2, len(x)
-    errors = y - x
-    gain, offset = 1.0, np.partition(errors, middle)[middle]
-    for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
-        for n in range(count):
-            errors[n] = abs(y[n] - gain * x[n] - offset)
-        scale = max(1.5 * np.partition(errors, middle)[middle], 0.01)
-        total = x_sum = y_sum = 0.0
-        for n in range(count):
-            errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # the weight from here on
-            total += errors[n]
-            x_sum += errors[n] * x[n]
-            y_sum += errors[n] * y[n]
-        x_mean, y_mean = x_sum / total, y_sum / total
-        # prior of the gain at 1: worth a tenth of the pixels at a contrast of 0.2
-        variance = covariance = 0.1 * total * 0.04
-        for n in range(count):
-            variance += errors[n] * (x[n] - x_mean) ** 2
-            covariance += errors[n] * (x[n] - x_mean) * (y[n] - y_mean)
-        gain = min(max(covariance / variance, 0.5), 2.0)
-        offset = y_mean - gain * x_mean
-    return gain, offset

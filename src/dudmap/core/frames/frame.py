@@ -6,7 +6,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
+from dudmap.errors import FrameError
 
 
 class FrameArrays(TypedDict, total=False):
@@ -34,6 +34,10 @@ class Frame:
     color: NDArray[np.uint8]
     color_timestamp: float | None = None
 
+    def __repr__(self) -> str:
+        """The sizes without the images."""
+        return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, colour {self.color.shape})"
+
     @classmethod
     def from_arrays(
         cls,
@@ -52,19 +56,21 @@ class Frame:
             depth_scale: Units of uint16 depth per metre; 1000 = millimetres. Not used for floating point.
 
         Raises:
-            DatasetError: An array has another shape or type, or the time is not a finite number.
+            FrameError: An array has another shape or type, or the time is not a finite number.
         """
         if depth.ndim != 2 or not (depth.dtype.kind == "f" or depth.dtype == np.uint16):
-            raise DatasetError(
+            raise FrameError(
                 f"depth has the shape {depth.shape} and the type {depth.dtype}; expected (H, W), floating point in "
-                "metres or uint16 in units of the camera's depth_scale"
+                "metres or uint16 in units of the camera's depth_scale",
+                "type",
             )
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise DatasetError(
-                f"rgb has the shape {rgb.shape} and the type {rgb.dtype}; expected (H, W, 3) uint8, red green blue"
+            raise FrameError(
+                f"rgb has the shape {rgb.shape} and the type {rgb.dtype}; expected (H, W, 3) uint8, red green blue",
+                "type",
             )
         if not np.isfinite(timestamp):
-            raise DatasetError(f"the timestamp is {timestamp}; expected a finite number of seconds")
+            raise FrameError(f"the timestamp is {timestamp}; expected a finite number of seconds")
         if depth.dtype.kind == "f":
             metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         else:

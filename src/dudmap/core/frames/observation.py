@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.spec import Backend
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 
@@ -21,7 +20,6 @@ class Observation:
         intensity: (H, W) float32, 0..1.
         rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Those of a colour camera that is not
             synchronous are so only once the camera's motion is known (``core/tracking/color_motion.py``).
-        backend: Compute device of the preprocessor, which also makes the image pyramid.
         recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
         color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
     """
@@ -31,7 +29,6 @@ class Observation:
     depth: NDArray[np.float32]
     intensity: NDArray[np.float32]
     rgb: NDArray[np.uint8]
-    backend: Backend = field(repr=False)
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)

@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig
-from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.filtering import filter_depth, intensity
 from dudmap.core.backends.parameters import FilterParameters
-from dudmap.core.backends.spec import Backend
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import DatasetError, FrameError
+from dudmap.errors import FrameError
 
 HOLE_NOISE = 0.01
 """Readings around a small hole may always differ by this much, metres."""
@@ -25,7 +24,7 @@ DEPTH_MIN = 1e-3
 
 
 class Preprocessor:
-    """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing. Not for concurrent calls.
+    """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
     The bilateral filter is separable (columns, then rows), which the exact one is not. Measured on 640x480 readings of
     two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm
@@ -35,7 +34,6 @@ class Preprocessor:
     Args:
         camera: Camera of the depth images, and of the colour images without ``calibration``.
         config: Limits and filter parameters.
-        backend: Compute device, of this preprocessor alone; None takes the CPU.
         calibration: Of the colour camera; None for colour that is registered to depth. Colours that were not taken
             together with the depth are left as they were recorded, scaled to the size of the depth image, to those who
             know the motion.
@@ -45,7 +43,6 @@ class Preprocessor:
         self,
         camera: Camera,
         config: PreprocessConfig | None = None,
-        backend: Backend | None = None,
         calibration: Calibration | None = None,
     ) -> None:
         self.config = config or PreprocessConfig()
@@ -53,7 +50,6 @@ class Preprocessor:
         self.camera = replace(camera, distortion=())
         self._maps = _undistortion(camera) if any(camera.distortion) else None
         self._inverse_map = _distortion(camera) if any(camera.distortion) else None
-        self._backend: Backend = backend or CpuBackend()
         self._parameters = FilterParameters(
             depth_min=max(self.config.depth_min, DEPTH_MIN),
             depth_max=self.config.depth_max,
@@ -78,13 +74,12 @@ class Preprocessor:
         rgb = np.ascontiguousarray(frame.color)
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
-        depth = self._backend.filter(depth, self._parameters)
+        depth = filter_depth(depth, self._parameters)
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
         if self.calibration is not None:
             recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
-        intensity = self._backend.intensity(rgb)
-        return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
+        return Observation(frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset)
 
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
@@ -92,7 +87,7 @@ class Preprocessor:
         """Colours (H, W, 3) registered to the depth as far as is possible without the camera's motion."""
         if calibration.is_instant(offset):
             projection = color_projection(calibration, np.zeros(6), offset)
-            return register_color(recorded, depth, self.camera, projection, self._backend)
+            return register_color(recorded, depth, self.camera, projection)
         if recorded.shape[:2] == depth.shape:
             return recorded
         import cv2
@@ -103,13 +98,14 @@ class Preprocessor:
         """Undistorted mask (H, W) bool of a frame.
 
         Raises:
-            DatasetError: The mask does not have the camera's size, or is not boolean.
+            FrameError: The mask does not have the camera's size, or is not boolean.
         """
         if mask.shape != self.camera.shape or mask.dtype != np.bool_:
             h, w = self.camera.shape
-            raise DatasetError(
+            raise FrameError(
                 f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
-                "the size of the camera's image"
+                "the size of the camera's image",
+                "type",
             )
         if self._maps is None:
             return mask

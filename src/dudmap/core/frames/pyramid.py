@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.frames.optical_flow import corners, grey
 from dudmap.core.geometry.camera import Camera
@@ -79,5 +80,5 @@ def halved(observation: Observation, level: int) -> tuple[NDArray[np.float32], N
     halvings = observation._halvings
     while len(halvings) < level:
         depth, intensity = halvings[-1] if halvings else (observation.depth, observation.intensity)
-        halvings.append(observation.backend.halve(depth, intensity, HALVING_BAND))
+        halvings.append(halve(depth, intensity, HALVING_BAND))
     return halvings[level - 1] if level else (observation.depth, observation.intensity)

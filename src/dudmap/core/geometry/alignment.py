@@ -85,6 +85,7 @@ def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
     """Whether two poses (4, 4) are closer than a distance (m) and an angle (deg)."""
-    if np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) >= distance:
+    apart = T_a[:3, 3] - T_b[:3, 3]
+    if math.sqrt(apart @ apart) >= distance:
         return False
-    return float(np.degrees(se3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]))) < angle_deg
+    return math.degrees(se3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])) < angle_deg

@@ -1,6 +1,7 @@
 """Pinhole camera with optional lens distortion."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -70,7 +71,7 @@ class Camera:
         """Intrinsic matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    @property
+    @cached_property
     def intrinsics(self) -> NDArray[np.float32]:
         """(4,) float32 fx, fy, cx, cy in pixels, the form that kernels use."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float32)
@@ -82,16 +83,7 @@ class Camera:
 
     def scaled(self, level: int) -> "Camera":
         """Camera of the image after ``level`` halvings by 2x2 blocks; a pixel lies at the centre of its block."""
-        factor = 1.0 / (1 << level)
-        return replace(
-            self,
-            fx=self.fx * factor,
-            fy=self.fy * factor,
-            cx=(self.cx + 0.5) * factor - 0.5,
-            cy=(self.cy + 0.5) * factor - 0.5,
-            width=self.width >> level,
-            height=self.height >> level,
-        )
+        return _scaled(self, level)
 
     def resized(self, width: int, height: int) -> "Camera":
         """Camera of the same view in an image of another size."""
@@ -126,3 +118,18 @@ class Camera:
             [points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy],
             axis=-1,
         )
+
+
+@lru_cache(maxsize=32)  # asked for in every frame
+def _scaled(camera: Camera, level: int) -> Camera:
+    """See ``Camera.scaled``."""
+    factor = 1.0 / (1 << level)
+    return replace(
+        camera,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=(camera.cx + 0.5) * factor - 0.5,
+        cy=(camera.cy + 0.5) * factor - 0.5,
+        width=camera.width >> level,
+        height=camera.height >> level,
+    )

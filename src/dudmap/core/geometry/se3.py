@@ -117,7 +117,7 @@ def log_rotation(R: Matrix) -> Matrix:
     """Rotation vector (3,) of a rotation matrix (3, 3), exact up to and at half a turn."""
     x, y, z, w = rotation_to_quat_xyzw(R)
     vector = np.array([x, y, z])
-    sine = float(np.linalg.norm(vector))
+    sine = math.sqrt(vector @ vector)
     if sine < 1e-12:
         return 2.0 * vector
     return vector * (2.0 * np.arctan2(sine, w) / sine)
@@ -125,8 +125,8 @@ def log_rotation(R: Matrix) -> Matrix:
 
 def inverse(T: Matrix) -> Matrix:
     """Inverse of rigid motions (..., 4, 4): ``inverse(T) @ T == identity``."""
-    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
+    R_t = T[..., :3, :3].swapaxes(-1, -2)
+    out = np.zeros(T.shape, T.dtype)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1.0
@@ -135,7 +135,8 @@ def inverse(T: Matrix) -> Matrix:
 
 def rotation_angle(T: Matrix) -> float:
     """Angle in radians, in [0, pi], of the rotation of ``T`` (4, 4) or (3, 3)."""
-    return float(np.linalg.norm(log_rotation(T[:3, :3])))
+    vector = log_rotation(T[:3, :3])
+    return math.sqrt(vector @ vector)
 
 
 def rotation_angles(Ts: Matrix) -> Matrix:

@@ -39,6 +39,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def __repr__(self) -> str:
+        """The extent without the poses."""
+        times = f", {self.timestamps[0]:.6f} to {self.timestamps[-1]:.6f} s" if len(self) else ""
+        return f"Trajectory({len(self)} poses{times})"
+
     @classmethod
     def from_poses(cls, poses: Iterable[tuple[float, NDArray[np.float64]]]) -> "Trajectory":
         """Trajectory of (timestamp, T_world_camera) pairs."""

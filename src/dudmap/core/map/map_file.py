@@ -87,7 +87,7 @@ def _write_array(
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(member, header)
         for part in parts:
-            member.write(np.ascontiguousarray(part).tobytes())
+            member.write(np.ascontiguousarray(part).data)
 
 
 def read_map(path: str | Path) -> MapContent:

@@ -65,7 +65,7 @@ def refine(
     noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (coarser.voxel_size * np.sqrt(np.minimum(fused, 64)))
     needed = np.maximum(bend / np.hypot(config.adaptive_bend, noise)[:, None], texture / config.adaptive_texture)
     children = level.children[slots]
-    rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
+    rows, octants = map(np.ascontiguousarray, np.nonzero(surface & (needed > 1) & (children < 0)))
     if len(rows):
         opened = level.open(parents, slots[rows], octants, number)
         blocks = level.blocks

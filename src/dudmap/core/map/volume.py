@@ -30,6 +30,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
+from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
@@ -282,6 +283,15 @@ class TsdfVolume(PagedMap):
         gains = self._reading_weights(depth, camera)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
+
+    def see_farther(self, depth: float) -> None:
+        """Let views reach ``depth`` metres, or as far as the largest window permits; for maps only looked at."""
+        spread = 2 * self._reach / self.depth_max  # the window covers depth_max
+        longest = ((MAX_WINDOW - 8) * self.block_size - 2 * self.band.limit) / spread
+        self.depth_max = min(max(depth, self.depth_max), longest)
+        self._reach = self.depth_max * spread / 2
+        self._window_cells = int(np.ceil(2 * (self._reach + self.band.limit) / self.block_size)) + 8
+        self.window = BlockWindow(self.block_size, self._window_cells)
 
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
         """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""

@@ -305,23 +305,32 @@ class Atlas:
             (4, 4) motion of the newest stored frame.
         """
         assert self.history is not None
-        self.repainting = None  # the new map has the new colours
         stamps = np.array([self.history.timestamps[n] for n in nodes])
         corrections = np.stack(
             [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
         )
-        for place in (*self.poses, *self.keyframes.keyframes):
-            if place.submap == self.current:
-                correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
-                place.T_world_camera = correction @ place.T_world_camera
+        self.move(stamps, corrections, volume)
         for n, T in zip(nodes, Ts_new, strict=True):
-            self.history.Ts_world_camera[n] = T
-        self.volume.take_over(volume)
+            self.history.Ts_world_camera[n] = T  # without the rounding of a correction
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
             self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
         return corrections[-1]
+
+    def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
+        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,), and use
+        a map that was built from the moved ones."""
+        self.repainting = None  # the new map has the new colours
+        for place in (*self.poses, *self.keyframes.keyframes):
+            if place.submap == self.current:
+                correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
+                place.T_world_camera = correction @ place.T_world_camera
+        for n in self.nodes(self.current):
+            assert self.history is not None
+            correction = se3.interpolate_in_time(stamps, corrections, self.history.timestamps[n])
+            self.history.Ts_world_camera[n] = correction @ self.history.Ts_world_camera[n]
+        self.volume.take_over(volume)
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.frames.exposure import fit_exposure
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas

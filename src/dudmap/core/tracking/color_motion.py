@@ -6,8 +6,6 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.backend import CpuBackend
-from dudmap.core.backends.spec import Backend
 from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
 from dudmap.core.frames.frame import Frame
@@ -28,13 +26,11 @@ class RegisteredLevel(Level):
         observation: The frame.
         calibration: Of the colour camera.
         velocity: (6,) twist of the camera per second.
-        backend: Compute device.
     """
 
     observation: Observation
     calibration: Calibration
     velocity: NDArray[np.float64]
-    backend: Backend
 
     def __init__(self, level: Level, **attributes: object) -> None:
         self.__dict__.update(camera=level.camera, depth=level.depth, **attributes)
@@ -46,7 +42,7 @@ class RegisteredLevel(Level):
         scaled = replace(self.calibration, camera=self.calibration.camera.scaled(halvings))
         projection = color_projection(scaled, self.velocity, self.observation.color_offset)
         recorded = recorded_intensity(self.observation, halvings)
-        return register_color(recorded, self.depth, self.camera, projection, self.backend)
+        return register_color(recorded, self.depth, self.camera, projection)
 
 
 class ColorMotion:
@@ -75,7 +71,6 @@ class ColorMotion:
         self.given = given
         self.calibration = given
         self._first: FrameView | None = None
-        self._backend = CpuBackend()  # of its own: frames are prepared in another thread
 
     def start(self, view: FrameView) -> None:
         """Remember the frame that a map was made of, until its velocity is known."""
@@ -117,7 +112,7 @@ class ColorMotion:
             return frame
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         projection = color_projection(self.calibration, velocity, offset)
-        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection, self._backend))
+        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
         """Whether the frame was prepared with all that is known."""
@@ -149,10 +144,7 @@ class ColorMotion:
             return view
         pyramid = view.pyramid
         given = {"observation": view.observation, "calibration": calibration, "velocity": velocity}
-        levels = {
-            level: RegisteredLevel(level, **given, backend=self._backend)
-            for level in (*pyramid.tracked, pyramid.labelled)
-        }
+        levels = {level: RegisteredLevel(level, **given) for level in (*pyramid.tracked, pyramid.labelled)}
         pyramid = Pyramid([levels[level] for level in pyramid.tracked], levels[pyramid.labelled])
 
         @cache

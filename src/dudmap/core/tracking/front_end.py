@@ -149,15 +149,34 @@ class FrontEnd:
         on_map = labels.sample.occupancy == SURFACE
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
 
+    def _by_distances(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Pose (4, 4) near one of both terms at which the distances of the labelled image are smallest.
+
+        Not while images are compared: a mover of the first frame is part of the young map, and distances follow it.
+        """
+        if view.blind or prediction.moving is not None or self.tracker.config.color_weight == 0:
+            return T_world_camera
+        excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.unverified_mask) if m is not None]
+        weights = initial_weights([view.labelled], self.last_dynamic, excluded)
+        return self.blind_tracker.nearest(
+            volume, view.labelled, T_world_camera, None if weights is None else weights[0]
+        )
+
     def _label(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult | Minimum
     ) -> Labels:
-        """Labels of a registered frame."""
+        """Labels of a registered frame, compared with the map from where it fits its distances best.
+
+        Colours beside their place bend the pose, and a cupboard's front that lies off the map for it looks like motion:
+        what fits under a pose that the registration cannot tell from its own is static.
+        """
         with view.timer("label"):
             labels = self.detector.detect(
                 volume,
                 view.labelled,
-                tracking.T_world_camera,
+                self._by_distances(volume, view, prediction, tracking.T_world_camera),
                 view.timestamp,
                 view.segmentation,
                 prediction.moving,

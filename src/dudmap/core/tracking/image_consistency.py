@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN
+from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
-from dudmap.core.backends.median import median
-from dudmap.core.dynamics.detector import depth_tolerance, distance_sigma
-from dudmap.core.frames.exposure import LARGE_GAIN, fit_exposure
+from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry import se3
@@ -30,8 +30,6 @@ CLEARLY_LESS = 0.5
 known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
 MIN_PIXELS = 100
 """Pixels of the coarsest level that must show the same static surface in both images."""
-AGREEING_SIGMAS = 3 * np.sqrt(2)
-"""Difference of two readings of one surface that noise explains, in standard deviations of one of them."""
 MIN_CORNERS = 60
 """Corners of an image from which on a motion that most of them follow would be found: four times those it needs."""
 
@@ -71,7 +69,7 @@ class ImageConsistency:
     """
 
     def __init__(self, config: Config, motion: MotionModel) -> None:
-        self.sensor = config.sensor
+        self.config = config
         self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
         self._last: tuple[Level, NDArray[np.uint8], bool] | None = None  # coarsest level, dynamic pixels, blind
@@ -134,24 +132,17 @@ class ImageConsistency:
         """
         if self._last is None:
             return ImageComparison()
-        level, (last, marks, blind) = view.pyramid.coarse, self._last
+        level, (last, moved, blind) = view.pyramid.coarse, self._last
         T_world_camera = estimate.T_world_camera if T_world_camera is None else T_world_camera
         T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
-        target = ReprojectionTarget(T_last_camera, last.depth, last.intensity, marks)
-        seen = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])[0]
-        static = (seen.marks == 0) & ~_dynamic(estimate, level)
-        agreeing = np.count_nonzero(np.abs(seen.gap) < AGREEING_SIGMAS * self.sensor.sigma(level.depth))
-        shares = [agreeing / max(np.count_nonzero(of), 1) for of in (level.depth, np.isfinite(seen.gap))]
-        tolerance = depth_tolerance(distance_sigma(self.sensor, level.depth, 0.0), level)
-        common = static & (np.abs(seen.gap) < tolerance)
-        if view.blind or blind or np.count_nonzero(common) < MIN_PIXELS:
-            return ImageComparison(np.nan, *shares)
-        gain, offset = fit_exposure(level.intensity, seen.difference, common.astype(np.float32))
-        difference = seen.difference + np.float32(1 - gain) * level.intensity - np.float32(offset)
-        down, across = np.gradient(level.intensity)
-        contrast = float(median(np.sqrt(down**2 + across**2)[common]))
-        shift = float(np.sqrt(2) * median(np.abs(difference[common])) / contrast) if contrast > 0 else np.nan
-        return ImageComparison(shift, *shares)
+        target = ReprojectionTarget(T_last_camera, last.depth, last.intensity, moved)
+        ((gap, difference, marks),) = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])
+        shift, agreeing, readings, seen = compare_images(
+            level.depth, level.intensity, _dynamic(estimate, level), gap, difference, marks,
+            noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
+        )  # fmt: skip
+        shift = np.nan if view.blind or blind else shift
+        return ImageComparison(shift, agreeing / max(readings, 1), agreeing / max(seen, 1))
 
 
 def _dynamic(estimate: PoseEstimate, level: Level) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, noise_sums
+from dudmap.core.backends.cpu.gradient_noise import NUM_SUMS, noise_information
 from dudmap.core.backends.parameters import ImageStack, RegistrationParameters, single
 from dudmap.core.frames.observation import Level
 
@@ -156,19 +156,16 @@ def gradient_noise(
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
-    sums, numbers = np.zeros(NUM_SUMS), (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
-    noise_sums(
+    s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
+    sums, noise = np.zeros(NUM_SUMS), np.empty((2, 6, 6))
+    noise_information(
         stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
-        *numbers, sums,
+        (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST), R_world_camera, s_c, REGULAR, sums, noise,
     )  # fmt: skip
     count, depth, weight = sums[:3]
     if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
         return None
     s_d = sums[3] / max(weight, 1e-12)
-    s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
-    noise = np.empty((2, 6, 6))
-    for moments, share, out in zip((sums[3:-NUM_MOMENTS], sums[-NUM_MOMENTS:]), (1.0, s_c), noise, strict=True):
-        isotropic(moments, R_world_camera, stride**2 * share, REGULAR, out)
     return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)
 
 

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
 from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
-from dudmap.core.frames.exposure import chained, exposed, fit_exposure
+from dudmap.core.frames.exposure import chained, exposed
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
@@ -26,6 +27,8 @@ NO_STEP = DescentRules(np.eye(6), damping=0.0, limit=0, stop=0.0, stop_gain=0.0,
 """Rules of a registration that ends where it begins, with the normal equations there."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
+NEAREST_STEPS = 3
+"""Largest number of steps to the minimum next to a pose that is near it."""
 MEDIAN_STRIDE = 4
 """Every so many pixels, across and down, enter the median intensity difference."""
 
@@ -189,6 +192,25 @@ class Tracker:
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
         return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
+
+    def nearest(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float64]:
+        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules.
+
+        Args:
+            volume: The map; its window must cover the view.
+            level: The image.
+            T_world_camera: (4, 4).
+            weights: (h, w) float32 static weights in [0, 1]; None weighs every pixel 1.
+        """
+        weights = np.ones_like(level.depth) if weights is None else weights
+        rules = self._rules(NEAREST_STEPS, finest=True, seen=COMPLETE)
+        return self._descend(volume, level, T_world_camera, weights, None, rules, None).T_world_camera
 
     def _observability(
         self,

@@ -102,7 +102,7 @@ def open_camera(text: str | None = None) -> LiveCamera:
     if name not in CAMERAS:
         raise CameraError(f"there is no camera {name!r}; expected one of {', '.join(CAMERAS)}")
     if name == "replay" and not argument:
-        raise CameraError("which recording is to be replayed? expected --camera replay:PATH")
+        raise CameraError("which recording is to be replayed? expected replay:PATH")
     module, class_name = CAMERAS[name].split(":")
     kind = getattr(import_module(f"dudmap.io.cameras.{module}"), class_name)
     return kind(argument) if argument else kind()

@@ -11,21 +11,14 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
-from dudmap.io.exporting.run_content import Box, ExportOptions
-
-SPECK = 0.02
-"""Diagonal of a connected piece of the mesh below which it is left out unless an option says otherwise, metres: loose
-pieces of a few voxels are noise of the depth readings."""
+from dudmap.io.exporting.run_content import SPECK, Box, ExportOptions
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
     """Mesh after all options that change it: crop, pieces, holes, triangles, in this order."""
     if options.crop is not None:
         mesh = cropped(mesh, options.crop)
-    if options.drop_pieces_below is None:
-        mesh = without_specks(mesh)
-    else:
-        mesh = without_small_pieces(mesh, options.drop_pieces_below)
+    mesh = without_small_pieces(mesh, options.drop_pieces_below)
     if options.fill_holes is not None:
         mesh = with_filled_holes(mesh, options.fill_holes)
     if options.max_triangles is not None:
@@ -44,24 +37,14 @@ def cropped(mesh: Mesh, box: Box) -> Mesh:
     return with_faces(mesh, np.all(inside[mesh.faces], axis=1))
 
 
-def without_small_pieces(mesh: Mesh, area: float) -> Mesh:
+def without_small_pieces(mesh: Mesh, area: float = SPECK) -> Mesh:
     """Mesh without the connected pieces whose surface is smaller than ``area``, square metres."""
-    piece = _pieces(mesh)[mesh.faces[:, 0]]
-    return with_faces(mesh, np.bincount(piece, face_areas(mesh))[piece] >= area)
+    piece = pieces(mesh)[mesh.faces[:, 0]]
+    kept = np.bincount(piece, face_areas(mesh))[piece] >= area
+    return mesh if kept.all() else with_faces(mesh, kept)
 
 
-def without_specks(mesh: Mesh) -> Mesh:
-    """Mesh without the connected pieces whose bounding box has a diagonal of less than ``SPECK``."""
-    piece = _pieces(mesh)
-    low = np.full((len(mesh.vertices), 3), np.inf, np.float32)
-    high = -low
-    np.minimum.at(low, piece, mesh.vertices)
-    np.maximum.at(high, piece, mesh.vertices)
-    large = np.linalg.norm(high - low, axis=1) >= SPECK
-    return mesh if large[piece].all() else with_faces(mesh, large[piece[mesh.faces[:, 0]]])
-
-
-def _pieces(mesh: Mesh) -> NDArray[np.int32]:
+def pieces(mesh: Mesh) -> NDArray[np.int32]:
     """Number (V,) of the connected piece that each vertex belongs to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -137,6 +137,9 @@ def _numbers(version: str) -> list[int]:
 
 
 Box = tuple[float, float, float, float, float, float]
+SPECK = 4e-4
+"""Surface of a connected piece of the mesh below which it is left out unless an option says otherwise, square metres,
+that of a square of 2 cm: loose pieces of a few voxels are noise of the depth readings."""
 MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
 """Options that change the mesh."""
 
@@ -148,8 +151,7 @@ class ExportOptions:
     Attributes:
         max_triangles: Largest number of triangles.
         crop: Lower and upper corner of the part of the map to keep, metres, world frame.
-        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres; None leaves
-            out those less than 2 cm across.
+        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres.
         fill_holes: Holes whose border is at most so long are closed, metres.
         up: Direction against gravity in the world frame; None for the normal of the floor in the map.
         resolution: Edge of the cells of grids, metres.
@@ -161,7 +163,7 @@ class ExportOptions:
 
     max_triangles: int | None = None
     crop: Box | None = None
-    drop_pieces_below: float | None = None
+    drop_pieces_below: float = SPECK
     fill_holes: float | None = None
     up: tuple[float, float, float] | None = None
     resolution: float = 0.05

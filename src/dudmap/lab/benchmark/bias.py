@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import exposed, fit_exposure
+from dudmap.core.backends.cpu.exposure import fit_exposure
+from dudmap.core.frames.exposure import exposed
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.preprocess import Preprocessor
@@ -146,7 +147,7 @@ class FirstSecond(NamedTuple):
 
 
 def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAMES) -> list[FirstSecond]:
-    """Track the first frames by distances only, as configured, and by colour almost only.
+    """Track the first frames by distances only, as configured, and by colour almost only; of the final trajectory.
 
     Both trajectories begin with the first camera: what its noise does to the world frame is no error.
 
@@ -160,14 +161,14 @@ def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAME
     found = []
     for term, color_weight in (("distances", 0.0), ("both", weight), ("colour", MOSTLY_COLOR * weight)):
         slam = Slam(sequence.camera, config.override([f"tracker.color_weight={color_weight}"]))
-        errors = np.full((frames, 2), np.nan)
-        T_world_first = np.eye(4)
-        for index in range(min(frames, len(sequence))):
-            T_true = truth.interpolate(float(sequence.timestamps[index]))
-            T_world_first = se3.inverse(T_true) if index == 0 else T_world_first
-            T = slam.process(sequence[index]).T_world_camera
-            if T is not None:
-                error = se3.inverse(T_world_first @ T_true) @ T
+        for index in range(min(frames + 1, len(sequence))):  # with the next frame the first poses are estimated again
+            slam.process(sequence[index])
+        poses = {pose.timestamp: pose.T_world_camera for pose in slam.atlas.poses}
+        stamps, errors = sequence.timestamps[:frames].tolist(), np.full((frames, 2), np.nan)
+        T_world_first = se3.inverse(truth.interpolate(stamps[0]))
+        for index, stamp in enumerate(stamps):
+            if stamp in poses:
+                error = se3.inverse(T_world_first @ truth.interpolate(stamp)) @ poses[stamp]
                 angle = np.linalg.norm(se3.log_rotation(error[:3, :3]))
                 errors[index] = np.degrees(angle), 1000 * np.linalg.norm(error[:3, 3])
         found.append(FirstSecond(term, errors[:, 0], errors[:, 1]))

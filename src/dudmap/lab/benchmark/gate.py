@@ -25,7 +25,7 @@ FIGURES: dict[str, tuple[str, float, float]] = {
 }
 """Recorded figures: whether smaller or larger is better, and the margins of a new file, relative and absolute."""
 HEAD = """\
-# Recorded figures of the accuracy gate; written by `dudmap benchmark gate --record`, reviewed by a person.
+# Recorded figures of the accuracy gate; written by `dudmap benchmark gate --update`, reviewed by a person.
 # A figure may become worse by relative * recorded + absolute.
 
 """
@@ -60,7 +60,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
     for row in rows:
         name = row["sequence"]
         if name not in recorded["figures"]:
-            raise ConfigError(f"the gate has no recorded figures of {name}; record them with --record")
+            raise ConfigError(f"the gate has no recorded figures of {name}; record them with --update")
         for figure, value in recorded["figures"][name].items():
             if figure not in FIGURES or figure not in recorded["margins"]:
                 raise ConfigError(f"unknown figure or margin {figure!r} of the gate; known are {', '.join(FIGURES)}")
@@ -82,9 +82,9 @@ def load_figures(path: Path) -> dict[str, Any]:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"cannot read the figures of the gate {path}: {error}; --record creates the file") from error
+        raise ConfigError(f"cannot read the figures of the gate {path}: {error}; --update creates the file") from error
     if not {"margins", "figures"} <= set(content):
-        raise ConfigError(f"{path} has no [margins] or no [figures]; --record creates it")
+        raise ConfigError(f"{path} has no [margins] or no [figures]; --update creates it")
     return content
 
 

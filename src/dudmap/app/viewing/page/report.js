@@ -110,14 +110,36 @@ class View {
     this.scene.add(this.mesh);
   }
 
-  // Behind and above the first camera, looking at what it sees; walls are transparent from behind.
+  // From behind and above the first camera, as far away as it takes to see the whole map and the trajectory; walls are
+  // transparent from behind.
   home() {
-    const pose = this.poses[0] ?? new THREE.Matrix4();
-    const ahead = new THREE.Vector3().setFromMatrixColumn(pose, 2);
-    const at = new THREE.Vector3().setFromMatrixPosition(pose);
-    this.camera.position.copy(at).addScaledVector(ahead, -1.6).addScaledVector(this.up, 0.9);
-    this.controls.target.copy(at).addScaledVector(ahead, 1.5);
+    const back = new THREE.Vector3().setFromMatrixColumn(this.poses[0], 2).negate().addScaledVector(this.up, 0.5);
+    back.normalize();
+    const right = new THREE.Vector3().crossVectors(this.up, back).normalize();
+    const axes = [right, new THREE.Vector3().crossVectors(back, right), back];
+    const points = this.mapPoints().map((point) => axes.map((axis) => axis.dot(point)));
+    const most = (value) => points.reduce((largest, point) => Math.max(largest, value(point)), -Infinity);
+    const tangent = Math.tan((this.camera.fov * Math.PI) / 360) * 0.96;
+    let away = most((point) => point[2]) + 0.5;
+    const place = [tangent * this.camera.aspect, tangent].map((reach, k) => {
+      const low = most((point) => point[2] - point[k] / reach);
+      const high = most((point) => point[2] + point[k] / reach);
+      away = Math.max(away, (high + low) / 2);
+      return (reach * (high - low)) / 2;
+    });
+    const at = (distance) => new THREE.Vector3(...place, distance).applyMatrix4(new THREE.Matrix4().makeBasis(...axes));
+    this.camera.position.copy(at(away));
+    this.controls.target.copy(at((most((point) => point[2]) - most((point) => -point[2])) / 2));
     this.controls.update();
+  }
+
+  // Every so many points of the map, and the places of all cameras.
+  mapPoints() {
+    const points = this.poses.map((pose) => new THREE.Vector3().setFromMatrixPosition(pose));
+    const vertices = this.mesh?.geometry.getAttribute("position");
+    const step = vertices ? Math.ceil(vertices.count / 50000) : 1;
+    for (let i = 0; i < (vertices?.count ?? 0); i += step) points.push(new THREE.Vector3().fromBufferAttribute(vertices, i));
+    return points;
   }
 
   ride(index) {
@@ -186,12 +208,17 @@ function showImages(t) {
   const column = nearestColumn(t);
   if (!column) return;
   const [color, mask] = [...column.figure.querySelectorAll("img")].map((image) => image.src);
-  const sources = { colour: color, "what moves": mask, depth: column.figure.dataset.depth, residuals: column.figure.dataset.residuals };
+  const { depth, residuals } = column.figure.dataset;
+  const sources = {
+    colour: color, "what moves, red": mask, "depth, blue 0 to red 5 m": depth,
+    "residuals, blue -5 cm to red 5 cm, dark off the map": residuals,
+  };
   byId("now").replaceChildren(...Object.entries(sources).filter(([, source]) => source).map(([name, source]) => {
-    const image = new Image();
+    const [figure, image, caption] = ["figure", "img", "figcaption"].map((tag) => document.createElement(tag));
     image.src = source;
-    image.alt = image.title = `${name} at ${(column.t - run.times[0]).toFixed(2)} s`;
-    return image;
+    caption.textContent = image.alt = `${name}; ${(column.t - run.times[0]).toFixed(2)} s`;
+    figure.append(image, caption);
+    return figure;
   }));
 }
 
@@ -287,7 +314,6 @@ async function start() {
   const view = run.times.length ? openView() : null;
   if (!run.times.length) notice.textContent = "No frame was tracked, so there is neither map nor trajectory.";
   if (view) {
-    view.home();
     if (!run.mesh) notice.textContent = "This run has no mesh: no frame was fused.";
     else if (typeof DecompressionStream === "undefined")
       notice.textContent = "This browser is too old to unpack the map (no DecompressionStream); the trajectory is shown.";
@@ -295,6 +321,8 @@ async function start() {
       view.setMesh(await meshGeometry(run.mesh));
       notice.textContent = "";
     }
+    view.draw(); // which finds the shape of the window
+    view.home();
   }
   connect(view);
   if (run.times.length) showFrame(view, 0);

@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import (
-    color_registration,
-    filtering,
     fusion,
     raycasting,
     registration,
@@ -22,10 +20,8 @@ from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.mirror import Mirror, on_host
 from dudmap.core.backends.parameters import (
     BLOCK,
-    ColorProjection,
     DepthTiles,
     DepthView,
-    FilterParameters,
     FreeSpace,
     FusedBlocks,
     FusionParameters,
@@ -36,10 +32,7 @@ from dudmap.core.backends.parameters import (
     VoxelGrid,
     single,
 )
-from dudmap.core.backends.threads import bands, run_bands
 
-FILTER_ROWS = 120
-"""Image rows of one band of the filter."""
 PIXELS_PER_BAND = 9600
 """Pixels of one band of a linearisation; the coarsest level is one band."""
 _NO_VOXELS = np.empty(0, dtype=np.int32)
@@ -51,80 +44,7 @@ class CpuBackend:
     raycast = staticmethod(raycasting.raycast)
 
     def __init__(self) -> None:
-        self._padded = np.empty((0, 0), dtype=np.float32)
-        self._limited = np.empty((0, 0), dtype=np.float32)
         self._pixels = np.empty((0, 2), dtype=np.int32)
-
-    # -- filter ------------------------------------------------------------------------------------------------------
-
-    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
-        """See ``Backend.filter``."""
-        p = parameters
-        smooth, limited = np.empty(depth.shape, dtype=np.float32), self._limited_buffer(depth.shape)
-        filtering.limit_depth(depth, np.float32(p.depth_min), np.float32(p.depth_max), limited)
-        alpha, hole_noise = np.float32(p.alpha), np.float32(p.hole_noise)
-        ranges = bands(depth.shape[0], FILTER_ROWS)
-        if p.drop_mixed:
-            whole, limited = limited, np.empty_like(limited)
-            steepest = np.float32(p.steepest)
-            run_bands(
-                lambda start, stop: filtering.drop_mixed(start, stop, whole, alpha, hole_noise, steepest, limited),
-                ranges,
-            )
-        if p.fill_holes:
-            run_bands(lambda start, stop: filtering.fill_holes(start, stop, limited, alpha, hole_noise, smooth), ranges)
-        else:
-            smooth[:] = limited
-        if p.smooth:
-            padded = self._padded_buffer(depth.shape, p.radius)
-            weights = p.spatial_weights
-            filtering.pad(0, depth.shape[0], smooth, p.radius, padded)
-            run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, weights, smooth), ranges)
-        return smooth
-
-    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See ``Backend.intensity``."""
-        intensity = np.empty(rgb.shape[:2], dtype=np.float32)
-        filtering.intensities(0, rgb.shape[0], rgb, intensity)
-        return intensity
-
-    def color_pixels(
-        self,
-        depth: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        projection: ColorProjection,
-        fallback: float,
-        start: int,
-        stop: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See ``Backend.color_pixels``."""
-        us, vs = np.empty((2, stop - start, depth.shape[1]), dtype=np.float32)
-        arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
-        color_registration.color_pixels_rows(start, stop, depth, intrinsics, *arrays, *numbers, us, vs)
-        return us, vs
-
-    def _limited_buffer(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Image for depths between two steps of the filter."""
-        if self._limited.shape != shape:
-            self._limited = np.empty(shape, dtype=np.float32)
-        return self._limited
-
-    def _padded_buffer(self, shape: tuple[int, ...], margin: int) -> NDArray[np.float32]:
-        """Image with a margin, OUTSIDE all around."""
-        padded = (shape[0] + 2 * margin, shape[1] + 2 * margin)
-        if self._padded.shape != padded:
-            self._padded = np.full(padded, filtering.OUTSIDE, dtype=np.float32)
-        return self._padded
-
-    def halve(
-        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See ``Backend.halve``."""
-        shape = (depth.shape[0] // 2, depth.shape[1] // 2)
-        small_depth, small_intensity = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-        filtering.halve_depth(0, shape[0], depth, np.float32(tolerance), small_depth)
-        filtering.halve_intensity(0, shape[0], intensity, small_intensity)
-        return small_depth, small_intensity
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,9 @@
 """Loop over the pixels of a depth image: where each lies in the image of another camera, taken at another time."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dudmap.core.backends.parameters import ColorProjection
 from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import elements, project, ray, transform
 
@@ -78,3 +80,26 @@ def color_pixels_rows(
             radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
             to_u[u] = (a * radial + two * p1 * a * d + p2 * (r2 + two * a * a)) * fx + cx
             to_v[u] = (d * radial + p1 * (r2 + two * d * d) + two * p2 * a * d) * fy + cy
+
+
+def color_pixels(
+    depth: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    projection: ColorProjection,
+    fallback: float,
+    start: int,
+    stop: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
+
+    Args:
+        depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
+        intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
+        projection: Of the colour camera.
+        fallback: Depth of rows without a reading, metres.
+        start, stop: First row, and that after the last.
+    """
+    us, vs = np.empty((2, stop - start, depth.shape[1]), dtype=np.float32)
+    arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
+    color_pixels_rows(start, stop, depth, intrinsics, *arrays, *numbers, us, vs)
+    return us, vs

@@ -6,10 +6,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import bands, kernel, run_bands
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, run_team, take, wait_for_all
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
+from dudmap.core.geometry.se3 import SMALL
 
-BAND, LINEARIZED_BAND = 64, 6
-"""Motions that one thread scores, and linearises, in one go."""
+BANDS = 12
+"""Bands of a search: the same number of hypotheses in each, and of motions that are refined."""
+REFINED = 5
+"""Hypotheses of each noise level that are refined: three noisy corners seldom give the best one outright."""
+ROUNDS = 2.0, 1.0, 1.0
+"""Inlier thresholds of the rounds of refinement, as multiples of the usual one: a hypothesis comes from three noisy
+corners, so begin with a wider one."""
+REGULAR = 1e-9
+"""Added to the diagonals of systems of equations: of samples with a repeated point, whose hypotheses have no support,
+and relative to the trace, of least squares."""
+VOTED = 1024
+"""Queries of one band of votes."""
+CHUNK = 32
+"""Points whose distances are looked at together."""
 
 
 class ConsensusParams(NamedTuple):
@@ -44,45 +58,177 @@ class Correspondences(NamedTuple):
     intrinsics: NDArray[np.float32]
 
 
-def msac_scores(motions: NDArray[np.float64], found: Correspondences, params: ConsensusParams) -> NDArray[np.float64]:
-    """MSAC scores (g, k) of motions (g, 4, 4) at each noise level (Torr and Zisserman 2000), times a prior.
+def best_motion(
+    draws: NDArray[np.int64], found: Correspondences, params: ConsensusParams, T_expected: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Motion (4, 4) of the highest score among hypotheses, the expected one, and both refined.
+
+    Args:
+        draws: (g, 3) correspondences of each hypothesis.
+        found: The correspondences.
+        params: Scales of the scores.
+        T_expected: (4, 4).
+    """
+    levels = len(params.gain)
+    size = levels * (REFINED + 1)
+    motions, scores = np.empty((len(draws), 4, 4)), np.empty((len(draws), levels))
+    refined, refined_scores = np.empty((size, 4, 4)), np.empty((size, levels))
+    return run_team(
+        search, BANDS, draws, found, params, np.ascontiguousarray(T_expected), motions, scores, refined, refined_scores
+    )
+
+
+@kernel
+def search(leads, team, draws, found, params, T_expected, motions, scores, refined, refined_scores):
+    """Loop of ``best_motion``, for a team of threads: the first step makes and scores the hypotheses, the
+    second refines the best ones of each noise level and the expected motion, and scores them."""
+    step, levels = 0, scores.shape[1]
+    while step < 2:
+        band, number = first_band(leads, team, step, BANDS)
+        if band == NO_BAND and not leads:
+            break
+        while band != NO_BAND:
+            all_motions, all_scores = (motions, scores) if number == 0 else (refined, refined_scores)
+            start, stop = len(all_motions) * band // BANDS, len(all_motions) * (band + 1) // BANDS
+            for g in range(start, stop):
+                if number == 0:
+                    hypothesis(draws[g], found, motions[g])
+                else:
+                    refine(refined[g], found, params.inlier_px[g // (REFINED + 1)])
+            score(start, stop, all_motions, found, params, all_scores)
+            done(team)
+            band, number = take(team, BANDS)
+        if leads:
+            wait_for_all(team, BANDS)
+            if step == 0:
+                for k in range(levels):
+                    first = k * (REFINED + 1)
+                    for n in range(REFINED + 1):
+                        best = highest(scores[:, k])
+                        T = T_expected if n == 0 else motions[best]
+                        for i in range(16):
+                            refined[first + n, i // 4, i % 4] = T[i // 4, i % 4]
+                        if n > 0:
+                            scores[best, k] = -np.inf
+            step += 1
+    best = 0
+    if leads:
+        finish(team)
+        best = highest(refined_scores.reshape(-1)) // levels
+    return refined[best]
+
+
+@scalar
+def highest(scores):
+    """Number of the highest score (n,), the first of equal ones; NaN is none."""
+    best, most = 0, -np.inf
+    for n in range(len(scores)):
+        if scores[n] > most:
+            best, most = n, scores[n]
+    return best
+
+
+@scalar
+def solved(A, b):
+    """Solution (n,) of A x = b; both are overwritten. Gauss' elimination with pivots from the columns."""
+    n = len(b)
+    for i in range(n):
+        pivot = i
+        for j in range(i + 1, n):
+            pivot = j if abs(A[j, i]) > abs(A[pivot, i]) else pivot
+        for k in range(n):
+            A[i, k], A[pivot, k] = A[pivot, k], A[i, k]
+        b[i], b[pivot] = b[pivot], b[i]
+        for j in range(i + 1, n):
+            share = A[j, i] / A[i, i]
+            for k in range(i, n):
+                A[j, k] -= share * A[i, k]
+            b[j] -= share * b[i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= A[i, k] * b[k]
+        b[i] /= A[i, i]
+    return b
+
+
+@scalar
+def exponential(twist, T):
+    """Write the rigid motion (4, 4) of a twist (6,), as by ``se3.exp``."""
+    x, y, z = twist[3], twist[4], twist[5]
+    square = x * x + y * y + z * z
+    a, b, c = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
+    if square >= SMALL:
+        theta = np.sqrt(square)
+        a, b = np.sin(theta) / theta, (1 - np.cos(theta)) / square
+        c = (1 - a) / square
+    W, WW = np.zeros((3, 3)), np.zeros((3, 3))
+    W[0, 1], W[0, 2], W[1, 0], W[1, 2], W[2, 0], W[2, 1] = -z, y, z, -x, -y, x
+    for i in range(4):
+        for j in range(4):
+            T[i, j] = 1.0 if i == j else 0.0
+    for i in range(3):
+        T[i, 3] = twist[i]
+        for j in range(3):
+            for k in range(3):
+                WW[i, j] += W[i, k] * W[k, j]
+    for i in range(3):
+        for j in range(3):
+            T[i, j] += a * W[i, j] + b * WW[i, j]
+            T[i, 3] += (b * W[i, j] + c * WW[i, j]) * twist[j]
+
+
+@scalar
+def hypothesis(draw, found, T):
+    """Write the motion (4, 4) of three correspondences, from the twist that is linear in their flow."""
+    points, targets, i = found.points, found.targets, found.intrinsics
+    A, b = np.zeros((6, 6)), np.empty(6)
+    for k in range(3):
+        n = draw[k]
+        by_z = 1.0 / max(points[2, n], 1e-6)
+        x, y = points[0, n] * by_z, points[1, n] * by_z
+        for row in range(2):
+            f, m = np.float64(i[row]), 2 * k + row
+            ray = y if row == 1 else x
+            A[m, row], A[m, 2] = f * by_z, -f * ray * by_z
+            A[m, 3] = -f * (1 + y * y) if row == 1 else -f * x * y
+            A[m, 4] = f * x * y if row == 1 else f * (1 + x * x)
+            A[m, 5] = f * x if row == 1 else -f * y
+            b[m] = targets[row, n] - (f * ray + np.float64(i[2 + row]))
+    for m in range(6):
+        A[m, m] += REGULAR
+    exponential(solved(A, b), T)
+
+
+@scalar
+def refine(T, found, inlier_px):
+    """Replace a motion (4, 4) by the least-squares one of its inliers, whose error is below ``inlier_px``."""
+    for scale in ROUNDS:
+        H, gradient, inliers = linearized(T, found, scale * inlier_px)
+        if inliers < 6:
+            continue
+        trace = 0.0
+        for m in range(6):
+            trace += H[m, m]
+        for m in range(6):
+            H[m, m] += REGULAR * trace
+        step, old = np.empty((4, 4)), T.copy()
+        exponential(solved(H, gradient), step)
+        for i in range(3):
+            for j in range(4):
+                T[i, j] = step[i, 3] if j == 3 else 0.0
+                for k in range(3):
+                    T[i, j] += step[i, k] * old[k, j]
+
+
+@scalar
+def score(start, stop, motions, found, params, scores):
+    """MSAC scores (g, k) of the motions ``start`` to ``stop`` at each noise level (Torr and Zisserman 2000), times a
+    prior.
 
     They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)), where e_n is the
     reprojection error and d the mean distance of the pixels from the expected ones.
     """
-    scores = np.empty((len(motions), len(params.gain)))
-    run_bands(
-        lambda start, stop: _score_band(start, stop, motions, *found, params, scores),
-        bands(len(motions), BAND),
-    )
-    return scores
-
-
-def linearized(
-    motions: NDArray[np.float64], found: Correspondences, inlier_px: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Normal equations of the reprojection error of motions (g, 4, 4), linearised at each of them.
-
-    Points are left out of them from an error of ``inlier_px`` (g,) on, pixels.
-
-    Returns:
-        H (g, 6, 6) and gradient (g, 6), whose solution ``solve(H, gradient)`` is the twist (v, omega) of the update
-        exp(twist) @ T; number of the inliers (g,).
-    """
-    g = len(motions)
-    H, gradient, inliers = np.zeros((g, 6, 6)), np.zeros((g, 6)), np.zeros(g, np.int64)
-    run_bands(
-        lambda start, stop: _linearize_band(
-            start, stop, motions, inlier_px, found.points, found.targets, found.intrinsics, H, gradient, inliers
-        ),
-        bands(g, LINEARIZED_BAND),
-    )
-    return H, gradient, inliers
-
-
-@kernel
-def _score_band(start, stop, motions, points, targets, expected, weights, intrinsics, params, scores):
-    """Scores of the motions ``start`` to ``stop``."""
+    points, targets, expected, weights, intrinsics = found
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     square = np.empty(weights.size)
     for g in range(start, stop):
@@ -105,67 +251,106 @@ def _score_band(start, stop, motions, points, targets, expected, weights, intrin
             scores[g, k] = total * params.gain[k] * prior
 
 
-@kernel
-def _linearize_band(start, stop, motions, inlier_px, points, targets, intrinsics, H, gradient, inliers):
-    """Normal equations and numbers of inliers of the motions ``start`` to ``stop``."""
+@scalar
+def linearized(T, found, inlier_px):
+    """Normal equations of the reprojection error at a motion (4, 4), without points from an error of ``inlier_px`` on.
+
+    Returns:
+        H (6, 6) and gradient (6,), whose solution ``solve(H, gradient)`` is the twist (v, omega) of the update
+        exp(twist) @ T; number of the inliers.
+    """
+    points, targets, intrinsics = found.points, found.targets, found.intrinsics
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     size = points.shape[1]
     rows = np.zeros((7, 2, size))  # derivatives of the pixels u, v by the twist, and their errors; of outliers 0
-    products = rows.reshape(7, 2 * size)
-    for g in range(start, stop):
-        T, limit, count = motions[g], inlier_px[g] * inlier_px[g], 0.0
-        for n in range(size):
-            a, b, c = points[0, n], points[1, n], points[2, n]
-            by_z = 1.0 / max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
-            x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) * by_z
-            y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) * by_z
-            du, dv = targets[0, n] - fx * x - cx, targets[1, n] - fy * y - cy
-            inlier = 1.0 if du * du + dv * dv < limit else 0.0
-            count += inlier
-            p, q = inlier * fx, inlier * fy
-            rows[0, 0, n], rows[2, 0, n], rows[3, 0, n] = p * by_z, -p * x * by_z, -p * x * y
-            rows[4, 0, n], rows[5, 0, n], rows[6, 0, n] = p * (1.0 + x * x), -p * y, du
-            rows[1, 1, n], rows[2, 1, n], rows[3, 1, n] = q * by_z, -q * y * by_z, -q * (1.0 + y * y)
-            rows[4, 1, n], rows[5, 1, n], rows[6, 1, n] = q * x * y, q * x, dv
-        inliers[g] = np.int64(count)
-        for i in range(6):
-            for j in range(i, 7):
-                total = 0.0
-                for n in range(2 * size):
-                    total += products[i, n] * products[j, n]
-                if j == 6:
-                    gradient[g, i] = total
-                else:
-                    H[g, i, j] = H[g, j, i] = total
+    products, H, gradient = rows.reshape(7, 2 * size), np.empty((6, 6)), np.empty(6)
+    limit, count = inlier_px * inlier_px, 0.0
+    for n in range(size):
+        a, b, c = points[0, n], points[1, n], points[2, n]
+        by_z = 1.0 / max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
+        x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) * by_z
+        y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) * by_z
+        du, dv = targets[0, n] - fx * x - cx, targets[1, n] - fy * y - cy
+        inlier = 1.0 if du * du + dv * dv < limit else 0.0
+        count += inlier
+        p, q = inlier * fx, inlier * fy
+        rows[0, 0, n], rows[2, 0, n], rows[3, 0, n] = p * by_z, -p * x * by_z, -p * x * y
+        rows[4, 0, n], rows[5, 0, n], rows[6, 0, n] = p * (1.0 + x * x), -p * y, du
+        rows[1, 1, n], rows[2, 1, n], rows[3, 1, n] = q * by_z, -q * y * by_z, -q * (1.0 + y * y)
+        rows[4, 1, n], rows[5, 1, n], rows[6, 1, n] = q * x * y, q * x, dv
+    for i in range(6):
+        for j in range(i, 7):
+            total = 0.0
+            for n in range(2 * size):
+                total += products[i, n] * products[j, n]
+            if j == 6:
+                gradient[i] = total
+            else:
+                H[i, j] = H[j, i] = total
+    return H, gradient, np.int64(count)
 
 
-@kernel
-def neighbour_votes(queries, groups, points, group_of, moving, neighbours):
+def neighbour_votes(
+    queries: NDArray[np.float64],
+    groups: NDArray[np.int32],
+    points: NDArray[np.float64],
+    group_of: NDArray[np.int32],
+    moving: NDArray[np.bool_],
+    neighbours: int,
+) -> NDArray[np.int64]:
     """Number (q,) of the nearest points of the same group that move.
 
     Args:
-        queries, groups: (q, 3) float64 positions, and the group (q,) of each, which has ``neighbours`` points or more.
-        points, group_of, moving: (n, 3) float64, (n,) int32, (n,) bool: the points, their groups, and which move.
+        queries, groups: (q, 3) positions, and the group (q,) of each, which has ``neighbours`` points or more.
+        points, group_of, moving: (n, 3), (n,), (n,): the points, their groups, and which move.
         neighbours: Number of points that vote.
     """
-    votes = np.empty(len(queries), np.int64)
-    distances, voters = np.empty(neighbours), np.empty(neighbours, np.int64)
-    for q in range(len(queries)):
-        distances[:] = np.inf
-        for n in range(len(points)):
-            if group_of[n] != groups[q]:
-                continue
-            x, y, z = points[n, 0] - queries[q, 0], points[n, 1] - queries[q, 1], points[n, 2] - queries[q, 2]
-            square = x * x + y * y + z * z
-            if square >= distances[neighbours - 1]:
-                continue
-            place = neighbours - 1
-            while place > 0 and distances[place - 1] > square:
-                distances[place], voters[place] = distances[place - 1], voters[place - 1]
-                place -= 1
-            distances[place], voters[place] = square, n
-        count = 0
-        for place in range(neighbours):
-            count += 1 if moving[voters[place]] else 0
-        votes[q] = count
+    order = np.argsort(group_of, kind="stable")
+    first = np.searchsorted(group_of[order], np.arange(int(group_of.max(initial=0)) + 2))
+    by_axis, moves, votes = np.ascontiguousarray(points[order].T), moving[order], np.empty(len(queries), np.int64)
+    run_bands(
+        lambda start, stop: _count_votes(start, stop, queries, groups, by_axis, first, moves, neighbours, votes),
+        bands(len(queries), VOTED),
+    )
     return votes
+
+
+@kernel
+def _count_votes(start, stop, queries, groups, points, first, moving, neighbours, votes):
+    """Votes of the queries ``start`` to ``stop``; points (3, n) are sorted by group, of which each begins at ``first``.
+
+    The voters of the query before, a neighbour in the image, give a bound of the distances of this one's.
+    """
+    squares, group = np.empty(CHUNK), -1
+    distances, voters = np.empty(neighbours), np.zeros(neighbours, np.int64)
+    for q in range(start, stop):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        bound = 0.0
+        for k in range(neighbours):
+            dx, dy, dz = points[0, voters[k]] - x, points[1, voters[k]] - y, points[2, voters[k]] - z
+            bound = max(bound, dx * dx + dy * dy + dz * dz)
+        bound = bound * (1 + 1e-9) if group == groups[q] else np.inf
+        group = groups[q]
+        distances[:] = np.inf
+        for begin in range(first[group], first[group + 1], CHUNK):
+            size, nearest = min(CHUNK, first[group + 1] - begin), np.inf
+            for n in range(size):
+                m = np.uintp(begin + n)
+                dx, dy, dz = points[0, m] - x, points[1, m] - y, points[2, m] - z
+                squares[np.uintp(n)] = dx * dx + dy * dy + dz * dz
+            for n in range(size):
+                nearest = min(nearest, squares[np.uintp(n)])
+            if nearest > bound:
+                continue
+            for n in range(size):
+                square, place = squares[n], neighbours - 1
+                if square > bound or square >= distances[place]:
+                    continue
+                while place > 0 and distances[place - 1] > square:
+                    distances[place], voters[place] = distances[place - 1], voters[place - 1]
+                    place -= 1
+                distances[place], voters[place] = square, begin + n
+        count = 0
+        for k in range(neighbours):
+            count += 1 if moving[voters[k]] else 0
+        votes[q] = count

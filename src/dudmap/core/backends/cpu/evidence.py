@@ -1,4 +1,4 @@
-"""Evidence of motion at single pixels: normalised residuals, log odds, and free space that single frames have seen.
+"""Evidence of motion at single pixels, in two compiled calls: what residuals are usual, and which pixels move.
 
 The formulas stand first: arithmetic on numbers or images.
 """
@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import reading_sigma
-from dudmap.core.backends.cpu import labeling
+from dudmap.core.backends.cpu.labeling import fit_mixture, grow_regions, mean_field, opened
 from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
-from dudmap.core.backends.cpu.segmentation import SegmentImage, SegmentSums, segment_sums
-from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN, MapSample, single
+from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
+from dudmap.core.backends.threads import exact, exact_scalar
 
 BINS = 128
 """Bins of the histogram of normalised residuals."""
@@ -21,41 +20,13 @@ MAX_RESIDUAL = 16.0
 """Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
 EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
 """Edges of the bins."""
+CENTERS = (EDGES[:-1] + EDGES[1:]) / 2
+"""Middles of the bins."""
 LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
 """Residual that larger ones are counted as."""
 BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
 """Bins per standard deviation of a reading."""
-LEAST_SHARE = np.float32(1e-3)
-"""Least share of the pixels of a window that are compared: keeps a quotient finite."""
-
-
-class ResidualCounts(NamedTuple):
-    """Statistics of an image compared with the map.
-
-    Attributes:
-        histogram: (BINS,) int64 counts of the normalised residuals at the surfaces of the map.
-        unknown: Share of the readings that lie in space unknown to the map.
-    """
-
-    histogram: NDArray[np.int64]
-    unknown: float
-
-
-class EvidenceParameters(NamedTuple):
-    """Log odds static : dynamic of a normalised residual r are offset + slope r^2, bounded.
-
-    Attributes:
-        offset, slope: Coefficients, as of ``Mixture.coefficients``.
-        limit: Log odds of a pixel that is certain.
-        noise_floor: Least distance to the map that can be motion, metres.
-        noise_sigmas: The same, standard deviations of the distance.
-    """
-
-    offset: float
-    slope: float
-    limit: float
-    noise_floor: float
-    noise_sigmas: float
+ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class NoiseParameters(NamedTuple):
@@ -67,8 +38,6 @@ class NoiseParameters(NamedTuple):
         edge_sigmas, edge_slope: Largest depth step to a neighbour of the same surface: standard deviations, and a share
             of the depth.
         floor, sigmas: As of ``noise_limit``.
-        gap: Largest depth difference of two readings of one point, as a multiple of ``noise_limit``.
-        least_sigma: Least standard deviation in comparisons by segment, metres.
     """
 
     base: float
@@ -78,116 +47,171 @@ class NoiseParameters(NamedTuple):
     edge_slope: float
     floor: float
     sigmas: float
-    gap: float
-    least_sigma: float
 
 
-class ReadingNoise(NamedTuple):
-    """Noise of the readings of an image, metres.
+class MixtureRules(NamedTuple):
+    """Arguments of ``labeling.fit_mixture``."""
+
+    iterations: int
+    start: tuple[float, float, float]
+    prior_bounds: tuple[float, float]
+    static_bounds: tuple[float, float]
+    separation: float
+
+
+class RegionRules(NamedTuple):
+    """How regions of moving pixels form.
 
     Attributes:
-        sigma: (h, w) float32, standard deviation of the distance of a static point.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface.
-        gap: (h, w) float32, largest depth difference of two readings of one point.
-        bounded_sigma: (h, w) float32, ``sigma`` where it is at least ``least_sigma``, else that.
+        limit: Log odds of a pixel that is certain.
+        coupling, sweeps: As of ``labeling.mean_field``.
+        half_seam: Half width of the seams that are no seeds, pixels.
+        min_area: Fewest pixels of a region.
+        seeded_share: Least share of seeds in a region.
+        free_space: Whether a pixel in space that the map knows to be free is certain to move.
+        regions: Whether regions grow from seeds; else every pixel is decided alone.
     """
 
-    sigma: NDArray[np.float32]
-    tolerance: NDArray[np.float32]
-    gap: NDArray[np.float32]
-    bounded_sigma: NDArray[np.float32]
+    limit: float
+    coupling: float
+    sweeps: int
+    half_seam: int
+    min_area: float
+    seeded_share: float
+    free_space: bool
+    regions: bool
 
 
+@exact_scalar
 def static_sigma(z: Any, base: Any, scale: Any, map_variance: Any) -> Any:
-    """Standard deviation of the distance of a static point at depth z, metres: of the reading and of the map."""
-    sigma = reading_sigma(z, base, scale)
+    """Standard deviation of the distance of a static point at depth z, metres: of the reading (``reading_sigma``) and
+    of the map."""
+    sigma = base + scale * (z * z)
     return np.sqrt(sigma * sigma + map_variance)
 
 
+@exact_scalar
 def edge_tolerance(sigma: Any, z: Any, edge_sigmas: Any, edge_slope: Any) -> Any:
     """Largest depth step to a neighbour of the same surface, metres."""
     return edge_sigmas * sigma + edge_slope * z
 
 
-def residual_bin(distance: Any, sigma: Any) -> Any:
-    """Bin of the histogram for a distance to the map with this standard deviation, both in metres."""
-    return np.int64(np.minimum(abs(distance) / sigma, LARGEST) * BINS_PER_SIGMA)
-
-
+@exact_scalar
 def mixture_log_odds(square: Any, offset: Any, slope: Any) -> Any:
     """Log odds static : dynamic of a squared normalised residual: of two half-normal densities (thesis eq. 4.56)."""
     return np.float32(offset + square * slope)
 
 
+@exact_scalar
 def noise_limit(sigma: Any, floor: Any, sigmas: Any) -> Any:
     """Distance to the map below which nothing is called motion (theta in eq. 4.57), metres."""
     return np.maximum(floor, sigmas * sigma)
 
 
-def surface_log_odds(
-    distance: Any,
-    sigma: Any,
-    noise: Any,
-    offset: Any,
-    slope: Any,
-    limit: Any,
-) -> Any:
+@exact_scalar
+def surface_log_odds(distance, sigma, noise, offset, slope, limit):
     """Log odds static : dynamic at a surface of the map, at least 1 within the noise (eq. 4.57).
 
     Args:
         distance, sigma: Distance to the map and its standard deviation, metres.
         noise: Distance below which nothing is called motion, metres.
-        offset, slope, limit: As of ``EvidenceParameters``.
+        offset, slope: Of ``mixture_log_odds``.
+        limit: Log odds of a pixel that is certain.
     """
     residual = abs(distance) / sigma
-    odds = mixture_log_odds(residual * residual, offset, slope)
-    odds = np.minimum(np.maximum(odds, -limit), limit)
-    return np.where(abs(distance) < noise, np.maximum(odds, np.float32(1)), odds)
+    odds = min(max(mixture_log_odds(residual * residual, offset, slope), -limit), limit)
+    return max(odds, ONE) if abs(distance) < noise else odds
 
 
-def reading_noise(depth: NDArray[np.float32], parameters: NoiseParameters) -> ReadingNoise:
-    """Noise of the readings of an image (h, w), metres, 0 = none."""
-    p = single(parameters)
-    sigma = static_sigma(depth, p.base, p.scale, p.map_variance)
-    gap = p.gap * noise_limit(sigma, p.floor, p.sigmas)
-    tolerance = edge_tolerance(sigma, depth, p.edge_sigmas, p.edge_slope)
-    return ReadingNoise(sigma, tolerance, gap, np.maximum(p.least_sigma, sigma))
-
-
-def residual_counts(sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> ResidualCounts:
-    """Histogram of the normalised residuals of an image at the surfaces of the map; arguments as of ``log_odds``,
-    and the depth (h, w) in metres, 0 = none."""
-    surface, valid = sample.occupancy == SURFACE, depth > 0
-    histogram = np.bincount(residual_bin(sample.distance[surface], sigma[surface]), minlength=BINS)
-    unknown = np.count_nonzero((sample.occupancy == UNKNOWN) & valid) / max(np.count_nonzero(valid), 1)
-    return ResidualCounts(histogram, unknown)
-
-
-def log_odds(
-    sample: MapSample,
-    sigma: NDArray[np.float32],
-    parameters: EvidenceParameters,
-    free_space: bool,
-    seen_free: NDArray[np.bool_] | None,
-) -> NDArray[np.float32]:
-    """Log odds static : dynamic (h, w) float32 of each pixel alone, 0 = unknown (eq. 4.56, 4.57).
+@exact
+def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tolerance, histogram):
+    """Noise of the readings of an image, and the mixture of their residuals.
 
     Args:
-        sample: The map at the points of the image.
-        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        parameters: Of the log odds at surfaces of the map.
-        free_space: Whether a pixel in space that the map knows to be free is certain to move.
-        seen_free: (h, w) bool, other pixels that then are, as of ``free_space``; None = none.
+        depth: (h, w) float32, metres, 0 = none.
+        distance, occupancy: (h, w) of the map at the points of the image, see ``MapSample``.
+        noise: NoiseParameters, all float32.
+        rules: MixtureRules.
+        centers: (BINS,) float64, middles of the bins of the histogram.
+        sigma: (h, w) float32 out, standard deviation of the distance of a static point, metres.
+        tolerance: (h, w) float32 out, largest depth step to a neighbour of the same surface, metres.
+        histogram: (BINS,) int64 out, counts of the normalised residuals at the surfaces of the map; 0 before.
+
+    Returns:
+        Share of the readings in space unknown to the map; prior of the dynamic density, standard deviations of the
+        static and of the dynamic one.
     """
-    p = parameters
-    noise = noise_limit(sigma, np.float32(p.noise_floor), np.float32(p.noise_sigmas))
-    limit = np.float32(p.limit)
-    odds = surface_log_odds(sample.distance, sigma, noise, np.float64(p.offset), np.float32(p.slope), limit)
-    odds[sample.occupancy != SURFACE] = 0  # NaN before
-    if free_space:
-        free = sample.occupancy == FREE
-        odds[free if seen_free is None else free | seen_free] = -limit
-    return odds
+    h, w = depth.shape
+    readings, unknown = 0, 0
+    for v in range(h):
+        for u in range(w):
+            z = depth[v, u]
+            s = static_sigma(z, noise.base, noise.scale, noise.map_variance)
+            sigma[v, u], tolerance[v, u] = s, edge_tolerance(s, z, noise.edge_sigmas, noise.edge_slope)
+            readings += z > ZERO
+            unknown += (z > ZERO) & (occupancy[v, u] == UNKNOWN)
+            if occupancy[v, u] == SURFACE:
+                histogram[np.int64(min(abs(distance[v, u]) / s, LARGEST) * BINS_PER_SIGMA)] += 1
+    mixture = fit_mixture(
+        histogram.astype(np.float64), centers, rules.iterations, rules.start, rules.prior_bounds, rules.static_bounds,
+        rules.separation, MAX_RESIDUAL,
+    )  # fmt: skip
+    return unknown / max(readings, 1), mixture
+
+
+@exact
+def moving_pixels(
+    depth, distance, occupancy, sigma, tolerance, seen_free, offset, slope, noise, rules, dynamic, seeds, probability
+):  # fmt: skip
+    """Pixels that move by themselves, or in regions that grow from them over the surface.
+
+    1. Log odds static : dynamic of each pixel alone, 0 = unknown (eq. 4.56, 4.57), and their mean field.
+    2. Seeds are the dynamic pixels but for thin seams along depth edges, and those in free space.
+    3. Regions grow from seeds up to depth edges and pixels whose own log odds are 1; small ones and those of few seeds
+       do not move.
+
+    Args:
+        depth, distance, occupancy, sigma, tolerance: As of ``weigh_readings``.
+        seen_free: (h, w) bool, pixels in space that single frames have seen to be free; of size 0 for none.
+        offset, slope: Float64 and float32, as of ``Mixture.coefficients``.
+        noise: NoiseParameters, all float32.
+        rules: RegionRules.
+        dynamic, seeds: (h, w) bool out; ``seeds`` only where regions grow.
+        probability: (h, w) float32 out, static probability of the mean field.
+    """
+    h, w = depth.shape
+    limit, seen = np.float32(rules.limit), seen_free.size > 0
+    odds = np.zeros((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            if occupancy[v, u] == SURFACE:
+                s = sigma[v, u]
+                least = noise_limit(s, noise.floor, noise.sigmas)
+                odds[v, u] = surface_log_odds(distance[v, u], s, least, offset, slope, limit)
+            if rules.free_space and (occupancy[v, u] == FREE or (seen and seen_free[v, u])):
+                odds[v, u] = -limit
+    probability[:] = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
+    for v in range(h):
+        for u in range(w):
+            dynamic[v, u] = probability[v, u] < np.float32(0.5) and depth[v, u] > ZERO
+    if not rules.regions:
+        return
+    seeds[:] = opened(dynamic, rules.half_seam)
+    open_pixels = np.empty((h, w), np.bool_)
+    for v in range(h):
+        for u in range(w):
+            seeds[v, u] = seeds[v, u] or (dynamic[v, u] and occupancy[v, u] == FREE)
+            open_pixels[v, u] = odds[v, u] < ONE
+    regions, count = grow_regions(seeds, open_pixels, depth, tolerance)
+    area, seeded = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
+    for v in range(h):
+        for u in range(w):
+            area[regions[v, u]] += 1
+            seeded[regions[v, u]] += seeds[v, u]
+    for v in range(h):
+        for u in range(w):
+            n = regions[v, u]
+            dynamic[v, u] = n > 0 and area[n] >= rules.min_area and seeded[n] >= rules.seeded_share * area[n]
 
 
 def free_space(
@@ -217,31 +241,6 @@ def free_space(
     return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
-def moving_regions(
-    seeds: NDArray[np.bool_],
-    log_odds: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    tolerance: NDArray[np.float32],
-    min_area: float,
-    seeded_share: float,
-) -> NDArray[np.bool_]:
-    """Pixels (h, w) bool of regions that grow from seeds over the surface, up to depth edges and static pixels.
-
-    Args:
-        seeds: (h, w) bool, pixels with a reading.
-        log_odds: (h, w) float32 of each pixel alone; a pixel is static from 1 on.
-        depth, tolerance: As of ``labeling.mean_field``.
-        min_area: Fewest pixels of a region.
-        seeded_share: Least share of seeds in a region.
-    """
-    labels, count = labeling.grow_regions(seeds, log_odds < 1, depth, tolerance)
-    areas = np.bincount(labels.reshape(-1), minlength=count + 1)
-    seeded = np.bincount(labels[seeds], minlength=count + 1)
-    dynamic = (areas >= min_area) & (seeded >= seeded_share * areas)
-    dynamic[0] = False
-    return dynamic[labels]
-
-
 def seen_marked(
     depth: NDArray[np.float32],
     intensity: NDArray[np.float32],
@@ -259,78 +258,3 @@ def seen_marked(
     """
     ((gap, _, marks),) = reproject(depth, intensity, intrinsics, [target])
     return (marks > 0) & (np.abs(gap) < max_gap)
-
-
-def segment_counts(
-    labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
-) -> list[NDArray[np.int64]]:
-    """Pixels (count + 1,) of each segment, and for each mask (h, w) those that lie in it.
-
-    Args:
-        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
-        count: Number of segments.
-        masks: Any number.
-    """
-    members = labels.reshape(-1), *(labels[mask] for mask in masks)
-    return [np.bincount(found, minlength=count + 1) for found in members]
-
-
-def compare_segments(
-    sample: MapSample,
-    segments: SegmentImage,
-    started: NDArray[np.bool_],
-    dynamic: NDArray[np.bool_],
-    intensity: NDArray[np.float32],
-    exposure: tuple[float, float],
-) -> tuple[NDArray[np.bool_], SegmentSums]:
-    """Dynamic pixels (h, w) bool, without those in unknown space whose segment has not started to move, and sums
-    over the segments, of a frame compared with the map.
-
-    Args:
-        sample: The map at the points of the image.
-        segments: The segments of the image.
-        started: (count + 1,) bool, segments that have started.
-        dynamic: (h, w) bool.
-        intensity: (h, w) float32.
-        exposure: Gain and offset that make the image's intensities those of the map.
-    """
-    surface, known = sample.occupancy == SURFACE, sample.occupancy != UNKNOWN
-    dynamic = dynamic & (known | started[segments.labels])
-    gain, offset = exposure
-    correction = np.float32(1 - gain) * intensity - np.float32(offset)
-    difference = np.asarray(sample.difference + correction, np.float32)
-    difference[np.isnan(difference)] = 0  # in the air
-    return dynamic, smoothed_segment_sums(segments, surface, dynamic, sample.distance, difference)
-
-
-def compare_with_frame(
-    depth: NDArray[np.float32],
-    intensity: NDArray[np.float32],
-    intrinsics: NDArray[np.float32],
-    target: ReprojectionTarget,
-    segments: SegmentImage,
-    max_sigmas: float,
-) -> SegmentSums:
-    """Sums over the segments of a frame compared with an older one, in which points move that are off by more than
-    ``max_sigmas``; other arguments as of ``seen_marked`` and ``compare_segments``."""
-    ((gap, difference, _),) = reproject(depth, intensity, intrinsics, [target])
-    compared = ~np.isnan(gap)
-    displaced = np.abs(gap) > max_sigmas * segments.sigma  # not where it is NaN
-    return smoothed_segment_sums(segments, compared, displaced, gap, difference)
-
-
-def smoothed_segment_sums(
-    segments: SegmentImage,
-    compared: NDArray[np.bool_],
-    moving: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    difference: NDArray[np.float32],
-) -> SegmentSums:
-    """Sums over segments, as of ``segment_sums``, with the mean difference over the pixels of a window that are
-    compared."""
-    import cv2
-
-    size = segments.window, segments.window
-    ones = cv2.blur(compared.astype(np.float32), size)
-    mean = cv2.blur(np.where(compared, difference, np.float32(0)), size) / np.maximum(ones, LEAST_SHARE)
-    return segment_sums(segments, compared, moving, distance, np.asarray(mean, np.float32))

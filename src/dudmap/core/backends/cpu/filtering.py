@@ -5,8 +5,10 @@ wrap-around test, and with it the vectorisation (measured: a factor 4).
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import kernel, scalar, written_out
+from dudmap.core.backends.parameters import FilterParameters
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar, written_out
 
 f32 = np.float32
 ABSENT = np.float32(-1e9)
@@ -17,6 +19,8 @@ LONGEST_RUN = 3
 """Longest run of missing pixels, in the row or the column, of a small hole."""
 MIN_NEIGHBOURS = 8
 """Readings that the 5x5 neighbourhood of a filled pixel must hold."""
+FILTER_ROWS = 120
+"""Image rows of one band of the filter."""
 
 
 @kernel
@@ -281,3 +285,45 @@ def halve_depth(row_start, row_stop, depth, band, out):
             k = np.uintp(2 * u)
             j = np.uintp(2 * u + 1)
             target[u] = foreground_mean(upper[k], upper[j], lower[k], lower[j], band)
+
+
+def filter_depth(depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
+    """Depth (H, W) in metres, limited, with small holes filled and smoothed (thesis section 4.3).
+
+    Args:
+        depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
+        parameters: Limits and filter.
+    """
+    p, (height, width), ranges = parameters, depth.shape, bands(depth.shape[0], FILTER_ROWS)
+    alpha, hole_noise, steepest = np.float32(p.alpha), np.float32(p.hole_noise), np.float32(p.steepest)
+    out = np.empty_like(depth)
+    limit_depth(depth, np.float32(p.depth_min), np.float32(p.depth_max), out)
+    if p.drop_mixed:
+        limited, out = out, np.empty_like(depth)
+        run_bands(lambda start, stop: drop_mixed(start, stop, limited, alpha, hole_noise, steepest, out), ranges)
+    if p.fill_holes:
+        holed, out = out, np.empty_like(depth)
+        run_bands(lambda start, stop: fill_holes(start, stop, holed, alpha, hole_noise, out), ranges)
+    if p.smooth:
+        padded, weights = np.full((height + 2 * p.radius, width + 2 * p.radius), OUTSIDE), p.spatial_weights
+        pad(0, height, out, p.radius, padded)
+        run_bands(lambda start, stop: bilateral(start, stop, padded, alpha, weights, out), ranges)
+    return out
+
+
+def intensity(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Intensities (H, W) in [0, 1] of colours (H, W, 3)."""
+    out = np.empty(rgb.shape[:2], dtype=np.float32)
+    intensities(0, rgb.shape[0], rgb, out)
+    return out
+
+
+def halve(
+    depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
+    ``max(tolerance, tolerance z)`` behind the nearest one z."""
+    small_depth, small_intensity = np.empty((2, depth.shape[0] // 2, depth.shape[1] // 2), dtype=np.float32)
+    halve_depth(0, len(small_depth), depth, np.float32(tolerance), small_depth)
+    halve_intensity(0, len(small_intensity), intensity, small_intensity)
+    return small_depth, small_intensity

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import sigma
 from dudmap.core.formulas.residual import weigh
 
@@ -14,7 +14,7 @@ NUM_SUMS = 3 + 2 * NUM_MOMENTS
 """
 
 
-@kernel
+@scalar
 def noise_sums(
     stride, depth, residuals, weights, intrinsics, parameters, filter_px, scale_px, voxel_size, interpolated, steepest,
     sums,
@@ -72,7 +72,7 @@ def noise_sums(
                 sums[n + 9] += share * z * z
 
 
-@kernel
+@scalar
 def isotropic(moments, R, share, regular, out):
     """Sum of w J' J with J = [I, -hat(p)] over points turned by a rotation, of which ``noise_sums`` gave the moments.
 
@@ -106,3 +106,27 @@ def isotropic(moments, R, share, regular, out):
         out[i, i] *= 1 + regular
         for j in range(6):
             out[i, j] *= share
+
+
+@kernel
+def noise_information(
+    stride, depth, residuals, weights, intrinsics, parameters, numbers, R, of_intensity, regular, sums, out
+):  # fmt: skip
+    """Sums of ``noise_sums``, and the information (2, 6, 6) that the noise of distances and of intensities adds to H.
+
+    Args:
+        stride, depth, residuals, weights, intrinsics, parameters, sums: As for ``noise_sums``.
+        numbers: Its other arguments.
+        R: (3, 3) float64, camera to world.
+        of_intensity: Variance of a component of the gradient of intensities.
+        regular: As for ``isotropic``.
+        out: (2, 6, 6) float64 out.
+    """
+    filter_px, scale_px, voxel_size, interpolated, steepest = numbers
+    noise_sums(
+        stride, depth, residuals, weights, intrinsics, parameters, filter_px, scale_px, voxel_size, interpolated,
+        steepest, sums,
+    )  # fmt: skip
+    for term in range(2):
+        share = stride * stride * (1.0 if term == 0 else of_intensity)
+        isotropic(sums[3 + NUM_MOMENTS * term : 3 + NUM_MOMENTS * (term + 1)], R, share, regular, out[term])

@@ -88,7 +88,7 @@ def depth_cost(z, z_low):
     return abs(z_low - z) if (z > zero) == (z_low > zero) else MISSING_COST
 
 
-@kernel
+@scalar
 def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds, separation, max_sigma):
     """Expectation maximisation of two half-normal densities on a histogram (thesis eq. 4.52-4.56).
 
@@ -129,7 +129,7 @@ def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds,
     return prior, static, dynamic
 
 
-@kernel
+@scalar
 def grow_regions(seeds, open_pixels, depth, tolerance):
     """Flood fill from seeds over open pixels that does not cross depth edges.
 
@@ -172,7 +172,7 @@ def grow_regions(seeds, open_pixels, depth, tolerance):
     return labels, count
 
 
-@kernel
+@scalar
 def mean_field(evidence, depth, tolerance, coupling, iterations):
     """Static probabilities with neighbourhood consistency (cliques of thesis algorithm 3), by mean-field iteration.
 
@@ -246,6 +246,36 @@ def upsample_labels(
         bands(depth.shape[0], UPSAMPLING_BAND),
     )
     return out.view(np.bool_)
+
+
+@scalar
+def opened(mask, half):
+    """Mask (h, w) bool without parts narrower than a square of 2 ``half`` + 1 pixels: eroded, then dilated by it.
+
+    What lies outside of the image neither erodes nor dilates.
+    """
+    h, w = mask.shape
+    across, out = np.empty((h, w), np.bool_), mask.copy()
+    for turn in range(2):  # the pixels outside are dilated, then those inside
+        for v in range(h):
+            for u in range(w):
+                across[v, u] = out[v, u] == (turn == 1)
+            for k in range(1, half + 1):
+                for u in range(w - k):
+                    n = np.uintp(u + k)
+                    across[v, u] |= out[v, n] == (turn == 1)
+                    across[v, n] |= out[v, u] == (turn == 1)
+        for v in range(h):
+            first, last = max(v - half, 0), min(v + half, h - 1)
+            for u in range(w):
+                out[v, u] = across[first, u]
+            for n in range(first + 1, last + 1):
+                for u in range(w):
+                    out[v, u] |= across[n, u]
+            if turn == 0:
+                for u in range(w):
+                    out[v, u] = not out[v, u]
+    return out
 
 
 @kernel

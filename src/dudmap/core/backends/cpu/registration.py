@@ -12,7 +12,7 @@ from dudmap.core.backends.cpu.gathers import LANES
 from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
 from dudmap.core.backends.cpu.vectors import wide_vectors
-from dudmap.core.backends.parameters import ImageStack, NormalEquations, to_lattice
+from dudmap.core.backends.parameters import BLOCK, ImageStack, NormalEquations
 from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.damping import damped_step, judged, moved
 from dudmap.core.formulas.pixel import elements, rotate
@@ -30,7 +30,14 @@ SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 COST = 27
 """Index of the cost among the sums."""
 
-_to_lattice = scalar(to_lattice)
+
+@scalar
+def write_lattice(T, voxel_size, origin, out):
+    """Write ``to_lattice`` of a pose (4, 4), element by element: the assignment of an array compiles for a second."""
+    for i in range(3):
+        for j in range(4):
+            shift = np.float64(origin[i] * BLOCK) if j == 3 else np.float64(0)
+            out[i, j] = np.float32(T[i, j] / voxel_size - shift)
 
 
 @scalar
@@ -244,7 +251,7 @@ def descend(
                 if length < rules.stop:  # too short to need another linearisation
                     T, settled = T_trial, True
                     break
-            poses[count] = _to_lattice(T_trial, voxel_size, origin)
+            write_lattice(T_trial, voxel_size, origin, poses[count])
             buffers[count] = 1 if kept == 0 else 0
             announce(team, count)
             band, number = take(team, num_bands)

@@ -65,7 +65,7 @@ def reproject(
         reproject_difference(depth, intensity, intrinsics, T, target.depth, target.intensity, target.marks, *out)
         return out
 
-    return run_bands(reproject_into, bands(len(targets), 1))
+    return [reproject_into(0, 1)] if len(targets) == 1 else run_bands(reproject_into, bands(len(targets), 1))
 
 
 @kernel

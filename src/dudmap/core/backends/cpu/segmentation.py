@@ -1,9 +1,7 @@
-"""Surface segmentation of a depth image, and sums over segments.
+"""Surface segmentation of a depth image.
 
 The segments are cut along depth edges and along concave edges. The scalar formulas stand in functions of their own.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,47 +11,6 @@ from dudmap.core.backends.threads import kernel, scalar
 PLANE_STEP = np.float32(0.35)
 """Largest distance of a pixel from the plane through its neighbour in the same segment, as a share of the largest
 depth step."""
-
-
-class SegmentSums(NamedTuple):
-    """Sums over the pixels of each segment, all (count + 1,) float64; entry 0 is meaningless.
-
-    A pixel is compared where its distance to the map is known, and static where it is compared and not moving.
-
-    Attributes:
-        pixels, compared, moving, static: Numbers of pixels.
-        distance: Sum of distance / sigma over the static pixels.
-        difference: Sum of the intensity difference over the static pixels.
-        gradient: Sum of the intensity gradient over the static pixels.
-        deviation: Sum over the static pixels of the absolute deviation of the difference from its mean over them.
-    """
-
-    pixels: NDArray[np.float64]
-    compared: NDArray[np.float64]
-    moving: NDArray[np.float64]
-    static: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    difference: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-
-
-class SegmentImage(NamedTuple):
-    """The segments of an image, and what residuals within them are compared with.
-
-    Attributes:
-        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
-        count: Number of segments.
-        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        gradient: (h, w) float32, magnitude of the intensity gradient.
-        window: Side of the window over which differences of intensities are averaged, pixels, odd.
-    """
-
-    labels: NDArray[np.int32]
-    count: int
-    sigma: NDArray[np.float32]
-    gradient: NDArray[np.float32]
-    window: int
 
 
 def segment_surface(
@@ -83,28 +40,6 @@ def segment_surface(
     concave_edges(depth, intrinsics, tolerance, reach, normal_reach, np.float32(sine), normals, edge)
     count = connected_segments(depth, intrinsics, tolerance, normals, edge, labels, reach + 1)
     return labels, count
-
-
-def segment_sums(
-    segments: SegmentImage,
-    compared: NDArray[np.bool_],
-    moving: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    difference: NDArray[np.float32],
-) -> SegmentSums:
-    """Sums over the pixels of each segment.
-
-    Args:
-        segments: The segments.
-        compared: (h, w) bool, pixels whose distance and difference are known.
-        moving: (h, w) bool.
-        distance: (h, w) float32, metres.
-        difference: (h, w) float32, of intensities, averaged.
-    """
-    labels, count, sigma, gradient, _ = segments
-    out = np.zeros((count + 1, len(SegmentSums._fields)))
-    add_segment_sums(labels, compared, moving, distance, sigma, difference, gradient, out)
-    return SegmentSums(*out.T)
 
 
 @scalar
@@ -275,29 +210,3 @@ def connected_segments(depth, intrinsics, tolerance, normals, edge, labels, pass
             for u in range(w):
                 labels[v, u] = abs(labels[v, u])
     return count
-
-
-@kernel
-def add_segment_sums(labels, compared, moving, distance, sigma, difference, gradient, out):
-    """Loop of ``segment_sums``; out is (count + 1, 8) float64, zeros before, columns as in ``SegmentSums``."""
-    h, w = labels.shape
-    for v in range(h):
-        for u in range(w):
-            n = labels[v, u]
-            if n == 0:
-                continue
-            out[n, 0] += 1
-            if compared[v, u]:
-                out[n, 1] += 1
-            if compared[v, u] and not moving[v, u]:
-                out[n, 3] += 1
-                out[n, 4] += distance[v, u] / sigma[v, u]
-                out[n, 5] += difference[v, u]
-                out[n, 6] += gradient[v, u]
-            if moving[v, u]:
-                out[n, 2] += 1
-    for v in range(h):
-        for u in range(w):
-            n = labels[v, u]
-            if n > 0 and compared[v, u] and not moving[v, u]:
-                out[n, 7] += abs(difference[v, u] - out[n, 5] / out[n, 3])

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import warp as wp  # pyright: ignore[reportMissingImports]
 
-MODULES = tuple(
-    f"dudmap.core.backends.warp.kernels.{name}" for name in ("images", "fusion", "surface", "raycasting", "rows")
-)
+MODULES = tuple(f"dudmap.core.backends.warp.kernels.{name}" for name in ("fusion", "surface", "raycasting", "rows"))
 """Modules that hold kernels."""
 
 

@@ -21,7 +21,6 @@ from dudmap.core.backends.descent import Descent, DescentRules, descend
 from dudmap.core.backends.parameters import (
     BLOCK,
     DepthView,
-    FilterParameters,
     FreeSpace,
     FusedBlocks,
     FusionParameters,
@@ -35,14 +34,12 @@ from dudmap.core.backends.parameters import (
     to_lattice,
 )
 from dudmap.core.backends.warp import faults
-from dudmap.core.backends.warp.kernels import fusion, images, surface
+from dudmap.core.backends.warp.kernels import fusion, surface
 from dudmap.core.backends.warp.kernels import raycasting as tracing
 from dudmap.core.backends.warp.kernels.formulas import motion_of
 from dudmap.core.backends.warp.kernels.structs import Lattice, camera_of, struct
 from dudmap.core.backends.warp.memory import down, in_warp, resident, up, wrote
 
-SHARES = 0.299 / 255, 0.587 / 255, 0.114 / 255
-"""Shares of red, green and blue in the intensity."""
 GROUPS = 64
 """Partial sums that are left after the first level of a sum."""
 PER_THREAD = 8
@@ -59,44 +56,6 @@ class WarpBackend(CpuBackend):
     def __init__(self, device: str) -> None:
         super().__init__()
         self.device = device
-
-    # -- filter ------------------------------------------------------------------------------------------------------
-
-    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
-        """See ``Backend.filter``."""
-        p = parameters
-        steps: list[tuple[Any, tuple[Any, ...]]] = [(images.limit_depth, (p.depth_min, p.depth_max))]
-        with self._using():
-            if p.drop_mixed:
-                steps.append((images.drop_mixed, (p.alpha, p.hole_noise, p.steepest)))
-            if p.fill_holes:
-                steps.append((images.fill_holes, (p.alpha, p.hole_noise)))
-            if p.smooth:
-                weights = self._up(p.spatial_weights)
-                steps += [(images.bilateral_line, (p.alpha, weights, *along)) for along in ((1, 0), (0, 1))]
-            image = self._up(depth)
-            for kernel, arguments in steps:
-                out = self._empty(depth.shape)
-                self._launch(kernel, depth.shape, image, *arguments, out)
-                image = out
-            return down(image)
-
-    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """See ``Backend.intensity``."""
-        with self._using():
-            out = self._empty(rgb.shape[:2])
-            self._launch(images.intensities, rgb.shape[:2], self._up(rgb), *SHARES, out)
-            return down(out)
-
-    def halve(
-        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """See ``Backend.halve``."""
-        shape = depth.shape[0] // 2, depth.shape[1] // 2
-        with self._using():
-            out = self._empty(shape), self._empty(shape)
-            self._launch(images.halve, shape, self._up(depth), self._up(intensity), tolerance, *out)
-            return down(out[0]), down(out[1])
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.core.backends.cpu import filtering, raycasting, sampling
+from dudmap.core.backends.cpu import raycasting, sampling
 from dudmap.core.formulas import pixel, residual, voxel
 
 wp.set_module_options({"enable_backward": False})
@@ -116,7 +116,5 @@ is_occupied = warp_function(voxel.is_occupied)
 trilinear, weigh = warp_function(residual.trilinear), warp_function(residual.weigh)
 normal_terms = warp_function(residual.normal_terms)
 corner_weight = warp_function(sampling.corner_weight)
-range_weight, between = warp_function(filtering.range_weight), warp_function(filtering.between)
-foreground_mean = warp_function(filtering.foreground_mean)
 step_length, corner_gradient = warp_function(raycasting.step_length), warp_function(raycasting.corner_gradient)
 to_block_boundary = warp_function(raycasting.to_block_boundary)

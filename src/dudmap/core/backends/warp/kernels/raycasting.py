@@ -15,8 +15,7 @@ from dudmap.core.backends.warp.kernels.formulas import (
     transform,
     trilinear,
 )
-from dudmap.core.backends.warp.kernels.images import Image
-from dudmap.core.backends.warp.kernels.structs import Camera, Lattice
+from dudmap.core.backends.warp.kernels.structs import Camera, Image, Lattice
 from dudmap.core.backends.warp.kernels.surface import Corners, corners_at
 
 wp.set_module_options({"enable_backward": False})

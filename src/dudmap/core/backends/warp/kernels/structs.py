@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends import parameters
 
+Image = wp.array2d(dtype=wp.float32)
 _STRUCTS: dict[type, Any] = {}
 
 

@@ -20,8 +20,7 @@ from dudmap.core.backends.warp.kernels.formulas import (
     trilinear,
     weigh,
 )
-from dudmap.core.backends.warp.kernels.images import Image
-from dudmap.core.backends.warp.kernels.structs import Camera, Lattice, RegistrationParameters
+from dudmap.core.backends.warp.kernels.structs import Camera, Image, Lattice, RegistrationParameters
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,0 +1,319 @@
+"""Motion decided by segment: whole segments that move, and those that have stood still since an older frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.parameters import SURFACE, UNKNOWN
+from dudmap.core.backends.threads import exact, exact_scalar
+
+MAX_SHARE = 0.15
+"""Segments that cover more than this share of the readings belong to the room: they are dynamic only if nearly all of
+their pixels are."""
+MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
+"""Shares of the pixels of a segment that must be dynamic by themselves for all of it to be: with evidence that the
+others have moved as well, and without."""
+STARTED_SHARE = 0.1
+"""Share of a segment that must be seeds for its pixels in unknown space to move."""
+DISTANCE_SCALE = 1.0
+"""Mean distance to the map of a segment that has moved, standard deviations of a reading."""
+MISMATCH_SCALE = 1 / 3
+"""Intensity mismatch of a segment that has moved, pixels of motion at REFERENCE_WIDTH."""
+COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
+"""Upper quartiles of both over the static segments of a well registered frame; where the quartiles of a frame are
+larger, the scales grow in proportion."""
+GRADIENT_NOISE = 0.03
+"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH: smaller ones give no evidence."""
+SETTLED_SIGMAS = 4
+"""Distance between two readings of a point from which on it has moved in between, standard deviations."""
+LEAST_SHARE = np.float32(1e-3)
+"""Least share of the pixels of a window that are compared: keeps a quotient finite."""
+SIZE, COMPARED, DYNAMIC, DISTANCE, MISMATCH = range(5)
+"""Columns of the evidence of a segment: its pixels; the share of them that is compared, since the map (or an older
+frame) has a surface near, and the share that is dynamic by itself; of those that are compared and not dynamic, the mean
+of distance / sigma, and the intensity mismatch in pixels of motion: the mean absolute deviation D of their intensity
+difference from its mean, over their mean gradient G, damped where G is no larger than noise: D G / (G + noise)^2."""
+f64 = np.float64
+
+
+class SegmentImage(NamedTuple):
+    """The segments of an image, and what residuals within them are compared with.
+
+    Attributes:
+        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
+        count: Number of segments.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        gradient: (h, w) float32, magnitude of the intensity gradient.
+        window: Side of the window over which differences of intensities are averaged, pixels, odd.
+        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+        least_sigma: Float32, its least value here.
+    """
+
+    labels: NDArray[np.int32]
+    count: int
+    min_pixels: float
+    gradient: NDArray[np.float32]
+    window: int
+    sigma: NDArray[np.float32]
+    least_sigma: float
+
+
+@exact_scalar
+def mirrored(n, size):
+    """Index of the pixel that stands for one beyond the border of an image: 1 for -1."""
+    n = -n if n < 0 else n
+    n = 2 * size - 2 - n if n >= size else n
+    return min(max(n, 0), size - 1)
+
+
+@exact_scalar
+def window_means(compared, difference, window):
+    """Mean difference (h, w) over those pixels of a square window that are compared."""
+    h, w = compared.shape
+    half, by_area = window // 2, 1.0 / (window * window)
+    ones, sums, means = np.zeros((h, w)), np.zeros((h, w)), np.empty((h, w), np.float32)
+    one, value = np.empty(w + 2 * half), np.empty(w + 2 * half)
+    for v in range(h):
+        for u in range(-half, w + half):
+            n = mirrored(u, w)
+            one[u + half] = 1.0 if compared[v, n] else 0.0
+            value[u + half] = f64(difference[v, n]) if compared[v, n] else 0.0
+        for k in range(window):
+            for u in range(w):
+                ones[v, u] += one[np.uintp(u + k)]
+                sums[v, u] += value[np.uintp(u + k)]
+    for v in range(h):
+        one[:] = 0
+        value[:] = 0
+        for k in range(-half, half + 1):
+            n = mirrored(v + k, h)
+            for u in range(w):
+                one[np.uintp(u)] += ones[n, u]
+                value[np.uintp(u)] += sums[n, u]
+        for u in range(w):
+            share = max(np.float32(one[np.uintp(u)] * by_area), LEAST_SHARE)
+            means[v, u] = np.float32(value[np.uintp(u)] * by_area) / share
+    return means
+
+
+@exact_scalar
+def segment_evidence(segments, labels, count, compared, moving, distance, difference):
+    """Evidence of motion (count + 1, 5) of each segment; row 0 is meaningless.
+
+    Args:
+        segments: SegmentImage.
+        labels, count: Its, or other ones.
+        compared, moving: (h, w) bool.
+        distance, difference: (h, w) float32 of distances, metres, and of intensities.
+    """
+    h, w = labels.shape
+    means = window_means(compared, difference, segments.window)
+    sums, deviations, out = np.zeros((count + 1, 7)), np.zeros(count + 1), np.empty((count + 1, 5))
+    for v in range(h):
+        for u in range(w):
+            n = labels[v, u]
+            if n == 0:
+                continue
+            sums[n, 0] += 1
+            sums[n, 1] += compared[v, u]
+            sums[n, 2] += moving[v, u]
+            if compared[v, u] and not moving[v, u]:
+                sums[n, 3] += 1
+                sums[n, 4] += distance[v, u] / max(segments.least_sigma, segments.sigma[v, u])
+                sums[n, 5] += means[v, u]
+                sums[n, 6] += segments.gradient[v, u]
+    for v in range(h):
+        for u in range(w):
+            n = labels[v, u]
+            if n > 0 and compared[v, u] and not moving[v, u]:
+                deviations[n] += abs(means[v, u] - sums[n, 5] / sums[n, 3])
+    for n in range(count + 1):
+        size, static = max(sums[n, 0], 1.0), max(sums[n, 3], 1.0)
+        texture = sums[n, 6] / static
+        out[n, SIZE], out[n, COMPARED], out[n, DYNAMIC] = sums[n, 0], sums[n, 1] / size, sums[n, 2] / size
+        out[n, DISTANCE] = sums[n, 4] / static
+        out[n, MISMATCH] = deviations[n] / static * texture / ((texture + GRADIENT_NOISE) * (texture + GRADIENT_NOISE))
+    return out
+
+
+@exact_scalar
+def upper_quartile(values):
+    """75th percentile of a few values, which are sorted, linear between two of them; 0 of no values."""
+    count = len(values)
+    if count == 0:
+        return 0.0
+    for n in range(1, count):
+        value, place = values[n], n
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
+    place = 0.75 * (count - 1)
+    low = int(place)
+    below, above = values[low], values[min(low + 1, count - 1)]
+    return below + (above - below) * (place - low)
+
+
+@exact_scalar
+def classify_segments(evidence, before, min_pixels):
+    """Segments that move as a whole, (count + 1,) bool.
+
+    A segment of at least ``min_pixels`` is dynamic if
+
+    - at least NEARLY_ALL of its pixels are dynamic by themselves, or
+    - it covers at most MAX_SHARE of the readings, at least MIN_DYNAMIC of its pixels are dynamic by themselves, and
+      the mean distance s and the intensity mismatch m of its static pixels say that these have moved as well:
+
+          (s / S)^2 + (m / M)^2 >= 1,    or 1/2 where most of the segment was dynamic in the last frame,
+
+    with S = DISTANCE_SCALE and M = MISMATCH_SCALE, larger in a badly registered frame: in proportion to the upper
+    quartiles of |s| and m over the static segments of the frame, where these exceed COMMON_DISTANCE and
+    COMMON_MISMATCH.
+
+    Args:
+        evidence: (count + 1, 5) of each segment.
+        before: (count + 1,) share of the pixels that belonged to a dynamic segment in the last frame.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
+    """
+    count, readings = len(evidence) - 1, 0.0
+    distances, mismatches, static = np.empty(count), np.empty(count), 0
+    for n in range(1, count + 1):
+        readings += evidence[n, SIZE]
+        if evidence[n, SIZE] >= min_pixels and evidence[n, COMPARED] > 0.5 and evidence[n, DYNAMIC] < 0.5:
+            distances[static], mismatches[static] = abs(evidence[n, DISTANCE]), evidence[n, MISMATCH]
+            static += 1
+    distance_scale = DISTANCE_SCALE * max(1.0, upper_quartile(distances[:static]) / COMMON_DISTANCE)
+    mismatch_scale = MISMATCH_SCALE * max(1.0, upper_quartile(mismatches[:static]) / COMMON_MISMATCH)
+    moving = np.zeros(count + 1, np.bool_)
+    for n in range(1, count + 1):
+        far, unlike = evidence[n, DISTANCE] / distance_scale, evidence[n, MISMATCH] / mismatch_scale
+        moved = far * far + unlike * unlike >= (0.5 if before[n] > 0.5 else 1.0)
+        small = evidence[n, SIZE] <= MAX_SHARE * readings
+        nearly_all, some = evidence[n, DYNAMIC] >= NEARLY_ALL, evidence[n, DYNAMIC] >= MIN_DYNAMIC
+        moving[n] = evidence[n, SIZE] >= min_pixels and (nearly_all or (small and moved and some))
+    return moving
+
+
+@exact_scalar
+def counts_in(labels, count, first, second):
+    """Pixels (count + 1,) of each segment, and those of them in two masks (h, w) bool."""
+    total, ones, twos = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            n = labels[v, u]
+            total[n] += 1
+            ones[n] += first[v, u]
+            twos[n] += second[v, u]
+    return total, ones, twos
+
+
+@exact_scalar
+def split_mixed_segments(labels, count, before, total, part, min_pixels):
+    """Labels and number of the segments where those that were separate in the last frame, a dynamic and a static one,
+    stay separate.
+
+    A segment is split where each part holds at least a fifth of its pixels; a smaller part has merely come into view.
+
+    Args:
+        labels, count, min_pixels: As of ``SegmentImage``.
+        before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        total, part: (count + 1,) int64 pixels of each segment, and those that did.
+    """
+    number, first = np.zeros(count + 1, np.int32), count
+    for n in range(1, len(total)):
+        if min(part[n], total[n] - part[n]) >= max(min_pixels, 0.2 * total[n]):
+            count += 1
+            number[n] = count
+    if count > first:
+        labels = labels.copy()
+        for v in range(labels.shape[0]):
+            for u in range(labels.shape[1]):
+                if before[v, u] and number[labels[v, u]] > 0:
+                    labels[v, u] = number[labels[v, u]]
+    return labels, count
+
+
+@exact
+def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dynamic):
+    """Make dynamic what moves as a whole, and static what is new, after ``split_mixed_segments``.
+
+    1. Pixels in unknown space are dynamic only in a segment at least STARTED_SHARE of which are seeds.
+    2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
+
+    Args:
+        segments: SegmentImage.
+        before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        seeds: (h, w) bool.
+        sample: MapSample at the points of the image.
+        intensity: (h, w) float32.
+        gain, offset: Float32: (1 - gain) of the intensity is added to the differences, and ``offset`` taken off, so
+            that the image has the exposure of the map.
+        dynamic: (h, w) bool in and out.
+
+    Returns:
+        Labels and number of the segments, some of which may have been split.
+    """
+    labels, count = segments.labels, segments.count
+    total, started, part = counts_in(labels, count, seeds, before)
+    labels, count = split_mixed_segments(labels, count, before, total, part, segments.min_pixels)
+    if count > segments.count:
+        total, started, part = counts_in(labels, count, seeds, before)
+    (h, w), size = labels.shape, np.maximum(total, 1)
+    begins = started / size >= STARTED_SHARE
+    compared, difference = np.empty((h, w), np.bool_), np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            occupancy = sample.occupancy[v, u]
+            dynamic[v, u] = dynamic[v, u] and (occupancy != UNKNOWN or begins[labels[v, u]])
+            compared[v, u] = occupancy == SURFACE
+            lit = sample.difference[v, u] + (gain * intensity[v, u] - offset)
+            difference[v, u] = np.float32(0) if np.isnan(lit) else lit  # in the air
+    evidence = segment_evidence(segments, labels, count, compared, dynamic, sample.distance, difference)
+    moving = classify_segments(evidence, part / size, segments.min_pixels)
+    for v in range(h):
+        for u in range(w):
+            dynamic[v, u] = dynamic[v, u] or moving[labels[v, u]]
+    return labels, count
+
+
+@exact
+def stand_still(segments, dynamic, gap, difference, settled):
+    """Keep of the settled segments those whose dynamic part stands where it stood in an older frame.
+
+    That is where more than 0.7 of its pixels are visible, less than 0.1 of them lie off by more than SETTLED_SIGMAS,
+    the mean distance is below one sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or
+    COMMON_MISMATCH).
+
+    Args:
+        segments: SegmentImage.
+        dynamic: (h, w) bool.
+        gap, difference: (h, w) float32 to the older frame, see ``Reprojection``.
+        settled: (count + 1,) bool in and out.
+
+    Returns:
+        Whether any is left.
+    """
+    count, (h, w) = segments.count, dynamic.shape
+    parts = np.empty((h, w), np.int32)  # the dynamic part of segment n is n + count
+    compared, displaced = np.empty((h, w), np.bool_), np.empty((h, w), np.bool_)
+    for v in range(h):
+        for u in range(w):
+            parts[v, u] = segments.labels[v, u] + (count if dynamic[v, u] else 0)
+            compared[v, u] = not np.isnan(gap[v, u])
+            sigma = max(segments.least_sigma, segments.sigma[v, u])
+            displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
+    evidence = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, difference)
+    visible, mismatches, found = np.zeros(2 * count + 1, np.bool_), np.empty(2 * count + 1), 0
+    for n in range(2 * count + 1):
+        visible[n] = evidence[n, COMPARED] > 0.7 and evidence[n, SIZE] >= segments.min_pixels
+        if visible[n]:
+            mismatches[found] = evidence[n, MISMATCH]
+            found += 1
+    limit, left = 1.2 * max(COMMON_MISMATCH, upper_quartile(mismatches[:found])), False
+    for n in range(1, count + 1):
+        e = evidence[n + count]
+        still = visible[n + count] and e[DYNAMIC] < 0.1 and abs(e[DISTANCE]) < 1 and e[MISMATCH] < limit
+        settled[n] = settled[n] and still
+        left = left or settled[n]
+    return left

@@ -1,0 +1,51 @@
+"""Frames are labelled where they fit the distances of the map, not where displaced colours have drawn their pose."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dudmap import Config, Slam
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.pose_prediction import PosePrediction
+from dudmap.lab import synthetic
+
+CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+DRAWN = np.array([0.0, 0.0, 0.03, 0.02, 0.01, 0.0])
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    sequence: Any = synthetic.sequence("desk", movers=(), frames=13, noise="kinect", seed=5, camera=CAMERA)
+    slam = Slam(sequence.camera, Config().override(["dynamics.start_seconds=0"]))
+    result = [slam.process(sequence[n]) for n in range(13)][-1]
+    assert result.tracking is not None
+    return slam, slam.prepare(sequence[12]), result.tracking
+
+
+def labelled(tracked, moving=None):
+    """Share of the readings that are dynamic where a registration has ended ``DRAWN`` beside the pose."""
+    slam, view, tracking = tracked
+    T_drawn = se3.retract(tracking.T_world_camera, DRAWN)
+    prediction = PosePrediction(T_drawn, lambda: None, moving)
+    labels = slam.front_end._label(slam.reference, view, prediction, replace(tracking, T_world_camera=T_drawn))
+    return np.count_nonzero(labels.dynamic) / np.count_nonzero(view.labelled.depth)
+
+
+def test_what_fits_the_map_under_a_pose_near_the_tracked_one_is_static(tracked):
+    assert labelled(tracked) < 0.01
+
+
+def test_while_images_are_compared_the_pose_stays(tracked):
+    """A mover of the first frame is part of a young map, and the distances alone would follow it."""
+    assert labelled(tracked, moving=np.zeros(tracked[1].labelled.depth.shape, bool)) > 0.05
+
+
+def test_the_nearest_minimum_of_the_distances_is_at_the_true_pose_where_a_desk_determines_it(tracked):
+    slam, view, tracking = tracked
+    T = slam.front_end.blind_tracker.nearest(slam.reference, view.labelled, se3.retract(tracking.T_world_camera, DRAWN))
+    _, _, z, roll, pitch, _ = se3.log(T @ se3.inverse(tracking.T_world_camera))
+    assert abs(z) < 0.004
+    assert np.hypot(roll, pitch) < np.radians(0.3)
