@@ -98,6 +98,14 @@ def test_json_is_one_object_on_stdout(slam, where, monkeypatch, words):
 FAKED = {
     "warmup": (["warmup"], {"dudmap.lab.warmup.steps": lambda: [("part", lambda: None)]}),
     "merge": (["merge", "a", "b"], {"dudmap.fleet.merge.merge_runs": lambda *_: merged()}),
+    "diff": (
+        ["diff", "a", "b"],
+        {"dudmap.fleet.diff.diff_runs": lambda *_: {"notes": [], "changes": [], "counts": {}}},
+    ),
+    "benchmark changes": (
+        ["benchmark", "changes"],
+        {"dudmap.fleet.change_benchmark.measure_changes": lambda *_: ([], "")},
+    ),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
     "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
     "benchmark consistency": None,  # tests/benchmark/test_consistency.py
@@ -242,7 +250,8 @@ def test_wrong_usage_of_every_command_is_exit_code_2(words):
 
 MISSING = {
     "run": ["run", "nowhere"], "view": ["view", "nowhere"], "report": ["report", "nowhere"],
-    "merge": ["merge", "nowhere", "there"], "export": ["export", "nowhere", "--out", "a.ply"],
+    "merge": ["merge", "nowhere", "there"], "diff": ["diff", "nowhere", "there"],
+    "export": ["export", "nowhere", "--out", "a.ply"],
     "render": ["render", "nowhere", "--orbit", "--out", "a.mp4"], "clean": ["clean", "nowhere", "out"],
     "live": ["live", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
     "demo": ["demo", "--set", "no.such=1"], "synth": ["synth", "out", "--scene", "moon"],

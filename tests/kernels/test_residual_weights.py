@@ -42,7 +42,7 @@ OWNERS = {
         "config.py:sigma",
         "core/map/fusion_parameters.py:fusion_parameters",  # hands them on, as do all that follow
         "core/tracking/tracker.py:_chi_square",
-        "core/dynamics/detector.py:_noise_parameters",
+        "core/dynamics/detector.py:noise_parameters",
         "core/dynamics/detector.py:distance_sigma",
         "core/calibration/adjustment.py:__init__",
     },

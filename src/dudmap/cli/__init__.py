@@ -23,6 +23,7 @@ COMMANDS = {
     "view": "Show a run folder in the browser.",
     "report": "Write one page on a run that opens offline.",
     "merge": "Join the maps of two or more runs of one place.",
+    "diff": "Say what changed between two visits to a place.",
     "export": "Write the results of a run for another program.",
     "render": "Render the map along a camera path, as a video or a recording.",
     "clean": "Write a recording as it would have been without what moves.",

@@ -133,6 +133,30 @@ def random(
     _answer({"rows": rows}, text, out, as_json=as_json)
 
 
+@app.command()
+def changes(
+    count: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.")] = 0,
+    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
+    out: Annotated[Path, typer.Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Render pairs of visits with known changes, run on both, and measure how many `dudmap diff` finds.
+
+    A fifth of the pairs has no change, a fifth people in the second visit, and every third other light.
+    """
+    from dudmap.fleet.change_benchmark import figures, measure_changes
+
+    def told(row: dict[str, Any]) -> None:
+        hits = sum(thing["found"] is not None for thing in row["things"])
+        outcome = row.get("error") or f"{hits} of {len(row['things'])} found, {len(row['false'])} false"
+        say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
+
+    rows, text = measure_changes(seed, count, o.read_config(None, None, assignments), out, min_size, told)
+    _answer({"rows": rows, "figures": figures(rows)}, text, out, as_json=as_json)
+
+
 def _print_world(row: dict[str, Any]) -> None:
     ate = row.get("ate_rmse_m")
     figure = row.get("error") or "no ATE" if ate is None else f"{1000 * ate:.1f} mm, {row['lost']} lost"

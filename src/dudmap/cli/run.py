@@ -41,6 +41,10 @@ def run(
     save_masks: o.SaveMasksOption = True,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl)."),
+    ] = False,
     passes: o.PassesOption = 1,
     calibration: Annotated[
         str,
@@ -97,7 +101,14 @@ def run(
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         config = config.override(["sensor.self_calibration=false"])
     storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, watching.report)
+    if watch and mapped.saved is None:
+        raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
     with observers(watching) as watchers:
+        if watch and mapped.saved is not None:
+            from dudmap.core.places.saved_map import SavedMap
+            from dudmap.fleet.change_watch import ChangeWatch
+
+            watchers += (ChangeWatch(SavedMap.load(mapped.saved), watchers),)
         done = run_sequence(
             recording, config, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,

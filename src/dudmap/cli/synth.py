@@ -1,7 +1,7 @@
 """``dudmap synth``: render a synthetic recording with exact ground truth."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -73,6 +73,17 @@ def synth(
             "The names are in docs/synthetic.md; an unknown one lists them.",
         ),
     ] = None,
+    visits: Annotated[
+        int, typer.Option(min=1, max=2, help="2: two recordings of one place, with --changes between them.")
+    ] = 1,
+    changes: Annotated[
+        str,
+        typer.Option(
+            metavar="THING:KIND,...",
+            help="box, ball, bin, chair or shelf :moved, :appeared or :disappeared, door:opened, poster:recoloured; or "
+            "none. With --movers people these walk through the second visit.",
+        ),
+    ] = "none",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
@@ -80,29 +91,43 @@ def synth(
     """Render a synthetic recording with exact ground truth.
 
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
-    surface_observed.ply, scene.json and sensor_truth.json.
+    surface_observed.ply, scene.json and sensor_truth.json. With --visits 2 these are in visit-1 and visit-2, beside
+    changes.json: what each visit could see of the changes.
     """
     from dudmap.lab import synthetic
     from dudmap.lab.synthetic.faults import parse_faults
     from dudmap.lab.synthetic.folder import write_folder
 
+    options: dict[str, Any] = {"frames": max_frames, "fps": fps, "noise": noise, "camera": o.image_size(size)}
+    if visits == 2 or changes != "none":
+        from dudmap.lab.synthetic.visits import parsed_changes, write_visits
+        from dudmap.lab.synthetic.visits import visits as two_visits
+
+        if visits != 2:
+            raise typer.BadParameter("--changes lie between two visits; add --visits 2")
+        people, paths = "people" in (_names(movers) or []), (camera_path or "pan",) * 2
+        recordings, truth = two_visits(
+            parsed_changes(changes), scene=scene, seed=seed, people=people, paths=paths, sensor=sensor, **options
+        )
+        write_visits(recordings, truth, out, overwrite=overwrite)
+        kinds = [f"{change.thing} {change.kind}" for change in truth]
+        tree: dict[str, Any] = {"out": out, "frames": max_frames, "changes": kinds}
+        answer(tree, f"{out}: two visits, {', '.join(kinds) or 'nothing changed'}", as_json=as_json, quiet=quiet)
+        return
     sequence = synthetic.sequence(
         scene=scene,
         movers=_names(movers),
         camera_path=camera_path,
-        frames=max_frames,
-        fps=fps,
-        noise=noise,
         speed=speed,
         coverage=coverage,
         start_dynamic=start_dynamic,
         situation=situation,
         seed=seed,
-        camera=o.image_size(size),
         motion_blur=motion_blur,
         exposure_change=exposure_change,
         sensor=sensor,
         faults=parse_faults(fault or []),
+        **options,
     )
     import time
 

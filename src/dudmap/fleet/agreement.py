@@ -28,6 +28,9 @@ MAX_DENIED = 0.01
 """Largest share of the compared surface that free space may deny. Runs of one place have up to 0.0014 (a real desk, two
 parts of one recording) or 0 to 0.006 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12,
 floors of a building with other plants and boxes 0.006 to 0.024."""
+MAX_CHANGED = 0.5
+"""The same share of two visits between which things may have been moved. More is another
+place, or one that was emptied."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
 have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
@@ -64,17 +67,21 @@ class Agreement:
         """Whether both maps hold enough of one surface to be compared."""
         return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
 
-    def rejection_reason(self, many: bool = False) -> str:
-        """Sentence on the first check that fails, empty if the maps can be joined; ``many``: a pair among many runs."""
+    def rejection_reason(self, many: bool = False, changed: bool = False) -> str:
+        """Sentence on the first check that fails, empty if the maps can be joined.
+
+        ``many``: a pair among many runs; ``changed``: things may have been moved, painted or lit in other ways between
+        two visits, which then is no reason.
+        """
         if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
-        if self.denied > MAX_DENIED:
+        if self.denied > (MAX_CHANGED if changed else MAX_DENIED):
             return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
-        return self.color_reason(many)
+        return self.color_reason(many, 0.0 if changed else MIN_COLOR_SHARE)
 
-    def color_reason(self, many: bool) -> str:
-        """Sentence on how the colours disagree, empty if they agree."""
-        if self.color_correlation < MIN_CORRELATION or self.color_share < MIN_COLOR_SHARE:
+    def color_reason(self, many: bool, min_share: float = MIN_COLOR_SHARE) -> str:
+        """Sentence on how the colours disagree, empty if they agree, at least in a share of the cells."""
+        if self.color_correlation < MIN_CORRELATION or self.color_share < min_share:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
                 f"{self.color_share:.1%} of the common surface has the same colour"

@@ -154,8 +154,10 @@ class MapSurface:
         return cls(saved.volume, surface_points(saved.volume, positions, SURFACE_POINTS))
 
 
-def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
-    """Find the relative pose of two maps, whose voxels have one size, and decide whether they show the same place.
+def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
+    """Find the relative pose of two maps and decide whether they show the same place.
+
+    ``changed``: They are two visits, between which things may have been moved.
 
     Raises:
         MapError: A map has no surface.
@@ -164,15 +166,21 @@ def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
     if not found:
         return MapPair(None, NOT_RECOGNISED)
-    return decided(MapSurface.of(a), MapSurface.of(b), found)
+    return decided(MapSurface.of(a), MapSurface.of(b), found, changed=changed)
 
 
-def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False) -> MapPair:
+def decided(
+    a: MapSurface,
+    b: MapSurface,
+    found: Sequence[Hypothesis],
+    many: bool = False,
+    changed: bool = False,
+) -> MapPair:
     """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
     is taken. ``many``: The maps are two of many, most of which do not show one place."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a, b, hypothesis, many)
+        pair = _checked(a, b, hypothesis, many, changed)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -185,7 +193,7 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, changed: bool) -> MapPair:
     """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
@@ -198,5 +206,5 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
     checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
-    reason = checked.rejection_reason(many)
+    reason = checked.rejection_reason(many, changed)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

@@ -52,7 +52,12 @@ class SdfAlignment:
 
 
 def align_maps(
-    a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
+    a: TsdfVolume,
+    b: TsdfVolume,
+    of_a: SurfacePoints,
+    of_b: SurfacePoints,
+    T_a_b: NDArray[np.float64],
+    min_points: int = MIN_POINTS,
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
@@ -64,7 +69,7 @@ def align_maps(
     center, scale = np.zeros(3), a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
-        if len(rows.distance) < MIN_POINTS:
+        if len(rows.distance) < min_points:
             return SdfAlignment(T_a_b, False, residual, 0.0, center)
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
         weights = 1 / np.square(1 + np.square(rows.distance / scale))

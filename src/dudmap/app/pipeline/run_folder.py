@@ -40,7 +40,7 @@ LOCKED_BYTE = 1 << 20
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
     "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
-    "merge.json", "report.html",
+    "merge.json", "report.html", "changes.jsonl",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",

@@ -181,7 +181,7 @@ def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
     found = run.mesh
     about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
-    license, three, script = (_asset(name) for name in ("three.LICENSE.txt", "three.min.js", "report.js"))
+    license, three, script = (asset(name) for name in ("three.LICENSE.txt", "three.min.js", "report.js"))
     library = f"\n/* three.js\n{license}*/\n{three}"
     parts = {
         "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
@@ -199,11 +199,11 @@ def report_page(run: RunFiles) -> str:
         "config": run.config or "The run folder has no config.toml.",
         "run": Html(json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c")),
         "mesh": mesh,
-        "css": _asset("report.css"),
+        "css": asset("report.css"),
         "library": Html(library),
         "script": script,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), _asset("report.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), asset("report.html"))
 
 
 def scene_data(run: RunFiles) -> dict[str, Any]:
@@ -236,7 +236,8 @@ class ReportObserver(Thumbnails):
         write_report(out)
 
 
-def _asset(name: str) -> Html:
+def asset(name: str) -> Html:
+    """A file of the page folder, as it is."""
     return Html((files("dudmap.app.viewing") / "page" / name).read_text(encoding="utf-8"))
 
 

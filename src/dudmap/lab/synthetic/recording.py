@@ -49,6 +49,7 @@ class SyntheticSequence:
         faults: What the sensor does and its files do not say.
         timestamps: (N,) seconds.
         parameters: Arguments from which it was made.
+        renderer: Renders all solids, those of the movers last.
     """
 
     calibration = None
@@ -80,7 +81,7 @@ class SyntheticSequence:
         self._color_camera = ColorCamera(self.faults, camera, motion_blur / fps, 1 / fps)
         owned = [p for mover in movers for p in mover.primitives]
         self._owner = np.repeat(np.arange(len(movers)), [len(mover.primitives) for mover in movers])
-        self._renderer = Renderer(scene, scene.primitives + owned)
+        self.renderer = Renderer(scene, scene.primitives + owned)
         self._kept: OrderedDict[int, tuple[Frame, NDArray[np.bool_]]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -142,8 +143,15 @@ class SyntheticSequence:
         """Recording with the same camera path and sensor noise, but without movers, or without them from a time on."""
         movers = [replace(m, present=lambda t, m=m: t < since and m.present(t)) for m in self._movers]
         kept, parameters = (movers, self.parameters) if since > -np.inf else ([], self.parameters | {"movers": []})
+        return self._like(self.scene, kept, parameters)
+
+    def in_scene(self, scene: Scene) -> "SyntheticSequence":
+        """Recording with the same camera path, movers and sensor noise in another scene."""
+        return self._like(scene, self._movers, self.parameters)
+
+    def _like(self, scene: Scene, movers: list[SyntheticMover], parameters: dict[str, object]) -> "SyntheticSequence":
         return SyntheticSequence(
-            self.scene, kept, self.ground_truth, self.camera,
+            scene, movers, self.ground_truth, self.camera,
             noise=self._noise, seed=self._seed, fps=self._fps, motion_blur=self._motion_blur,
             exposure_change=self._exposure_change, faults=self.faults, parameters=parameters,
         )  # fmt: skip
@@ -185,7 +193,7 @@ class SyntheticSequence:
             if mover.settles and mover.present(end) and mover.top_speed(end - 0.5, 1.0) < MOVING_SPEED
             for primitive, T in zip(mover.primitives, mover.parts(end), strict=True)
         ]
-        return tessellate(self.scene.primitives + resting, self.scene.detail, self.scene.extent, self._renderer.atlas)
+        return tessellate(self.scene.primitives + resting, self.scene.detail, self.scene.extent, self.renderer.atlas)
 
     def _number(self, index: int) -> int:
         number = index + len(self) if index < 0 else index
@@ -286,4 +294,4 @@ class SyntheticSequence:
     def _render_at(self, t: float, T_world_camera: NDArray[np.float64], camera: Camera, with_color: bool) -> Rendering:
         Ts, present = placed(self._movers, t)
         gain = 1.0 + self._exposure_change * np.sin(2 * np.pi * t / 2.7)
-        return self._renderer.render(camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
+        return self.renderer.render(camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)

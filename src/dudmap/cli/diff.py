@@ -1,0 +1,34 @@
+"""``dudmap diff``: what changed between two visits to a place."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dudmap.cli import options as o
+from dudmap.cli.output import answer, free_folder
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def diff(
+    before: Annotated[Path, typer.Argument(help="Run folder of the first visit.", metavar="BEFORE")],
+    after: Annotated[Path, typer.Argument(help="Run folder of the second visit.", metavar="AFTER")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; default: runs/<BEFORE>-<AFTER>-changes.", metavar="FOLDER")
+    ] = None,
+    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
+) -> None:
+    """List what appeared, disappeared, moved or got other colours between two runs of one place.
+
+    Writes changes.json, changes/<id>.ply and report.html. Something changed where one visit has a surface and the other
+    saw free space, beyond noise and alignment; what only one visit saw is unknown.
+    """
+    from dudmap.fleet.diff import diff_runs, summary
+
+    folder = out or free_folder(Path("runs") / f"{before.name}-{after.name}-changes")
+    found = diff_runs(before, after, folder, min_size)
+    answer(found, f"{summary(found)}\nwritten to {folder}", as_json=as_json, quiet=quiet)

@@ -1,0 +1,204 @@
+"""Pairs of visits drawn at random, and how well their changes are found."""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.app.pipeline.run import run
+from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.errors import ConfigError, DudmapError
+from dudmap.fleet.changes import Change
+from dudmap.fleet.diff import compared
+from dudmap.lab.benchmark.measure import save
+from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.visits import TrueChange, visits
+
+SCENES = {"room": 0.5, "corridor": 0.2, "desk": 0.3}
+THINGS = {"box": 0.35, "bin": 0.15, "ball": 0.1, "chair": 0.15, "shelf": 0.08, "poster": 0.1, "door": 0.07}
+LARGE = ("chair", "shelf", "door")
+"""Things that do not fit on a desk."""
+KINDS = {"moved": 0.45, "appeared": 0.275, "disappeared": 0.275}
+PATHS = ("handheld", "pan", "orbit", "dolly")
+NONE, PEOPLE, LIGHT = 0.2, 0.2, 0.3
+"""Shares of the pairs without any change, with people in the second visit, and with other light."""
+SAME = 0.06
+"""Distance within which found and true surface are the same, metres: three voxels and the noise at 3 m."""
+LEAST_SHARE = 0.5
+"""Share of a found surface that must lie on that of a true change to be it."""
+IOU_CELL = 0.04
+"""Edge of the cells in which the found surface is compared with the true one, metres."""
+SMALL = 0.15
+"""Longest edge below which a thing counts as small, metres."""
+FRAMES, FPS, SIZE = 60, 12.0, (320, 240)
+
+
+def draw_pair(seed: int, number: int, changed: bool | None = None) -> dict[str, Any]:
+    """Arguments of ``visits`` of pair ``number`` of a seed; ``changed`` decides whether there is any change."""
+    rng = np.random.default_rng([seed, number, 33])
+
+    def one_of(shares: dict[str, float]) -> str:
+        return str(rng.choice(list(shares), p=np.array(list(shares.values())) / sum(shares.values())))
+
+    scene, none = one_of(SCENES), rng.random() < NONE
+    changes = []
+    for _ in range(int(rng.integers(1, 5))):
+        thing, kind = one_of(THINGS), one_of(KINDS)
+        while scene == "desk" and thing in LARGE:
+            thing = one_of(THINGS)
+        changes.append((thing, {"poster": "recoloured", "door": "opened"}.get(thing, kind)))
+    return {
+        "changes": changes if (not none if changed is None else changed) else [],
+        "scene": scene, "seed": int(rng.integers(1, 100_000)), "paths": tuple(str(x) for x in rng.choice(PATHS, 2)),
+        "people": bool(rng.random() < PEOPLE), "other_light": bool(rng.random() < LIGHT),
+        "frames": FRAMES, "fps": FPS, "camera": SIZE,
+    }  # fmt: skip
+
+
+def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[TrueChange]]:
+    """Recordings and true changes of a pair; things that find no free place are left out."""
+    while True:
+        try:
+            return visits(**pair)
+        except ConfigError:
+            if not pair["changes"]:
+                raise
+            pair = pair | {"changes": pair["changes"][:-1]}
+
+
+def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path) -> list[Path]:
+    """Run folders of both visits."""
+    folders = [out / "before", out / "after"]
+    for recording, folder in zip(recordings, folders, strict=True):
+        run(recording, config, folder, progress=False)
+    return folders
+
+
+def score_pair(
+    changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_before: NDArray[np.float64]
+) -> dict[str, Any]:
+    """What was found of each true change, the false changes, and how far surface and motion agree.
+
+    ``T_scene_before`` (4, 4) brings the found changes to the frame of the true ones. Things that the truth calls
+    unknown count neither as missed nor as false.
+    """
+
+    def surface(one: TrueChange | Change) -> NDArray[np.float64]:
+        if isinstance(one, TrueChange):
+            return np.concatenate([one.before, one.after])
+        parts = [piece.points for piece in (one.before, one.after) if piece is not None]
+        return np.concatenate(parts) @ T_scene_before[:3, :3].T + T_scene_before[:3, 3]
+
+    found = [change for change in changes if change.kind != "unknown"]
+    trees = [KDTree(surface(one)) if len(surface(one)) else None for one in truth]
+    owners: list[int | None] = []
+    for change in found:
+        shares = [-1.0 if t is None else float(np.mean(t.query(surface(change))[0] < SAME)) for t in trees]
+        owners.append(int(np.argmax(shares)) if shares and max(shares) >= LEAST_SHARE else None)
+    things: list[dict[str, Any]] = []
+    false: list[str] = []
+    for number, true in enumerate(truth):
+        mine = sorted(
+            (c for c, owner in zip(found, owners, strict=True) if owner == number), key=lambda c: -len(c.points)
+        )
+        false += [c.kind for c in mine[1:] if true.kind != "unknown"]
+        if true.kind == "unknown":
+            continue
+        row: dict[str, Any] = {"thing": true.thing, "kind": true.kind, "size": true.size, "found": None}
+        if mine:
+            row |= {"found": mine[0].kind, "iou": _iou(surface(mine[0]), surface(true))}
+            if mine[0].T_after_before is not None and true.kind == "moved":
+                row |= _motion_error(true, T_scene_before @ mine[0].T_after_before @ se3.inverse(T_scene_before))
+        things.append(row)
+    false += [c.kind for c, owner in zip(found, owners, strict=True) if owner is None]
+    return {"things": things, "false": false}
+
+
+def _iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Cells that two surfaces (n, 3) both reach over those that any does."""
+    cells = [{tuple(row) for row in np.floor(points / IOU_CELL).astype(int).tolist()} for points in (a, b)]
+    return len(cells[0] & cells[1]) / max(len(cells[0] | cells[1]), 1)
+
+
+def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
+    """Errors of a motion at the centre of a thing: its place, and its turn unless it is symmetric."""
+    off = T @ se3.inverse(true.T_after_before)
+    at = true.T_after_before[:3] @ np.append(true.at, 1)
+    moved = 100 * float(np.linalg.norm(off[:3, :3] @ at + off[:3, 3] - at))
+    return {"motion_cm": moved, "motion_deg": 0.0 if true.symmetric else float(np.degrees(se3.rotation_angle(off)))}
+
+
+def measure_pair(job: tuple[dict[str, Any], Config, float]) -> dict[str, Any]:
+    """Render, run and compare one pair; returns a row."""
+    pair, config, min_size = job
+    recordings, truth = rendered_pair(pair)
+    row: dict[str, Any] = {"scene": pair["scene"], "seed": pair["seed"], "people": pair["people"]}
+    with tempfile.TemporaryDirectory() as folder:
+        folders = run_pair(recordings, config, Path(folder))
+        start = time.perf_counter()
+        try:
+            changes = compared(*folders, min_size).changes
+        except DudmapError as error:
+            return row | {"error": str(error), "things": [], "false": []}
+        row["seconds"] = round(time.perf_counter() - start, 2)
+    return row | score_pair(changes, truth, recordings[0].ground_truth.Ts_world_camera[0])
+
+
+def measure_changes(
+    seed: int, count: int, config: Config, out: Path, min_size: float, done: Callable[[dict[str, Any]], None]
+) -> tuple[list[dict[str, Any]], str]:
+    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``."""
+    rows = []
+    for number in range(count):
+        row = {"pair": number} | measure_pair((draw_pair(seed, number), config, min_size))
+        rows.append(row)
+        done(row)
+    text = table(rows)
+    flat = [row | {"things": json.dumps(row["things"]), "false": " ".join(row["false"])} for row in rows]
+    save(flat, text, out, "changes", {"seed": seed, "figures": figures(rows)})
+    return rows, text
+
+
+def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Figures over all pairs."""
+    things = [thing for row in rows for thing in row["things"]]
+    large = [thing for thing in things if thing["size"] >= SMALL]
+    small = [thing for thing in things if thing["size"] < SMALL]
+    hits = [thing for thing in things if thing["found"]]
+    false = sum(len(row["false"]) for row in rows)
+
+    def share(part: float, whole: float) -> float | None:
+        return round(part / whole, 4) if whole else None
+
+    def median(key: str) -> float | None:
+        values = [thing[key] for thing in hits if key in thing]
+        return round(float(np.median(values)), 3) if values else None
+
+    def recall(part: Sequence[dict[str, Any]]) -> float | None:
+        return share(sum(thing["found"] is not None for thing in part), len(part))
+
+    out: dict[str, float | None] = {
+        "pairs": len(rows), "not_compared": sum("error" in row for row in rows), "things": len(things),
+        "recall_15cm": recall(large), "recall_small": recall(small), "precision": share(len(hits), len(hits) + false),
+        "kind_right": share(sum(thing["found"] == thing["kind"] for thing in hits), len(hits)),
+        "voxel_iou": median("iou"), "motion_cm": median("motion_cm"), "motion_deg": median("motion_deg"),
+        "unchanged_pairs": sum(not row["things"] for row in rows),
+        "false_in_unchanged": sum(len(row["false"]) for row in rows if not row["things"]),
+        "seconds": round(float(np.median([row["seconds"] for row in rows if "seconds" in row] or [0])), 2),
+    }  # fmt: skip
+    for kind in sorted({thing["kind"] for thing in things}):
+        out[f"recall_{kind}"] = recall([thing for thing in things if thing["kind"] == kind])
+    return out
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown of the figures."""
+    lines = [f"| {name} | {'-' if value is None else value} |" for name, value in figures(rows).items()]
+    return "\n".join(["| figure | value |", "|---|---:|", *lines])

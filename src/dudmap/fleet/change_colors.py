@@ -1,0 +1,84 @@
+"""Surface that stands where it stood and has other colours: a poster, a screen, a painted wall.
+
+Light changes the brightness of surface smoothly; paint changes it where light does not. So the colours of both visits
+are averaged over small cells, which leaves out what a pose that is off by a pixel does, and a gain is fitted to the
+cells around each. What then differs by more than the spread of all cells explains has other colours.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.core.map import morton
+from dudmap.fleet.change_evidence import CONFIRMED, DEVIATIONS, Evidence
+from dudmap.fleet.change_objects import Piece, connected, is_wide
+
+CELL, CELL_VOXELS = 0.05, 4
+"""Edge of the cells in which colours are averaged, metres, and in voxels at least: several pixels."""
+AROUND = 0.6
+"""Radius in which the light is taken to be even, metres; a poster fills less than half of it."""
+LEAST_POINTS, LEAST_AROUND = 6, 12
+"""Vertices of a cell whose colour is compared, and cells around it from which the light is known."""
+LEAST_DIFFERENCE = 20.0
+"""Smallest difference of the colours of a cell, grey levels, as of cells that agree when maps are joined."""
+CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0
+"""What light alone does not do: a difference of the shares of red, green and blue, or a correlation so low of textures
+with at least this standard deviation (grey levels)."""
+SOLID = 0.7
+"""Share of the surface within the extent of a change that must have other colours: highlights
+are scattered."""
+
+
+def recolored_pieces(
+    found: Evidence, voxel_size: float, min_size: float, solid: float = SOLID
+) -> list[tuple[Piece, float]]:
+    """Pieces of the own mesh with other colours, and the share of their surface that has them."""
+    known = np.flatnonzero((found.state == CONFIRMED) & (found.other_color.max(axis=1) > 0))
+    known = known[found.mesh.colors[known].max(axis=1) > 0]
+    if len(known) < LEAST_AROUND * LEAST_POINTS:
+        return []
+    points, edge = found.points[known], max(CELL, CELL_VOXELS * voxel_size)
+    _, cell, counts = np.unique(
+        morton.encode(np.floor(points / edge).astype(np.int64)), return_inverse=True, return_counts=True
+    )
+
+    def mean(values: NDArray) -> NDArray[np.float64]:
+        return np.stack([np.bincount(cell, column) for column in values.T], axis=1) / counts[:, None]
+
+    own, other, centres = mean(found.mesh.colors[known].astype(float)), mean(found.other_color[known]), mean(points)
+    use = counts >= LEAST_POINTS
+    different = np.zeros(len(use), bool)
+    different[use] = _different(centres[use], own[use], other[use])
+    chosen = np.zeros(len(found.state), bool)
+    chosen[known[different[cell]]] = True
+    out, light = [], np.median(own, axis=0) / np.maximum(np.median(other, axis=0), 1)
+    for piece in connected(found.mesh, chosen, 2 * edge):
+        low, high = piece.box
+        inside = known[np.all((points >= low) & (points <= high), axis=1)]
+        share = len(piece.vertices) / max(len(inside), 1)
+        is_large = piece.area > min_size**2 and is_wide(piece.points, min_size, min_size)
+        rows = found.mesh.colors[piece.vertices].astype(float), found.other_color[piece.vertices].astype(float)
+        if share > solid and is_large and _is_paint(*rows, light):
+            out.append((piece, float(share)))
+    return out
+
+
+def _different(centres: NDArray[np.float64], own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Cells (n,) whose colours (n, 3) differ by more than noise and light explain."""
+    logs = np.log((own + 8) / (other + 8))
+    near = KDTree(centres).query(centres, k=64, distance_upper_bound=AROUND)[1]
+    padded = np.concatenate([logs, np.full((1, 3), np.nan)])[near]
+    enough = (near < len(centres)).sum(axis=1) >= LEAST_AROUND
+    gain = np.exp(np.nanmedian(padded, axis=1))
+    difference = np.abs(own - gain * other).max(axis=1)
+    usual = 1.4826 * float(np.median(difference))
+    return enough & (difference > max(LEAST_DIFFERENCE, DEVIATIONS * usual))
+
+
+def _is_paint(own: NDArray[np.float64], other: NDArray[np.float64], light: NDArray[np.float64]) -> bool:
+    """Whether the colours (n, 3) of a piece differ as light, with gains (3,), does not make them."""
+    shares = [(colors + 8) / (colors + 8).sum(axis=1, keepdims=True) for colors in (own, other * light)]
+    if np.abs(np.median(shares[0], axis=0) - np.median(shares[1], axis=0)).max() > CHROMA:
+        return True
+    grey = own.mean(axis=1), other.mean(axis=1)
+    return bool(min(grey[0].std(), grey[1].std()) > TEXTURE and np.corrcoef(*grey)[0, 1] < CORRELATION)

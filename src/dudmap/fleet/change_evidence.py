@@ -1,0 +1,173 @@
+"""What two maps of one place say about each other's surface: confirmed, seen through, of another colour, or not seen.
+
+Every vertex of the mesh of one map is looked up in the other one. It is denied where the other map has seen free space,
+farther from its own surface than the noise of both explains: a voxel, and three standard deviations of the local noise.
+That is the larger of the sensor's at the distance of the camera, and of the distances between the two surfaces in the
+same part of the place, which hold the error of the alignment and the bending of the maps as well.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map import morton
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, MapSamples, sample_map, transformed
+
+UNKNOWN, CONFIRMED, DENIED, BEHIND = 0, 1, 2, 3
+"""State of a vertex: the other map did not see the place; has a surface there; saw free space; or has it behind one."""
+DEVIATIONS = 3.0
+"""Standard deviations that noise may reach."""
+MAX_VIEWS = 24
+"""Keyframes of a visit that are asked what they look through."""
+CELL = 0.5
+"""Edge of the cells in which the noise of the surfaces is measured, metres: the size of furniture."""
+MIN_CELL_POINTS = 50
+"""Vertices of a cell from which its own noise is taken."""
+MAX_NOISE = 2.0
+"""Largest local noise, in multiples of that of the whole place: a cell in which most of the surface moved by a little
+must not explain it away."""
+EDGE_PIXELS = 2.0
+"""Width of a depth edge in pixels, and in voxels: readings there mix both surfaces."""
+READINGS = 2
+"""Readings of emptiness, each of the carving weight, that a place needs to count as seen to be free."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The surface of one map, judged by the other.
+
+    Attributes:
+        mesh: Surface in the common frame.
+        state: (V,) uint8.
+        sdf: (V,) float32, distance to the surface of the other map, metres; NaN where it is unknown.
+        tolerance: (V,) distance that noise explains, metres.
+        blur: (V,) width of a depth edge: two pixels of the camera, two voxels at least, metres.
+        weight: (V,) float32, of the own map there.
+        min_weight: Weight that the mesh needs.
+        other_color: (V, 3) float32, colour of the other map where it confirms, else 0.
+    """
+
+    mesh: Mesh
+    state: NDArray[np.uint8]
+    sdf: NDArray[np.float32]
+    tolerance: NDArray[np.float32]
+    blur: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    min_weight: int
+    other_color: NDArray[np.float32]
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Vertices (V, 3), metres."""
+        return self.mesh.vertices.astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """A map at its place in the common frame.
+
+    Attributes:
+        volume: The map.
+        T_common_map: (4, 4).
+        mesh: Its surface in the common frame.
+        keyframes: (k, 4, 4) poses of its keyframes in the common frame.
+    """
+
+    volume: TsdfVolume
+    T_common_map: NDArray[np.float64]
+    mesh: Mesh
+    keyframes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, saved: SavedMap, T_common_map: NDArray[np.float64]) -> "Visit":
+        """A saved map at a pose (4, 4).
+
+        Raises:
+            MapError: The map is empty.
+        """
+        mesh, (R, t) = saved.volume.extract_mesh(), (T_common_map[:3, :3], T_common_map[:3, 3])
+        vertices = (mesh.vertices.astype(np.float64) @ R.T + t).astype(np.float32)
+        moved = Mesh(vertices, mesh.faces, mesh.colors, (mesh.normals @ R.T).astype(np.float32))
+        poses = np.array([T_common_map @ keyframe.T_world_camera for keyframe in saved.keyframes])
+        return cls(saved.volume, T_common_map, moved, poses)
+
+    def sample(self, points: NDArray[np.float64]) -> MapSamples:
+        """The map at points (n, 3) of the common frame."""
+        return sample_map(self.volume, transformed(se3.inverse(self.T_common_map), points))
+
+
+def evidence(own: Visit, other: Visit) -> Evidence:
+    """Judge the surface of a visit by the other one."""
+    points = own.mesh.vertices.astype(np.float64)
+    samples, band = other.sample(points), other.volume.truncation
+    sdf = np.where(samples.state == OBSERVED, samples.sdf, np.where(samples.state == EMPTY, band, np.nan))
+    near = KDTree(own.keyframes[:, :3, 3]).query(points)[0]
+    sigma = own.volume.sensor.sigma(near)
+    voxel = max(own.volume.voxel_size, other.volume.voxel_size)
+    noise = sigma * noise_share(points, sdf / sigma, band / 2 / sigma)
+    tolerance = (voxel + DEVIATIONS * noise).astype(np.float32)
+    state = np.full(len(points), UNKNOWN, np.uint8)
+    state[sdf >= -tolerance] = CONFIRMED
+    state[sdf < -tolerance] = BEHIND
+    seen = samples.weight >= READINGS * other.volume.config.carve_rate
+    away = np.flatnonzero((sdf > tolerance) | (samples.state == EMPTY) | np.isnan(sdf))
+    away = away[surface_tree(other.mesh.vertices).query(points[away], workers=-1)[0] > tolerance[away]]
+    state[away] = np.where((seen & ~np.isnan(sdf))[away], DENIED, UNKNOWN)
+    doubtful = away[state[away] == UNKNOWN]
+    state[doubtful[times_seen_through(other, points[doubtful], tolerance[doubtful]) >= READINGS]] = DENIED
+    blur = EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel).astype(np.float32)
+    color = np.where((state == CONFIRMED)[:, None], samples.color, 0)
+    weight = own.sample(points).weight
+    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color)
+
+
+def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
+    """How many keyframes (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
+
+    The map remembers free space block by block, and not where a part of a block is hidden. What a keyframe sees of the
+    map is behind space that it saw to be free, farther than a margin (n,), metres, also beside the pixel.
+    """
+    import cv2
+
+    counts, camera = np.zeros(len(points), np.int64), visit.volume.camera
+    T_map = se3.inverse(visit.T_common_map)
+    step = max(1, len(visit.keyframes) // MAX_VIEWS)
+    for T in visit.keyframes[::step] if len(points) else ():
+        depth = visit.volume.raycast(T_map @ T, camera).depth
+        nearest = cv2.erode(depth, np.ones((3, 3), np.uint8))
+        local = transformed(se3.inverse(T), points)
+        u, v = np.rint(np.nan_to_num(camera.project(local), nan=-1, posinf=-1, neginf=-1)).astype(np.int64).T
+        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        counts[inside] += nearest[v[inside], u[inside]] > (local[:, 2] + 2 * margin)[inside]
+    return counts
+
+
+def surface_tree(points: NDArray[np.floating]) -> KDTree:
+    """Tree of many points (n, 3) that are spread over surfaces, built in a third of the time of a balanced one."""
+    return KDTree(points, balanced_tree=False, compact_nodes=False)
+
+
+def noise_share(
+    points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3), in the unit of these.
+
+    It is 1.48 times the median of the absolute distances below a limit (n,) in a cell, and at least that of all.
+    """
+    near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
+    if not near.any():
+        return np.ones(len(points))
+    whole = 1.4826 * float(np.median(np.abs(distances[near])))
+    _, cell = np.unique(morton.encode(np.floor(points / CELL).astype(np.int64)), return_inverse=True)
+    values, cells = np.abs(distances[near]), cell[near]
+    order = np.lexsort((values, cells))
+    counts = np.bincount(cells, minlength=cell.max() + 1)
+    middle = np.cumsum(counts) - counts + counts // 2
+    medians = 1.4826 * values[order][np.minimum(middle, len(order) - 1)]
+    return np.where(counts >= MIN_CELL_POINTS, np.clip(medians, whole, MAX_NOISE * whole), whole)[cell]

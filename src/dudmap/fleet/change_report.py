@@ -1,0 +1,96 @@
+"""The page on what changed: both maps in 3D with the changes in colours, and each change before and after."""
+
+import base64
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import __version__
+from dudmap.app.viewing.report import POLICY, Html, asset, html, joined, packed, script_source
+from dudmap.app.viewing.snapshot import jpeg
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh_simplification import simplified
+from dudmap.fleet.change_evidence import Visit
+from dudmap.fleet.changes import Change
+
+TINTS = {
+    "appeared": (60, 200, 90), "disappeared": (230, 60, 60), "moved": (60, 130, 255), "recoloured": (220, 120, 230),
+}  # fmt: skip
+"""Colour of each kind; what is unknown keeps its own."""
+STRENGTH = 0.65
+"""Share of it in the colour of changed surface."""
+TRIANGLES = 120_000
+"""Triangles of each map in the page."""
+PICTURES = 40
+"""Changes with pictures."""
+
+
+def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:
+    """The mesh of a visit, "before" or "after", with what changed in the colour of its kind."""
+    colors = mesh.colors.astype(np.float64)
+    for change in changes:
+        piece = getattr(change, side)
+        if piece is not None and change.kind in TINTS:
+            tint = STRENGTH * np.array(TINTS[change.kind])
+            colors[piece.vertices] = (1 - STRENGTH) * colors[piece.vertices] + tint
+    return replace(mesh, colors=np.rint(colors).astype(np.uint8))
+
+
+def change_page(
+    tree: dict[str, Any], meshes: Sequence[Mesh], visits: Sequence[Visit], poses: Sequence[NDArray[np.float64] | None]
+) -> str:
+    """HTML text of the page; a change is pictured from a pose (4, 4) in the common frame, if there is one."""
+    data, texts = [], []
+    for mesh in meshes:
+        about, text = packed(simplified(mesh, TRIANGLES))
+        data.append(about)
+        texts.append(text)
+    rows = []
+    for row, pose in zip(tree["changes"], poses, strict=True):
+        known = row["kind"] in TINTS
+        pictures = _pictures(row, visits, pose) if known and pose is not None and row["id"] <= PICTURES else Html("")
+        size = " x ".join(f"{100 * (b - a):.0f}" for a, b in zip(*row["box"], strict=True))
+        moved = (
+            f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
+        )
+        text = f"{size} cm{moved}, confidence {row['confidence']:.2f}" if known else f"{row['area']:.1f} m2 seen once"
+        line = '<li data-id="{id}"><b class="{kind}">{id}. {kind}</b> <span>{text}</span>{pictures}</li>'
+        rows.append(html(line, id=row["id"], kind=row["kind"], text=text, pictures=pictures))
+    up = -np.mean([visit.keyframes[:, :3, 1].mean(axis=0) for visit in visits], axis=0)
+    first = visits[0].keyframes[0]
+    scene = {
+        "meshes": data, "up": up.round(4).tolist(), "eye": first[:3, 3].tolist(), "ahead": first[:3, 2].tolist(),
+        "changes": [{key: row[key] for key in ("id", "kind", "box")} for row in tree["changes"]],
+        "tints": {kind: int.from_bytes(bytes(tint), "big") for kind, tint in TINTS.items()},
+    }  # fmt: skip
+    library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
+    script = asset("changes.js")
+    counts = ", ".join(f"{count} {kind}" for kind, count in tree["counts"].items() if kind in TINTS)
+    parts = {
+        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
+        "version": __version__, "css": asset("report.css"), "library": Html(library), "script": script,
+        "title": f"{tree['before']} and {tree['after']}", "rows": joined(rows),
+        "verdict": "; ".join([counts or "nothing changed", *tree["notes"]]),
+        "before": texts[0], "after": texts[1],
+        "scene": Html(json.dumps(scene, allow_nan=False).replace("<", "\\u003c")),
+        "tints": Html("".join(f".{kind} {{ color: rgb{tint} }}" for kind, tint in TINTS.items())),
+    }  # fmt: skip
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), asset("changes.html"))
+
+
+def _pictures(row: dict[str, Any], visits: Sequence[Visit], T: NDArray[np.float64]) -> Html:
+    """Both maps seen from one pose."""
+    shown = []
+    for name, visit in zip(("before", "after"), visits, strict=True):
+        camera = visit.volume.camera.resized(
+            320, max(1, round(320 * visit.volume.camera.height / visit.volume.camera.width))
+        )
+        image = visit.volume.raycast(np.linalg.inv(visit.T_common_map) @ T, camera).color
+        data = "data:image/jpeg;base64," + base64.b64encode(jpeg(image.copy())).decode()
+        shown.append(html('<img src="{data}" alt="{name}" title="{name}">', data=data, name=f"{row['id']} {name}"))
+    return html('<span class="pair">{shown}</span>', shown=joined(shown))

@@ -1,0 +1,192 @@
+"""Changes against the map of an earlier visit while a run goes on in it, as soon as they are certain."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.map import morton
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.fleet.change_evidence import DEVIATIONS
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, transformed
+
+if TYPE_CHECKING:
+    from dudmap.app.pipeline.frame_source import FrameRead
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
+
+WATCH_FILE = "changes.jsonl"
+CELL = 0.05
+"""Edge of the cells in which evidence is counted, metres."""
+COLUMNS = 80
+"""Readings of a row of the image that are looked at."""
+FRAMES, SECONDS = 6, 0.5
+"""Frames that must show a change in a cell, more than show the opposite, and the time that they must span: who walks
+through does not stay that long in one cell."""
+LEAST_CELLS = 3.0
+"""Cells of a change that is reported, in multiples of the cells of a face of the smallest size."""
+KINDS = ("appeared", "disappeared")
+
+
+class _Cells:
+    """Frames for and against a change in cells, by their centres (n, 3): what free space is asked for grows as it goes.
+
+    Attributes:
+        codes: (n,) int64 Morton codes, ascending.
+        score: (n,) frames for a change, less those against it.
+        first, last: (n,) seconds.
+        reported: (n,) bool.
+    """
+
+    def __init__(self, codes: NDArray[np.int64]) -> None:
+        self.codes, n = codes, len(codes)
+        self.score, self.first, self.last = np.zeros(n, np.int32), np.zeros(n), np.zeros(n)
+        self.reported = np.zeros(n, bool)
+
+    def rows_of(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Rows of the cells of points (n, 3), which are added where they are new."""
+        codes = np.unique(morton.encode(np.floor(points / CELL).astype(np.int64)))
+        new = np.setdiff1d(codes, self.codes, assume_unique=True)
+        if len(new):
+            at = np.searchsorted(self.codes, new)
+            self.codes = np.insert(self.codes, at, new)
+            self.score, self.reported = np.insert(self.score, at, 0), np.insert(self.reported, at, False)
+            self.first, self.last = np.insert(self.first, at, 0.0), np.insert(self.last, at, 0.0)
+        return np.searchsorted(self.codes, codes)
+
+    def count(self, rows: NDArray[np.intp], gain: int, now: float) -> None:
+        """One frame for (1) or against (-1) a change in some cells."""
+        fresh = rows[self.score[rows] <= 0]
+        self.first[fresh], self.last[rows] = now, now
+        self.score[rows] = np.maximum(self.score[rows] + gain, 0)
+
+    def certain(self) -> NDArray[np.intp]:
+        """Rows of the cells that are certain and not yet reported."""
+        return np.flatnonzero((self.score >= FRAMES) & (self.last - self.first >= SECONDS) & ~self.reported)
+
+
+class ChangeWatch(RunObserver):
+    """Writes changes.jsonl into the run folder: an object per change with kind, box, centre, timestamp and frame.
+
+    One half of the frames asks for new surface in space that the earlier map saw free, the other for its surface that
+    a frame looks through. ``event`` of the other observers is told each change as "change".
+
+    Args:
+        before: The map of the earlier visit, which must not be the one that the run changes.
+        others: Observers that are told.
+        min_size: Edge of the smallest thing, metres.
+    """
+
+    def __init__(self, before: SavedMap, others: "tuple[RunObserver, ...]" = (), min_size: float = 0.1) -> None:
+        self.volume, self.others, self.min_size = before.volume, others, min_size
+        self.reported: list[dict[str, Any]] = []
+        vertices = before.volume.extract_mesh().vertices.astype(np.float64)
+        codes, first = np.unique(morton.encode(np.floor(vertices / CELL).astype(np.int64)), return_index=True)
+        self._codes, self._surface = codes, vertices[first]
+        self._cells = self._fresh()
+        self._file: TextIO | None = None
+        self._slam: Slam | None = None
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """A pass begins."""
+        self._slam, self.reported = slam, []
+        self._cells = self._fresh()
+        self._close()
+        self._file = (out / WATCH_FILE).open("w", encoding="utf-8", buffering=1)
+
+    def _fresh(self) -> dict[str, _Cells]:
+        return {"appeared": _Cells(np.empty(0, np.int64)), "disappeared": _Cells(self._codes)}
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """Count what a tracked frame shows, and report what has become certain."""
+        T, frame = result.T_world_camera, read.frame
+        if T is None or result.submap != 0 or result.state != "tracked" or not isinstance(frame, Frame):
+            return
+        kind = KINDS[index % 2]
+        self._look(kind, frame, T)
+        if index % 8 < 2:
+            self._report(kind, index, frame.timestamp)
+
+    def finish(self, out: Path) -> None:
+        """End the file."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _look(self, kind: str, frame: Frame, T: NDArray[np.float64]) -> None:
+        assert self._slam is not None
+        camera, cells, sensor = self._slam.camera, self._cells[kind], self.volume.sensor
+        if kind == "appeared":
+            step = max(1, frame.depth.shape[1] // COLUMNS)
+            depth = frame.depth[step // 2 :: step, step // 2 :: step]
+            v, u = np.nonzero((depth > 0) & (depth < self.volume.depth_max))
+            z = depth[v, u].astype(np.float64)
+            points = transformed(T, camera.points(u * step + step // 2, v * step + step // 2, z))
+            samples = sample_map(self.volume, points)
+            margin = self._margin(z, sensor)
+            free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > margin))
+            cells.count(cells.rows_of(points[free]), 1, frame.timestamp)
+            return
+        local = transformed(se3.inverse(T), self._surface)
+        ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
+        ahead &= np.abs(local[:, 0]) < local[:, 2] * camera.width / camera.fx
+        near = np.flatnonzero(ahead)
+        u, v = np.rint(camera.project(local[near])).astype(np.int64).T
+        inside = (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
+        near, u, v = near[inside], u[inside], v[inside]
+        z, reading = local[near, 2], frame.depth[v, u]
+        beside = np.minimum.reduce([reading, frame.depth[v, u - 1], frame.depth[v, u + 1], frame.depth[v - 1, u]])
+        margin = self._margin(z, sensor)
+        cells.count(near[beside > z + 2 * margin], 1, frame.timestamp)
+        cells.count(near[np.abs(reading - z) < margin], -1, frame.timestamp)
+
+    def _margin(self, z: NDArray[np.float64], sensor: Any) -> NDArray[np.float64]:  # noqa: ANN401 - its configuration
+        """Distance (n,) that noise explains at depths (n,), metres."""
+        return 2 * self.volume.voxel_size + DEVIATIONS * sensor.sigma(z)
+
+    def _report(self, kind: str, index: int, now: float) -> None:
+        """Write the groups of certain cells that are large enough."""
+        cells = self._cells[kind]
+        rows = cells.certain()
+        wanted = LEAST_CELLS * (self.min_size / CELL) ** 2
+        if len(rows) < wanted:
+            return
+        centres = (morton.decode(cells.codes[rows]).astype(np.float64) + 0.5) * CELL
+        tree, left = KDTree(centres), set(range(len(rows)))
+        while left:
+            group, edge = set[int](), {left.pop()}
+            while edge:
+                group |= edge
+                near = tree.query_ball_point(centres[list(edge)], 2.5 * CELL)
+                edge = {n for part in near for n in part} & left
+                left -= edge
+            if len(group) < wanted:
+                continue
+            members = sorted(group)
+            cells.reported[rows[members]] = True
+            box = np.stack([centres[members].min(axis=0) - CELL / 2, centres[members].max(axis=0) + CELL / 2])
+            if self._is_known(kind, box):
+                continue
+            row = {
+                "timestamp": now, "frame": index, "id": len(self.reported) + 1, "kind": kind,
+                "centre": box.mean(axis=0).round(3).tolist(), "box": box.round(3).tolist(),
+            }  # fmt: skip
+            self.reported.append(row)
+            assert self._file is not None
+            self._file.write(json.dumps(row) + "\n")
+            for observer in self.others:
+                observer.event("change", **row)
+
+    def _is_known(self, kind: str, box: NDArray[np.float64]) -> bool:
+        """Whether a box touches a change of the same kind that was reported: more of the same thing came into view."""
+        boxes = [np.array(row["box"]) for row in self.reported if row["kind"] == kind]
+        return any(np.all((box[0] < b[1] + 2 * CELL) & (b[0] - 2 * CELL < box[1])) for b in boxes)

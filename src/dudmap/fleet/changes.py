@@ -1,0 +1,192 @@
+"""What changed between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.fleet.change_colors import SOLID, recolored_pieces
+from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
+from dudmap.fleet.change_motion import Body, Motion, motion_between
+from dudmap.fleet.change_objects import BRIDGE, Piece, connected, denied_pieces, gap_between, joined
+from dudmap.io.exporting.gravity import CONE, PARALLEL
+from dudmap.io.exporting.mesh_editing import with_faces
+
+Array = NDArray[np.float64]
+NEAR = 0.3
+"""Gap between surfaces of one thing that moved by less than its size, metres: they then are its opposite faces."""
+ON_SURFACE = 0.02
+"""Distance of a piece from the surface that it would belong to after a motion, metres: the largest tolerances."""
+FRAGMENT = 0.15
+"""Area of a piece, in that of the one beside it, below which it is a part of the same thing."""
+LEAST_UNKNOWN = 0.25
+"""Surface of a part of the place that only one visit saw, square metres, from which on it is listed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A thing that changed, in the frame of the visit before.
+
+    Attributes:
+        kind: appeared, disappeared, moved, recoloured, or unknown: surface that only one visit saw.
+        before, after: Its surface in either visit, None if it is not there.
+        confidence: 0..1, share of its surface that agrees with its kind.
+        T_after_before: (4, 4), of what moved.
+    """
+
+    kind: str
+    before: Piece | None
+    after: Piece | None
+    confidence: float
+    T_after_before: Array | None = None
+
+    @property
+    def points(self) -> Array:
+        """Surface (n, 3) where it is now, or was if it is gone, metres."""
+        piece = self.after if self.after is not None else self.before
+        assert piece is not None
+        return piece.points
+
+    @property
+    def box(self) -> Array:
+        """Lower and upper corner (2, 3), metres."""
+        return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
+
+    def tree(self) -> dict[str, Any]:
+        """For a JSON file."""
+        box, area = self.box, max(piece.area for piece in (self.before, self.after) if piece is not None)
+        out: dict[str, Any] = {
+            "kind": self.kind, "centre": box.mean(axis=0).round(4).tolist(), "box": box.round(4).tolist(),
+            "volume": round(float(np.prod(box[1] - box[0])), 6), "area": round(area, 4),
+            "confidence": round(self.confidence, 3),
+        }  # fmt: skip
+        if self.before is not None and self.after is not None:
+            out["box_before"] = self.before.box.round(4).tolist()
+        if self.T_after_before is not None:
+            T = self.T_after_before
+            centre = self.before.box.mean(axis=0) if self.before is not None else np.zeros(3)
+            distance = float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
+            turn = float(np.degrees(se3.rotation_angle(T)))
+            out |= {"T_after_before": T.tolist(), "distance": round(distance, 4), "turn_deg": round(turn, 2)}
+        return out
+
+
+def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[list[Change], tuple[Evidence, Evidence]]:
+    """All changes of at least a size (m), the largest first, then what is unknown; and the evidence of both visits."""
+    found = evidence(before, after), evidence(after, before)
+    voxel = max(before.volume.voxel_size, after.volume.voxel_size)
+    missing, new = (denied_pieces(one, voxel, min_size) for one in found)
+    out = _moved(before, after, found, missing, new) if missing and new else []
+    out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
+    out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
+    painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
+    for piece, share in painted[1]:  # both visits must say so: their meshes have other vertices and other edges
+        if any(gap_between(piece, other) < ON_SURFACE + voxel for other, _ in painted[0]):
+            out.append(Change("recoloured", None, piece, share))
+    out.sort(key=lambda change: -len(change.points))
+    return out + _unknown(found, voxel), found
+
+
+def _moved(
+    before: Visit, after: Visit, found: tuple[Evidence, Evidence], missing: list[Piece], new: list[Piece]
+) -> list[Change]:
+    """Pairs of pieces that are one thing, the best fits first; they are taken out of the lists."""
+    motions: list[tuple[Motion, Piece, Piece]] = []
+    up = vertical(before)
+    for old in missing:
+        for now in new:
+            motion = _motion(before, after, found, old, now, up)
+            if motion is not None:
+                motions.append((motion, old, now))
+    out: list[Change] = []
+    surfaces = (surface_tree(after.mesh.vertices), surface_tree(before.mesh.vertices)) if motions else ()
+    for motion, old, now in sorted(motions, key=lambda row: -row[0].fit * min(row[1].area, row[2].area)):
+        if not (any(old is piece for piece in missing) and any(now is piece for piece in new)):
+            continue
+        both, T = [], motion.T_after_before
+        for pieces, first, T_there, there in zip(
+            (missing, new), (old, now), (T, se3.inverse(T)), surfaces, strict=True
+        ):
+            parts = [p for p in pieces if p is first or _explained(p, first, T_there, there)]
+            pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
+            both.append(joined(parts))
+        out.append(Change("moved", *both, motion.fit, T))
+    return out
+
+
+def _motion(
+    before: Visit, after: Visit, found: tuple[Evidence, Evidence], old: Piece, now: Piece, up: Array
+) -> Motion | None:
+    """The motion from a missing piece to a new one, None if they are two things."""
+    boxes = [(old.box, now.box)]
+    if gap_between(old, now) < NEAR:  # the faces that it left and those that it reached may be opposite ones
+        both = np.stack([np.minimum(old.box[0], now.box[0]), np.maximum(old.box[1], now.box[1])])
+        boxes.append((both, both))
+    best: Motion | None = None
+    for pair in boxes:
+        bodies = [Body.of(one, piece, box) for one, piece, box in zip(found, (old, now), pair, strict=True)]
+        motion = motion_between(before, after, bodies[0], bodies[1], up)
+        if motion is not None and (best is None or motion.fit > best.fit):
+            best = motion
+    return best
+
+
+def vertical(visit: Visit) -> Array:
+    """Unit vector (3,) that most of the surface faces among those near the direction in which the cameras were held."""
+    held = -visit.keyframes[:, :3, 1].mean(axis=0)
+    held /= np.linalg.norm(held)
+    normals = visit.mesh.normals[:: max(1, len(visit.mesh.normals) // 5000)].astype(np.float64)
+    normals = normals[normals @ held > CONE]
+    if len(normals) == 0:
+        return held
+    facing = normals @ normals[:: max(1, len(normals) // 300)].T > PARALLEL
+    mean = normals[facing[:, np.argmax(facing.sum(axis=0))]].mean(axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _explained(piece: Piece, first: Piece, T: Array, there: KDTree) -> bool:
+    """Whether a further piece near the first one of a thing went the same way, to a surface of the other visit."""
+    if gap_between(piece, first) > NEAR:
+        return False
+    return bool(np.median(there.query(piece.points @ T[:3, :3].T + T[:3, 3])[0]) < ON_SURFACE)
+
+
+def _with_fragments(pieces: list[Piece]) -> list[Piece]:
+    """Pieces, largest first, joined with small ones beside them: parts of a thing that were seen by chance."""
+    out: list[Piece] = []
+    for piece in sorted(pieces, key=lambda one: -one.area):
+        near = [n for n, one in enumerate(out) if piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE]
+        if near:
+            out[near[0]] = joined([out[near[0]], piece])
+        else:
+            out.append(piece)
+    return out
+
+
+def _confidence(piece: Piece, found: Evidence) -> float:
+    """How far the surface lies off what noise explains: 1 less the squared tolerance over the distance."""
+    distance = np.maximum(np.nan_to_num(found.sdf[piece.vertices], nan=np.inf), 1e-6)
+    return float(np.clip(1 - np.median(found.tolerance[piece.vertices] / distance) ** 2, 0, 1))
+
+
+def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:
+    """Parts of the place that only one visit saw."""
+    out = []
+    for number, one in enumerate(found):
+        pieces = [p for p in connected(one.mesh, one.state == UNKNOWN, 4 * voxel) if p.area > LEAST_UNKNOWN]
+        out += [Change("unknown", None if number else p, p if number else None, 1.0) for p in pieces]
+    return out
+
+
+def mesh_of(change: Change, found: tuple[Evidence, Evidence]) -> Mesh:
+    """Surface of a change where it is now, or was if it is gone."""
+    one, piece = (found[1], change.after) if change.after is not None else (found[0], change.before)
+    assert piece is not None
+    chosen = np.zeros(len(one.state), bool)
+    chosen[piece.vertices] = True
+    return with_faces(one.mesh, np.all(chosen[one.mesh.faces], axis=1))

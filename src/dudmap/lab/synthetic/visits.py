@@ -1,0 +1,366 @@
+"""Two visits to one place, between which things appeared, disappeared, moved or got other colours, with exact truth."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.errors import ConfigError
+from dudmap.lab.data import find
+from dudmap.lab.synthetic.folder import write_folder
+from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.render import Renderer
+from dudmap.lab.synthetic.rooms import chair, shelf
+from dudmap.lab.synthetic.scene import Light, Material, Primitive, Scene, box, cylinder, ellipsoid, pose
+from dudmap.lab.synthetic.setup import sequence
+from dudmap.lab.synthetic.surface import count_views, tessellate
+
+Array = NDArray[np.float64]
+TRUTH = "changes.json"
+SKINS = ("cardboard", "books", "plaid", "checks", "denim", "brick", "stripes", "paper")
+KINDS = {"appeared", "disappeared", "moved", "opened", "recoloured"}
+NEAREST, FARTHEST, GRAZING = 0.5, 4.5, 0.2
+"""Distances (m) and least cosine of the angle of incidence at which a surface counts as seen."""
+VIEWS = 5
+"""Frames of 30 that must see a surface, or through it."""
+CLEAR = 0.03
+"""A ray that goes on so far behind a point sees it empty, metres: twice the noise of a Kinect at 2.5 m."""
+LEAST_SEEN = 0.35
+"""Share of the face of a thing (its longest edge times its middle one) that must have been seen to change."""
+GAP = 0.12
+"""Distance between things, and to the solids beside them, metres."""
+TRIES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class TrueChange:
+    """What happened to a thing.
+
+    Attributes:
+        thing, kind, size: Its name, one of ``KINDS`` without "opened", or "unknown" where a visit could not see it; its
+            longest edge, metres.
+        T_after_before: (4, 4) its motion in the common frame of both visits; the identity if it did not move.
+        before, after: Points (n, 3) of its surface that one visit saw and where the other looked through, or in both
+            its surface for a change of the colour alone, metres.
+        symmetric: Whether rotations about its vertical axis leave its shape as it is.
+        at: (3,) its centre before, or after if it was not there before.
+    """
+
+    thing: str
+    kind: str
+    size: float
+    T_after_before: Array
+    before: Array
+    after: Array
+    symmetric: bool
+    at: Array
+
+    def tree(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return {
+            "thing": self.thing, "kind": self.kind, "size": round(self.size, 3), "symmetric": self.symmetric,
+            "T_after_before": self.T_after_before.tolist(), "centre": self.at.round(4).tolist(),
+            "before": self.before.round(4).tolist(), "after": self.after.round(4).tolist(),
+        }  # fmt: skip
+
+    @classmethod
+    def of_tree(cls, tree: dict[str, Any]) -> "TrueChange":
+        """From a JSON file."""
+        arrays = {key: np.array(tree[key], float).reshape(-1, 3) for key in ("before", "after")}
+        return cls(
+            tree["thing"], tree["kind"], tree["size"], np.array(tree["T_after_before"]), arrays["before"],
+            arrays["after"], tree["symmetric"], np.array(tree["centre"]),
+        )  # fmt: skip
+
+
+def _skin(rng: np.random.Generator, size: float) -> Material:
+    scale = float(rng.uniform(0.5, 1.0)) / size
+    tint = tuple(float(x) for x in rng.uniform(0.5, 1.15, 3))
+    return Material(str(rng.choice(SKINS)), (scale, scale), tuple(rng.uniform(0, 1, 2)), tint)  # pyright: ignore
+
+
+def _box(rng: np.random.Generator, size: float) -> list[Primitive]:
+    w, d, h = size * np.array([1.0, rng.uniform(0.7, 1.0), rng.uniform(0.7, 1.0)])[rng.permutation(3)]
+    return [box((0, 0, h / 2), (w, d, h), _skin(rng, size))]
+
+
+def _ball(rng: np.random.Generator, size: float) -> list[Primitive]:
+    return [ellipsoid((0, 0, size / 2), (size / 2,) * 3, _skin(rng, size))]
+
+
+def _bin(rng: np.random.Generator, size: float) -> list[Primitive]:
+    return [cylinder((0, 0, 0), (0, 0, size), size * float(rng.uniform(0.3, 0.45)), _skin(rng, size))]
+
+
+def _chair(rng: np.random.Generator, size: float) -> list[Primitive]:
+    return chair((0, 0), 0.0, _skin(rng, 0.5))
+
+
+def _shelf(rng: np.random.Generator, size: float) -> list[Primitive]:
+    return shelf((0, 0), 0.8, int(rng.integers(3, 5)))
+
+
+def _door(rng: np.random.Generator, size: float) -> list[Primitive]:
+    return [box((0.4, 0, 0.975), (0.8, 0.04, 1.95), Material("wood", (0.9, 0.7), tint=(0.75, 0.85, 0.95)))]
+
+
+THINGS: dict[str, tuple[Callable[[np.random.Generator, float], list[Primitive]], tuple[float, float], bool]] = {
+    "box": (_box, (0.1, 0.8), False), "ball": (_ball, (0.15, 0.5), True), "bin": (_bin, (0.1, 0.6), True),
+    "chair": (_chair, (0.9, 0.9), False), "shelf": (_shelf, (1.26, 1.68), False), "door": (_door, (1.95, 1.95), False),
+    "poster": (_box, (0.3, 1.0), False),
+}  # fmt: skip
+"""Maker of the solids on the origin, range of the longest edge in metres, and whether it is symmetric."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """A thing in the frame of each visit in which it is there; solids of a poster are those on its wall."""
+
+    name: str
+    kind: str
+    size: float
+    before: list[Primitive]
+    after: list[Primitive]
+    T_after_before: Array
+
+
+def parsed_changes(text: str) -> list[tuple[str, str]]:
+    """Names and kinds of ``chair:moved,box:appeared``; "none" is the empty list.
+
+    Raises:
+        ConfigError: A thing or a kind is unknown, or a kind does not suit the thing.
+    """
+    out = []
+    for part in (part.strip() for part in text.split(",") if part.strip() not in ("", "none")):
+        name, _, kind = part.partition(":")
+        find(name, THINGS, "thing")
+        if kind not in KINDS or (kind == "recoloured") != (name == "poster") or (kind == "opened" and name != "door"):
+            raise ConfigError(
+                f"cannot understand the change {part!r}; expected THING:KIND with a thing of {', '.join(THINGS)}, "
+                "moved, appeared or disappeared, door:opened, or poster:recoloured"
+            )
+        out.append((name, kind))
+    return out
+
+
+class _Stage:
+    """Free spots of a scene in view of its home camera, on which things are put one after the other."""
+
+    def __init__(self, scene: Scene, recording: SyntheticSequence, rng: np.random.Generator) -> None:
+        self.scene, self.rng, self.taken = scene, rng, list[Array]()
+        camera = recording.camera.resized(64, 48)
+        empty = np.empty((0, 4, 4)), np.empty(0, bool)
+        depth = Renderer(scene, scene.primitives).render(camera, scene.home, *empty, with_color=False).depth
+        points = camera.backproject(depth).astype(float) @ scene.home[:3, :3].T + scene.home[:3, 3]
+        flat = np.abs(points[1:, :, 2] - points[:-1, :, 2]) < 0.004
+        near = (depth > NEAREST + 0.4) & (depth < FARTHEST - 0.5)
+        near[:, :6] = near[:, -6:] = near[-4:] = False
+        self.spots = points[:-1][flat & near[:-1]]
+
+    def put(self, solids: list[Primitive], around: Array | None = None) -> Array | None:
+        """Pose (4, 4) of a thing, None without room for it; at a distance drawn from 5 cm to 3 m of a pose before."""
+        solid = _samples(solids)
+        far = float(np.exp(self.rng.uniform(np.log(0.05), np.log(3.0))))
+        for _ in range(TRIES):
+            if around is None:
+                T = pose(self.spots[self.rng.integers(len(self.spots))], float(self.rng.uniform(-180, 180)))
+            else:
+                angle, turn = self.rng.uniform(0, 2 * np.pi), float(self.rng.normal() * min(60 * far, 90))
+                T = pose((*(far * np.array([np.cos(angle), np.sin(angle)])), 0)) @ around @ pose(yaw=turn)
+            if self._is_free(solid @ T[:3, :3].T + T[:3, 3], around is not None and far < 0.5):
+                return T
+            far = far if around is None else max(0.05, far * 0.99)
+        return None
+
+    def _is_free(self, points: Array, overlapping: bool) -> bool:
+        low = points[:, 2].min()
+        above = points[points[:, 2] > low + 0.02]
+        if not self._in_view(points.mean(axis=0)) or self.scene.clearance(above).min() < 0.02:
+            return False
+        feet = points[points[:, 2] < low + 0.005] - (0, 0, 0.015)
+        if self.scene.clearance(feet).max() > 0.004:
+            return False
+        others = self.taken[:-1] if overlapping else self.taken
+        return all(np.linalg.norm(points[:, None] - other[None], axis=2).min() > GAP for other in others)
+
+    def _in_view(self, point: Array) -> bool:
+        local = se3.inverse(self.scene.home) @ np.append(point, 1)
+        return bool(
+            local[2] > 0.8 * min(1.0, self.scene.mover_scale * 2) and np.all(np.abs(local[:2]) < 0.5 * local[2])
+        )
+
+
+def _samples(solids: list[Primitive]) -> Array:
+    """Points (n, 3) on the bounding boxes of solids, about 300."""
+    axis = np.linspace(-1, 1, 5)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    grid = grid[np.abs(grid).max(axis=1) == 1]
+    parts = [(grid * p.bounds()) @ p.T_body_primitive[:3, :3].T + p.T_body_primitive[:3, 3] for p in solids]
+    return np.concatenate(parts)
+
+
+def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | None:
+    """A thing of a name on free spots of the stage; None if it does not fit."""
+    rng, scene = stage.rng, stage.scene
+    make, (low, high), _ = THINGS[name]
+    if name == "poster":
+        pictures = [p for p in scene.primitives if p.material.texture == "poster" and stage._in_view(
+            p.T_body_primitive[:3, 3])]  # fmt: skip
+        if not pictures:
+            return None
+        old = pictures[rng.integers(len(pictures))]
+        other = (old.material.offset[0] + 0.5, old.material.offset[1] + float(rng.choice([0.0, 0.5])))
+        new = replace(old, material=replace(old.material, offset=other))
+        return Thing(name, kind, float(2 * max(old.half)), [old], [new], np.eye(4))
+    scaled = low < high and name != "shelf"
+    size = size or float(
+        np.exp(rng.uniform(np.log(low), np.log(high * (min(1.0, 2 * scene.mover_scale) if scaled else 1))))
+    )
+    solids = make(rng, size)
+    if name == "door":
+        first, second = scene.hinge, scene.hinge @ pose(yaw=-float(rng.uniform(20, 95)))
+        if kind != "opened":
+            first, second = (None, first) if kind == "appeared" else (first, None)
+    else:
+        first = stage.put(solids)
+        if first is None:
+            return None
+        stage.taken.append(_samples(solids) @ first[:3, :3].T + first[:3, 3])
+        second = stage.put(solids, first) if kind == "moved" else None
+        if kind == "moved" and second is None:
+            return None
+        if kind == "appeared":
+            first, second = None, first
+    for T in (first, second):
+        if T is not None:
+            stage.taken.append(_samples(solids) @ T[:3, :3].T + T[:3, 3])
+    there = [[] if T is None else [p.moved(T) for p in solids] for T in (first, second)]
+    motion = np.eye(4) if first is None or second is None else second @ se3.inverse(first)
+    return Thing(name, kind, size, *there, motion)
+
+
+def visits(
+    changes: Sequence[tuple[str, str]],
+    *,
+    scene: str = "room",
+    seed: int = 0,
+    size: float | None = None,
+    people: bool = False,
+    other_light: bool = False,
+    paths: tuple[str, str] = ("pan", "pan"),
+    **options: Any,  # noqa: ANN401 - those of ``sequence``
+) -> tuple[list[SyntheticSequence], list[TrueChange]]:
+    """Recordings before and after some changes, in one world frame, and what each visit could see of them.
+
+    Args:
+        changes: Things and what happens to them, as ``parsed_changes`` gives them.
+        scene: Name of the scene.
+        seed: Seed of all that is drawn.
+        size: Longest edge of boxes, balls and bins, metres; drawn by default.
+        people: Whether people walk through the second visit.
+        other_light: Whether the lamps of the second visit stand elsewhere.
+        paths: Camera paths of the visits.
+        options: Of both recordings, see ``sequence``.
+
+    Raises:
+        ConfigError: A name is unknown, or a thing finds no free place in view.
+    """
+    rng = np.random.default_rng([seed, 7])
+    plain = sequence(scene, (), paths[0], seed=seed, **options)
+    stage = _Stage(plain.scene, plain, rng)
+    things: list[Thing] = []
+    for name, kind in changes:
+        made = next((t for _ in range(8) if (t := _placed(name, kind, stage, size)) is not None), None)
+        if made is None:
+            raise ConfigError(f"there is no free place for {name}:{kind} in the scene {scene}; take another --seed")
+        things.append(made)
+    recordings = []
+    for visit in range(2):
+        walkers = ("people",) if people and visit else ()
+        like = sequence(scene, walkers, paths[visit], seed=seed + 1000 * visit, **options)
+        solids = [p for p in like.scene.primitives if not any(_is_same(p, old) for t in things for old in t.before)]
+        solids += [p for thing in things for p in (thing.after if visit else thing.before)]
+        lights = like.scene.lights
+        if other_light and visit:
+            lights = tuple(Light((-x.position[1], x.position[0], x.position[2]), 0.8 * x.strength) for x in lights)
+        recordings.append(like.in_scene(replace(like.scene, primitives=solids, lights=lights)))
+    return recordings, [_truth(thing, recordings) for thing in things]
+
+
+def _is_same(a: Primitive, b: Primitive) -> bool:
+    return a.half == b.half and np.array_equal(a.T_body_primitive, b.T_body_primitive)
+
+
+def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
+    """What the visits could see of a change: surface of one of them that the other saw, or looked through."""
+    recoloured = thing.kind == "recoloured"
+    seen = []
+    for own, other, solids in zip(recordings, recordings[::-1], (thing.before, thing.after), strict=True):
+        surface = _surface(solids, thing.size, own) if solids else None
+        if surface is None:
+            seen.append((np.empty((0, 3)), 0.0))
+            continue
+        count = _views(surface, own) >= VIEWS
+        count &= (_views(surface, other) if recoloured else _looks_through(surface, other)) >= VIEWS
+        points = surface.vertices[count].astype(float)
+        share = surface.area() / max(len(surface.vertices), 1) * len(points)
+        seen.append((points, share))
+    edges = np.sort(np.ptp(_samples(thing.before or thing.after), axis=0))
+    enough = [area > LEAST_SEEN * edges[1] * edges[2] * (0.3 if thing.kind == "moved" else 1) for _, area in seen]
+    kind = "moved" if thing.kind == "opened" else thing.kind
+    if kind == "moved" and not all(enough):
+        kind = "disappeared" if enough[0] else "appeared" if enough[1] else "unknown"
+    elif not any(enough):
+        kind = "unknown"
+    at = _samples(thing.before or thing.after).mean(axis=0)
+    return TrueChange(
+        thing.name, kind, thing.size, thing.T_after_before, seen[0][0], seen[1][0], THINGS[thing.name][2], at
+    )
+
+
+def _surface(solids: list[Primitive], size: float, recording: SyntheticSequence) -> Mesh:
+    detail = min(0.02, size / 12)
+    return tessellate(solids, detail, recording.scene.extent, recording.renderer.atlas)
+
+
+def _shots(recording: SyntheticSequence) -> list[tuple[Array, NDArray[np.float32]]]:
+    still = recording.static_twin()
+    frames = np.unique(np.linspace(0, len(still) - 1, min(len(still), 30)).astype(int))
+    return [(still.ground_truth.Ts_world_camera[n], still.exact_depth(int(n))) for n in frames]
+
+
+def _views(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
+    return count_views(surface, recording.camera, _shots(recording), (NEAREST, FARTHEST), GRAZING)
+
+
+def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
+    """Number of frames (V,) whose rays go on behind each vertex."""
+    counts, camera = np.zeros(len(surface.vertices), np.int32), recording.camera
+    for T_world_camera, depth in _shots(recording):
+        T = se3.inverse(T_world_camera)
+        points = surface.vertices @ T[:3, :3].T + T[:3, 3]
+        z = points[:, 2]
+        u, v = np.rint(np.nan_to_num(camera.project(points), nan=-1)).astype(int).T
+        inside = (z > NEAREST) & (z < FARTHEST) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        reading = np.where(inside, depth[np.where(inside, v, 0), np.where(inside, u, 0)], 0)
+        counts += inside & (reading > z + CLEAR)
+    return counts
+
+
+def write_visits(
+    recordings: Sequence[SyntheticSequence], truth: Sequence[TrueChange], out: Path, *, overwrite: bool = False
+) -> None:
+    """Write the recordings as visit-1 and visit-2 with their true changes beside them.
+
+    Raises:
+        DatasetError: A folder is not empty, or cannot be written.
+    """
+    for number, recording in enumerate(recordings, start=1):
+        write_folder(recording, out / f"visit-{number}", overwrite=overwrite)
+    (out / TRUTH).write_text(json.dumps([change.tree() for change in truth]) + "\n", encoding="utf-8")
