@@ -9,6 +9,7 @@ import typer
 
 from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
+from dudmap.cli.benchmark_changes import changes
 from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, roofline, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
@@ -64,7 +65,7 @@ def suite_command(
     _answer(tree, text, out, as_json=as_json)
 
 
-for _command in (speed, gpu, roofline, soak):
+for _command in (changes, speed, gpu, roofline, soak):
     app.command()(_command)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
@@ -131,30 +132,6 @@ def random(
     text = report(rows, seed)
     (out / f"seed-{seed}.md").write_text(text, encoding="utf-8")
     _answer({"rows": rows}, text, out, as_json=as_json)
-
-
-@app.command()
-def changes(
-    count: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.")] = 0,
-    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
-    out: Annotated[Path, typer.Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
-    assignments: o.SetOption = None,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Render pairs of visits with known changes, run on both, and measure how many `dudmap diff` finds.
-
-    A fifth of the pairs has no change, a fifth people in the second visit, and every third other light.
-    """
-    from dudmap.fleet.change_benchmark import figures, measure_changes
-
-    def told(row: dict[str, Any]) -> None:
-        hits = sum(thing["found"] is not None for thing in row["things"])
-        outcome = row.get("error") or f"{hits} of {len(row['things'])} found, {len(row['false'])} false"
-        say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
-
-    rows, text = measure_changes(seed, count, o.read_config(None, None, assignments), out, min_size, told)
-    _answer({"rows": rows, "figures": figures(rows)}, text, out, as_json=as_json)
 
 
 def _print_world(row: dict[str, Any]) -> None:

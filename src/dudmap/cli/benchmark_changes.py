@@ -1,0 +1,35 @@
+"""``dudmap benchmark changes``: how many changes between two visits are found."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dudmap.app.terminal import say
+from dudmap.cli import options as o
+from dudmap.cli.benchmark_machine import RUNS
+from dudmap.cli.output import answer
+
+
+def changes(
+    count: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.")] = 0,
+    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
+    out: Annotated[Path, typer.Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Render pairs of visits with known changes, run on both, and measure how many `dudmap diff` finds.
+
+    A fifth of the pairs has no change, a fifth people in the second visit, and every third other light.
+    """
+    from dudmap.fleet.change_benchmark import figures, measure_changes
+
+    def told(row: dict[str, Any]) -> None:
+        hits = sum(thing["found"] is not None for thing in row["things"])
+        outcome = row.get("error") or f"{hits} of {len(row['things'])} found, {len(row['false'])} false"
+        say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
+
+    rows, text = measure_changes(seed, count, o.read_config(None, None, assignments), out, min_size, told)
+    tree = {"rows": rows, "figures": figures(rows), "out": out}
+    answer(tree, f"{text}\nwritten to {out}", as_json=as_json)
