@@ -105,9 +105,9 @@ def synth(
 
         if visits != 2:
             raise typer.BadParameter("--changes lie between two visits; add --visits 2")
-        people, paths = "people" in (_names(movers) or []), (camera_path or "pan",) * 2
+        people, path = "people" in (_names(movers) or []), camera_path or "pan"
         recordings, truth = two_visits(
-            parsed_changes(changes), scene=scene, seed=seed, people=people, paths=paths, sensor=sensor, **options
+            parsed_changes(changes), scene=scene, seed=seed, people=people, paths=(path, path), sensor=sensor, **options
         )
         write_visits(recordings, truth, out, overwrite=overwrite)
         kinds = [f"{change.thing} {change.kind}" for change in truth]

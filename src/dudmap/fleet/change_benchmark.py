@@ -144,7 +144,7 @@ def measure_pair(job: tuple[dict[str, Any], Config, float]) -> dict[str, Any]:
         folders = run_pair(recordings, config, Path(folder))
         start = time.perf_counter()
         try:
-            changes = compared(*folders, min_size).changes
+            changes = compared(folders[0], folders[1], min_size).changes
         except DudmapError as error:
             return row | {"error": str(error), "things": [], "false": []}
         row["seconds"] = round(time.perf_counter() - start, 2)

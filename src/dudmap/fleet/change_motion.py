@@ -159,7 +159,7 @@ def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
 
     def met(T: Array, gate: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
         points, normals = transformed(T, a.points), a.normals @ T[:3, :3].T
-        near = tree.query(np.hstack([points, shade * a.colors]))[1]
+        near = np.asarray(tree.query(np.hstack([points, shade * a.colors]))[1])
         close = np.linalg.norm(points - b.points[near], axis=1) < gate
         return points, near, close & ((normals * b.normals[near]).sum(axis=1) > 0.5)
 

@@ -144,4 +144,4 @@ def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
     """Surface (V,) that each vertex stands for, square metres."""
     a, b, c = (mesh.vertices[mesh.faces[:, n]] for n in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).astype(np.float64) / 6
-    return np.bincount(mesh.faces.reshape(-1), np.repeat(areas, 3), len(mesh.vertices))
+    return np.bincount(mesh.faces.reshape(-1), np.repeat(areas, 3), len(mesh.vertices)).astype(np.float64)

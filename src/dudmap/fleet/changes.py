@@ -115,7 +115,7 @@ def _moved(
             parts = [p for p in pieces if p is first or _explained(p, first, T_there, there)]
             pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
             both.append(joined(parts))
-        out.append(Change("moved", *both, motion.fit, T))
+        out.append(Change("moved", both[0], both[1], motion.fit, T))
     return out
 
 

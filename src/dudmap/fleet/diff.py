@@ -109,7 +109,7 @@ def compared(before: str | Path, after: str | Path, min_size: float) -> Comparis
         notes.append("both are the same run: nothing changed")
     pair_tree, T = _aligned(maps, same=bool(notes))
     sizes = [saved.volume.voxel_size for saved in maps]
-    if not np.isclose(*sizes):
+    if not np.isclose(sizes[0], sizes[1]):
         notes.append(
             f"the maps have voxels of {sizes[0]:g} and {sizes[1]:g} m and were sampled in metres; things below a few "
             f"voxels of {coarsest:g} m are not found"

@@ -210,8 +210,8 @@ def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | 
     rng, scene = stage.rng, stage.scene
     make, (low, high), _ = THINGS[name]
     if name == "poster":
-        pictures = [p for p in scene.primitives if p.material.texture == "poster" and stage._in_view(
-            p.T_body_primitive[:3, 3])]  # fmt: skip
+        posters = (p for p in scene.primitives if p.material.texture == "poster")
+        pictures = [p for p in posters if stage._in_view(p.T_body_primitive[:3, 3])]
         if not pictures:
             return None
         old = pictures[rng.integers(len(pictures))]
@@ -240,9 +240,9 @@ def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | 
     for T in (first, second):
         if T is not None:
             stage.taken.append(_samples(solids) @ T[:3, :3].T + T[:3, 3])
-    there = [[] if T is None else [p.moved(T) for p in solids] for T in (first, second)]
+    before, after = ([] if T is None else [p.moved(T) for p in solids] for T in (first, second))
     motion = np.eye(4) if first is None or second is None else second @ se3.inverse(first)
-    return Thing(name, kind, size, *there, motion)
+    return Thing(name, kind, size, before, after, motion)
 
 
 def visits(
