@@ -200,7 +200,7 @@ def _fit(there: Visit, own: Body, other: Body, T: Array) -> float:
     """Share of the denied surface of a thing that lies on the other's after a motion; 0 if it does not belong to it."""
     moved = own.chosen(own.denied).sample(1500)
     points, normals = transformed(T, moved.points), moved.normals @ T[:3, :3].T
-    gap, near = KDTree(other.points).query(points)
+    gap, near = (np.asarray(found) for found in KDTree(other.points).query(points))
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
     samples = there.sample(points)
