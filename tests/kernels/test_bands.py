@@ -1,6 +1,7 @@
 """Bands of work on several threads."""
 
 import multiprocessing
+import subprocess
 import sys
 import threading
 
@@ -69,3 +70,13 @@ def test_a_forked_process_has_threads_of_its_own():
     child.join(30)
     assert child.exitcode == 0
     assert queue.get() == (expected, 7)
+
+
+def test_the_interpreter_ends_after_what_its_threads_do():
+    """A thread that is in compiled code then would end the process with an error."""
+    program = (
+        "import time\nfrom dudmap.core.backends import threads\n"
+        "threads.submit(lambda: (time.sleep(0.3), print('done')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "done\n"

@@ -4,6 +4,7 @@ Kernels are serial and release the GIL; a call is cut into bands that do not dep
 sums are added in band order, so that the result is the same, bit for bit, on one core and on sixteen.
 """
 
+import atexit
 import hashlib
 import os
 import threading
@@ -80,16 +81,28 @@ def _num_cores() -> int:
 
 
 @cache
-def _tasks() -> SimpleQueue[Callable[[], object]]:
-    """Tasks of the other threads, one for each core but one. An executor would take ten times as long to wake one."""
-    tasks: SimpleQueue[Callable[[], object]] = SimpleQueue()
+def _tasks() -> SimpleQueue[Callable[[], object] | None]:
+    """Tasks of the other threads, one for each core but one. An executor would take ten times as long to wake one.
+
+    The threads end when the interpreter does. One that was still in compiled code then would be ended there, which C++
+    answers by ending the process with an error.
+    """
+    tasks: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
 
     def work() -> None:
-        while True:
-            tasks.get()()
+        while (task := tasks.get()) is not None:
+            task()
 
-    for n in range(max(1, num_threads() - 1)):
-        threading.Thread(target=work, name=f"dudmap-{n}", daemon=True).start()
+    def stop() -> None:
+        for _ in threads:
+            tasks.put(None)
+        for thread in threads:
+            thread.join()
+
+    threads = [threading.Thread(target=work, name=f"dudmap-{n}", daemon=True) for n in range(max(1, num_threads() - 1))]
+    for thread in threads:
+        thread.start()
+    atexit.register(stop)
     return tasks
 
 
