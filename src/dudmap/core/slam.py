@@ -221,9 +221,8 @@ class Slam(SlamResults):
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the one before, or its depth.
 
-        It has the pose of the frame it repeats. With new colours the camera may have moved: the pose is the predicted
-        one, and in the trajectory interpolated once the next frame is tracked. Neither is believed for longer than a
-        prediction can be trusted.
+        It has the pose of the frame it repeats, or with new colours the predicted one, which is interpolated in the
+        trajectory once the next frame is tracked. Neither is believed for longer than a prediction can be trusted.
         """
         repeats, time = self.stream.repeats, view.timestamp
         result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
