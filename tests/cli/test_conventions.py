@@ -7,7 +7,6 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from dudmap.cli import COMMANDS, app
 from dudmap.cli.options import GROUPS, arranged
 from dudmap.cli.output import answer, plain
 from exported_runs import make_run
+from long_commands import FAKED
 from run_folders import write_run
 
 SILENT = {"view"}
@@ -93,117 +93,6 @@ def test_json_is_one_object_on_stdout(slam, where, monkeypatch, words):
     assert done.exit_code == 0, done.output
     assert len(done.stdout.strip().splitlines()) == 1
     assert isinstance(json.loads(done.stdout, parse_constant=pytest.fail), dict)
-
-
-FAKED = {
-    "warmup": (["warmup"], {"dudmap.lab.warmup.steps": lambda: [("part", lambda: None)]}),
-    "merge": (["merge", "a", "b"], {"dudmap.fleet.merge.merge_runs": lambda *_: merged()}),
-    "diff": (
-        ["diff", "a", "b"],
-        {"dudmap.fleet.diff.diff_runs": lambda *_: {"notes": [], "changes": [], "counts": {}}},
-    ),
-    "benchmark changes": (
-        ["benchmark", "changes"],
-        {"dudmap.fleet.change_benchmark.measure_changes": lambda *_: ([], "")},
-    ),
-    "calibrate": None,  # tests/calibration/test_self_calibration.py
-    "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
-    "benchmark consistency": None,  # tests/benchmark/test_consistency.py
-    "benchmark gate": (
-        ["benchmark", "gate"],
-        {
-            "dudmap.lab.benchmark.gate.load_figures": lambda _: {},
-            "dudmap.lab.benchmark.gate.gate_entries": lambda _: [],
-            "dudmap.lab.benchmark.gate.measure_gate": lambda *_: [],
-            "dudmap.lab.benchmark.gate.compare": lambda *_: [],
-        },
-    ),
-    "benchmark sensors": (
-        ["benchmark", "sensors", "--only", "kinect_v1", "--out", "sensors"],
-        {
-            "dudmap.lab.benchmark.color_columns.measure_columns": lambda *_: [],
-            "dudmap.lab.benchmark.color_columns.color_table": lambda *_: "",
-        },
-    ),
-    "benchmark random": (
-        ["benchmark", "random", "--out", "."],
-        {
-            "dudmap.lab.benchmark.random_worlds.measure_worlds": lambda *_: [],
-            "dudmap.lab.benchmark.random_worlds.report": lambda *_: "",
-        },
-    ),
-    "benchmark limits": (
-        ["benchmark", "limits", "--out", "limits"],
-        {
-            "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.lab.benchmark.limits.limits_table": lambda *_: "",
-            "dudmap.lab.benchmark.limits.cells_table": lambda *_: "",
-        },
-    ),
-    "benchmark gpu": (
-        ["benchmark", "gpu", "--out", "gpu"],
-        {"dudmap.lab.benchmark.gpu.recordings": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
-    ),
-    "benchmark faults": (
-        ["benchmark", "faults"],
-        {
-            "dudmap.lab.benchmark.stream_faults.default_room": lambda *_: SimpleNamespace(name="room"),
-            "dudmap.lab.benchmark.stream_faults.measure_stream_faults": lambda *_: [],
-        },
-    ),
-    "benchmark speed": (
-        ["benchmark", "speed", "--out", "speed"],
-        {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
-    ),
-    "benchmark roofline": (
-        ["benchmark", "roofline", "--out", "roofline"],
-        {"dudmap.lab.benchmark.roofline.roofline": lambda *_: ({}, "")},
-    ),
-    "benchmark soak": (
-        ["benchmark", "soak"],
-        {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
-    ),
-    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.roofline.count_calls": lambda *_: []}),
-    "benchmark bias": (
-        ["benchmark", "bias", "--seeds", 1],
-        {
-            "dudmap.lab.benchmark.bias.measure_pulls": lambda *_: [],
-            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
-        },
-    ),
-    "benchmark first-second": (
-        ["benchmark", "first-second", "--seeds", 1],
-        {
-            "dudmap.lab.benchmark.bias.measure_first_second": lambda *_: [],
-            "dudmap.lab.benchmark.bias.first_second_table": lambda _: "",
-            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
-        },
-    ),
-    "study run": (
-        ["study", "design.toml"],
-        {
-            "dudmap.lab.study.plan.load_plan": lambda _: None,
-            "dudmap.lab.study.study.run_study": lambda *_, **__: "an outcome",
-        },
-    ),
-    "study tune": (
-        ["study", "tune", "design.toml"],
-        {
-            "dudmap.lab.study.plan.load_plan": lambda _: None,
-            "dudmap.lab.study.tune.run_tune": lambda *_, **__: "an outcome",
-        },
-    ),
-    "study thesis": (
-        ["study", "thesis", "--published", "--out", "published"],
-        {"dudmap.lab.study.study.published_report": lambda _: "an outcome"},
-    ),
-}
-"""Long commands, with their measurements replaced."""
-
-
-def merged(*_):
-    return {"features": 9, "keyframes": 2, "area": 1.0, "denied": 0.0, "color_correlation": float("nan"),
-            "finer_blocks_left_out": 0}  # fmt: skip
 
 
 @pytest.mark.parametrize("words", [words for words, faked in FAKED.items() if faked])

@@ -13,7 +13,7 @@ from dudmap.cli.output import answer
 
 def changes(
     count: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.", metavar="N")] = 0,
     min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
     out: Annotated[Path, typer.Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
     assignments: o.SetOption = None,

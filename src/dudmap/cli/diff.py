@@ -15,9 +15,7 @@ app = typer.Typer(add_completion=False)
 def diff(
     before: Annotated[Path, typer.Argument(help="Run folder of the first visit.", metavar="BEFORE")],
     after: Annotated[Path, typer.Argument(help="Run folder of the second visit.", metavar="AFTER")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder; default: runs/<BEFORE>-<AFTER>-changes.", metavar="FOLDER")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; default: runs/<BEFORE>-<AFTER>-changes.")] = None,
     min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
