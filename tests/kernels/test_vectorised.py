@@ -20,7 +20,7 @@ from numba import njit
 from vectors import counts
 
 from dudmap.config import Config
-from dudmap.core.backends.cpu import filtering, fusion, integration, labeling, registration, sampling
+from dudmap.core.backends.cpu import evidence, filtering, fusion, integration, labeling, registration, sampling
 from dudmap.core.slam import Slam
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
@@ -41,7 +41,7 @@ FEWEST = {
     (filtering, "halve_depth"): {"loops": 1, "fma": 3, "packed": 6},
 }
 """Least number of vectorised loops and of packed instructions on eight or more floats, per kernel."""
-CALLERS = registration.descend, fusion.fuse, sampling.sample
+CALLERS = registration.descend, fusion.fuse, sampling.sample, evidence.moving_pixels
 """Kernels that some of these are inlined into."""
 LONGEST = [(registration, "linearize_rows"), (integration, "integrate_blocks")]
 """Kernels of which one scalar loop is enough to be caught; they take half of the compiler's time."""

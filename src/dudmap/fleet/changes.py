@@ -82,11 +82,18 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
     missing, new = (denied_pieces(one, voxel, min_size) for one in found)
     out = _moved(before, after, found, missing, new) if missing and new else []
+    missing = [piece for piece in missing if not _is_fragment(piece, [moved.before for moved in out])]
+    new = [piece for piece in new if not _is_fragment(piece, [moved.after for moved in out])]
     out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
     out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
     painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
     for piece, share in painted[1]:  # both visits must say so: their meshes have other vertices and other edges
-        if any(gap_between(piece, other) < ON_SURFACE + voxel for other, _ in painted[0]):
+        touched = [part for change in out for part in (change.before, change.after) if part is not None]
+        touches = [
+            any(gap_between(piece, other) < ON_SURFACE + voxel for other in others)
+            for others in ([other for other, _ in painted[0]], touched)
+        ]
+        if touches == [True, False]:  # what stood on it has left its colours at the border
             out.append(Change("recoloured", None, piece, share))
     out.sort(key=lambda change: -len(change.points))
     return out + _unknown(found, voxel), found
@@ -156,11 +163,16 @@ def _explained(piece: Piece, first: Piece, T: Array, there: KDTree) -> bool:
     return bool(np.median(there.query(piece.points @ T[:3, :3].T + T[:3, 3])[0]) < ON_SURFACE)
 
 
+def _is_fragment(piece: Piece, things: Sequence[Piece | None]) -> bool:
+    """Whether a piece is small beside a thing that it lies at: a part of it that was seen by chance."""
+    return any(piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE for one in things if one)
+
+
 def _with_fragments(pieces: list[Piece]) -> list[Piece]:
     """Pieces, largest first, joined with small ones beside them: parts of a thing that were seen by chance."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
-        near = [n for n, one in enumerate(out) if piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE]
+        near = [n for n, one in enumerate(out) if _is_fragment(piece, [one])]
         if near:
             out[near[0]] = joined([out[near[0]], piece])
         else:

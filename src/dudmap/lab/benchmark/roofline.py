@@ -191,7 +191,9 @@ def summary(counts: list[dict[str, int]]) -> dict[str, float]:
 
 def _counted(function: Callable[[Any], object], argument: object) -> dict[str, int]:
     """The counts of one call."""
-    compiled = [found for found in gc.get_objects() if isinstance(found, Dispatcher)]
+    compiled = [
+        found for found in gc.get_objects() if issubclass(type(found), Dispatcher)
+    ]  # an isinstance would ask dead proxies
     # formulas are inlined where kernels call them, and Python calls them uncompiled
     kernels = {found.py_func.__code__ for found in compiled if not found.targetoptions.get("forceinline")}
     sharing = {teams.run_team.__code__, threads.run_bands.__code__}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_text
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
@@ -363,4 +364,4 @@ def write_visits(
     """
     for number, recording in enumerate(recordings, start=1):
         write_folder(recording, out / f"visit-{number}", overwrite=overwrite)
-    (out / TRUTH).write_text(json.dumps([change.tree() for change in truth]) + "\n", encoding="utf-8")
+    write_text(out / TRUTH, json.dumps([change.tree() for change in truth]) + "\n")
