@@ -21,10 +21,10 @@ def room():
     return sequence
 
 
-def run(room, monkeypatch, window, spoil=lambda slam, index: None):
+def run(room, monkeypatch, window, spoil=lambda slam, index: None, *, live=False):
     """A run of 25 frames whose poses are estimated again after so many, and the poses as they were returned."""
     monkeypatch.setattr(bootstrap, "WINDOW", window)
-    slam, returned = Slam(room.camera, Config()), []
+    slam, returned = Slam(room.camera, Config(), live=live), []
     for index in range(25):
         spoil(slam, index)
         returned.append(slam.process(room[index]).T_world_camera)
@@ -58,4 +58,9 @@ def test_it_happens_once_and_never_to_a_map_that_began_anew(room, monkeypatch):
     run(room, monkeypatch, WINDOW, spoil)
     assert np.count_nonzero(np.diff(maps[2:])) == 1
     slam, returned = run(room, monkeypatch, WINDOW, lambda slam, n: slam.bootstrap.abandon() if n == 10 else None)
+    assert np.array_equal(slam.trajectory.Ts_world_camera, returned)
+
+
+def test_a_live_camera_does_not_wait_for_it(room, monkeypatch):
+    slam, returned = run(room, monkeypatch, WINDOW, live=True)
     assert np.array_equal(slam.trajectory.Ts_world_camera, returned)

@@ -59,7 +59,7 @@ class Slam(SlamResults):
             static before it moved or before it was seen through.
         calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
             as it is; another is where the estimation begins, with ``sensor.self_calibration``.
-        live: A calibration is used as soon as it is found, and not at a fixed frame.
+        live: A calibration is used as soon as it is found, and the first poses are not estimated a second time.
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
@@ -107,7 +107,7 @@ class Slam(SlamResults):
         self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
-        self.localize = localize
+        self.localize, self.live = localize, live
         self.mapper = Mapper(
             config, self.camera, self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy,
             localize=localize,
@@ -247,7 +247,8 @@ class Slam(SlamResults):
 
     def _refine_start(self) -> None:
         """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
-        if self.prior_map is None and (correction := self.mapper.refine_start(self.tracker)) is not None:
+        wanted = self.prior_map is None and not self.live
+        if wanted and (correction := self.mapper.refine_start(self.tracker)) is not None:
             self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
