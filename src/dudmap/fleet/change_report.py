@@ -69,7 +69,7 @@ def change_page(
         "tints": {kind: int.from_bytes(bytes(tint), "big") for kind, tint in TINTS.items()},
     }  # fmt: skip
     library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
-    script = asset("changes.js")
+    script = Html(asset("packed_mesh.js") + asset("changes.js"))
     counts = ", ".join(f"{count} {kind}" for kind, count in tree["counts"].items() if kind in TINTS)
     parts = {
         "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),

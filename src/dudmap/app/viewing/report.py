@@ -181,7 +181,8 @@ def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
     found = run.mesh
     about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
-    license, three, script = (asset(name) for name in ("three.LICENSE.txt", "three.min.js", "report.js"))
+    license, three = asset("three.LICENSE.txt"), asset("three.min.js")
+    script = Html(asset("packed_mesh.js") + asset("report.js"))
     library = f"\n/* three.js\n{license}*/\n{three}"
     parts = {
         "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),

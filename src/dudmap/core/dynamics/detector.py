@@ -160,11 +160,8 @@ class DynamicDetector:
             moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
             exposure: Gain and offset that make the image's intensities those of the map.
         """
-        config, depth, noise = (
-            self.config,
-            level.depth,
-            noise_parameters(self.config, self.sensor, level, volume.voxel_size),
-        )
+        config, depth = self.config, level.depth
+        noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
         sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
         histogram = np.zeros(BINS, np.int64)

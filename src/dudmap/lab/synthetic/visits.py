@@ -70,15 +70,6 @@ class TrueChange:
             "before": self.before.round(4).tolist(), "after": self.after.round(4).tolist(),
         }  # fmt: skip
 
-    @classmethod
-    def of_tree(cls, tree: dict[str, Any]) -> "TrueChange":
-        """From a JSON file."""
-        arrays = {key: np.array(tree[key], float).reshape(-1, 3) for key in ("before", "after")}
-        return cls(
-            tree["thing"], tree["kind"], tree["size"], np.array(tree["T_after_before"]), arrays["before"],
-            arrays["after"], tree["symmetric"], np.array(tree["centre"]),
-        )  # fmt: skip
-
 
 def _skin(rng: np.random.Generator, size: float) -> Material:
     scale = float(rng.uniform(0.5, 1.0)) / size

@@ -2,28 +2,6 @@
 "use strict";
 
 const data = JSON.parse(document.getElementById("scene").textContent);
-const byId = (id) => document.getElementById(id);
-
-// Layout as in report.js: positions uint16 x 3, colours uint8 x 3, padding, differences of indices as int32.
-async function geometryOf(about, text) {
-  const bytes = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const buffer = await new Response(stream).arrayBuffer();
-  const steps = new Uint16Array(buffer, 0, 3 * about.vertices);
-  const positions = Float32Array.from(steps, (step, i) => {
-    const axis = i % 3;
-    return about.low[axis] + (step / 65535) * (about.high[axis] - about.low[axis]);
-  });
-  const colors = new Uint8Array(buffer, 6 * about.vertices, 3 * about.vertices);
-  const differences = new Int32Array(buffer, Math.ceil((9 * about.vertices) / 4) * 4, 3 * about.triangles);
-  let last = 0;
-  const indices = Uint32Array.from(differences, (difference) => (last += difference));
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
-  geometry.setAttribute("color", new THREE.BufferAttribute(colors, 3, true));
-  geometry.setIndex(new THREE.BufferAttribute(indices, 1));
-  return geometry;
-}
 
 function boxOf(change) {
   const [low, high] = change.box.map((corner) => new THREE.Vector3(...corner));
@@ -78,7 +56,7 @@ async function start() {
     const view = new View();
     const maps = { boxes: view.boxes };
     for (const [number, name] of ["before", "after"].entries()) {
-      const geometry = await geometryOf(data.meshes[number], byId(`mesh-${name}`).textContent);
+      const geometry = await meshGeometry(data.meshes[number], byId(`mesh-${name}`).textContent);
       maps[name] = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ vertexColors: true }));
       view.scene.add(maps[name]);
     }
