@@ -141,7 +141,9 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     T_a, T_b = before.T_common_map, after.T_common_map
     surfaces = new.sample(4000).surface(se3.inverse(T_b)), missing.sample(4000).surface(se3.inverse(T_a))
     for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN / 2]:
-        aligned = align_maps(after.volume, before.volume, *surfaces, se3.inverse(T_b) @ T @ T_a, MIN_POINTS)
+        aligned = align_maps(
+            after.volume, before.volume, *surfaces, se3.inverse(T_b) @ T @ T_a, MIN_POINTS, changed=True
+        )
         for candidate in (T_b @ aligned.T_a_b @ se3.inverse(T_a), T):
             fit = _fit(after, missing, new, candidate), _fit(before, new, missing, se3.inverse(candidate))
             if min(fit) > 0 and (best is None or sum(fit) > 2 * best.fit):
