@@ -7,9 +7,12 @@ same part of the place, which hold the error of the alignment and the bending of
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
@@ -62,10 +65,16 @@ class Evidence:
     min_weight: int
     other_color: NDArray[np.float32]
 
-    @property
+    @cached_property
     def points(self) -> NDArray[np.float64]:
         """Vertices (V, 3), metres."""
         return self.mesh.vertices.astype(np.float64)
+
+    @cached_property
+    def parts(self) -> NDArray[np.intp]:
+        """Number (V,) of the surface to which each vertex belongs if what the other map confirms is left out."""
+        faces = self.mesh.faces[np.all(self.state[self.mesh.faces] != CONFIRMED, axis=1)]
+        return components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(self.state))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +155,12 @@ def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArra
         inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         counts[inside] += nearest[v[inside], u[inside]] > (local[:, 2] + 2 * margin)[inside]
     return counts
+
+
+def components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    """Number (count,) of the connected component of each node of a graph with edges (n, 2)."""
+    graph = csr_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def surface_tree(points: NDArray[np.floating]) -> KDTree:

@@ -1,23 +1,23 @@
 """From denied surface to things: connected pieces, which of them moved, which came, went, or got other colours."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, surface_tree
+from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
+from dudmap.fleet.map_samples import EMPTY, OBSERVED
 
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 BRIDGE = 0.15
-"""The same through surface that the other map did not see, metres: free space is known in blocks, whose borders remain
-unknown."""
-LEAST_FACE = 0.3
-"""Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
+"""The same where no free space was seen between them, metres."""
+LEAST_FACE, LEAST_PART = 0.3, 0.2
+"""Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly. And that
+of a part of one, or of a thing that is a change because it is found elsewhere as well."""
 LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 CERTAIN = 2
@@ -43,13 +43,43 @@ class Piece:
         """Lower and upper corner (2, 3)."""
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
 
+    @property
+    def length(self) -> float:
+        """Diagonal of the box, metres."""
+        return float(np.linalg.norm(self.box[1] - self.box[0]))
 
-def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
-    """Pieces of surface that the other map denies beyond the noise, the largest first."""
+
+def denied_pieces(found: Evidence, own: Visit, voxel_size: float, min_size: float) -> list[Piece]:
+    """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
     pieces = connected(found.mesh, opened(found, found.state == DENIED), LINK * voxel_size)
-    unseen = found.mesh.faces[np.all(found.state[found.mesh.faces] != CONFIRMED, axis=1)]
-    pieces = bridged(pieces, unseen, len(found.state))
-    return [piece for piece in pieces if is_certain(piece, found, min_size)]
+    return assembled([piece for piece in pieces if piece.area > LEAST_PART * min_size**2], own, lambda _: BRIDGE)
+
+
+def assembled(pieces: list[Piece], own: Visit, reach: Callable[[Piece], float]) -> list[Piece]:
+    """Pieces, the largest first, joined with smaller ones in reach (m) if their own visit saw no free space between:
+    something stood before the middle of one thing."""
+    out: list[Piece] = []
+    for piece in sorted(pieces, key=lambda one: -one.area):
+        near = [
+            n
+            for n, one in enumerate(out)
+            if gap_between(one, piece) < reach(one) and is_hidden_between(one, piece, own)
+        ]
+        for n in reversed(near):
+            piece = joined([out.pop(n), piece])
+        out.append(piece)
+    return sorted(out, key=lambda one: -one.area)
+
+
+def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
+    """Whether the visit of two pieces saw no free space on half of the shortest ways from one to the other."""
+    some, steps = b.points[:: max(1, len(b.points) // 200)], np.linspace(0, 1, 20)[:, None]
+    gap, near = KDTree(a.points).query(some)
+    ways = np.argsort(gap)[: max(5, len(some) // 5)]
+    start, end = some[ways][:, None], a.points[near[ways]][:, None]
+    samples, clear = own.sample((start + (end - start) * steps).reshape(-1, 3)), 2 * own.volume.voxel_size
+    free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > clear))
+    return bool(np.median(free.reshape(len(ways), -1).mean(axis=1) * gap[ways]) < clear)
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
@@ -94,21 +124,8 @@ def connected(mesh: Mesh, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
     if len(numbers) == 0:
         return []
     places, cell = np.unique(np.floor(mesh.vertices[numbers] / (gap / 2)).astype(np.int64), axis=0, return_inverse=True)
-    group = _components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))
+    group = components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))
     return _grouped(numbers, group[cell.reshape(-1)], mesh)
-
-
-def bridged(pieces: list[Piece], unseen: NDArray[np.int32], count: int) -> list[Piece]:
-    """Pieces of which those are one that hang together by triangles (n, 3) of a mesh with ``count`` vertices."""
-    surface = _components(np.concatenate([unseen[:, :2], unseen[:, 1:]]), count)
-    parts = [np.unique(surface[piece.vertices]) for piece in pieces]
-    pairs = [
-        (a, b) for a in range(len(pieces)) for b in range(a)
-        if len(np.intersect1d(parts[a], parts[b], assume_unique=True))
-        and gap_between(pieces[a], pieces[b]) < BRIDGE
-    ]  # fmt: skip
-    group = _components(np.array(pairs, np.int64).reshape(-1, 2), len(pieces))
-    return [joined([pieces[n] for n in np.flatnonzero(group == g)]) for g in np.unique(group)]
 
 
 def gap_between(a: Piece, b: Piece) -> float:
@@ -132,12 +149,6 @@ def _grouped(numbers: NDArray[np.intp], group: NDArray[np.intp], mesh: Mesh) -> 
         points = mesh.vertices[numbers[members]].astype(np.float64)
         out.append(Piece(numbers[members], points, float(areas[members].sum())))
     return sorted(out, key=lambda piece: -piece.area)
-
-
-def _components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
-    """Number (count,) of the connected component of each node of a graph with edges (n, 2)."""
-    graph = csr_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:

@@ -67,7 +67,7 @@ def align_maps(
 
     It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
     scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities Huber
-    weights. ``changed``: Things may have moved or been painted; intensities then have Geman-McClure weights as well, and
+    weights. ``changed``: Things may have moved or been painted; intensities then have Geman-McClure weights too, and
     count as much as their noise against that of the distances allows, since many that are far off would outweigh both.
     """
     exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
