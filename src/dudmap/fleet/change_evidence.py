@@ -54,6 +54,7 @@ class Evidence:
         weight: (V,) float32, of the own map there.
         min_weight: Weight that the mesh needs.
         other_color: (V, 3) float32, colour of the other map where it confirms, else 0.
+        cameras: (k, 3) positions of the own keyframes, metres, common frame.
     """
 
     mesh: Mesh
@@ -64,6 +65,7 @@ class Evidence:
     weight: NDArray[np.float32]
     min_weight: int
     other_color: NDArray[np.float32]
+    cameras: NDArray[np.float64]
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
@@ -133,7 +135,8 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     blur = EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel).astype(np.float32)
     color = np.where((state == CONFIRMED)[:, None], samples.color, 0)
     weight = own.sample(points).weight
-    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color)
+    cameras = own.keyframes[:, :3, 3]
+    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color, cameras)
 
 
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:

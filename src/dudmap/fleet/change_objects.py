@@ -20,6 +20,8 @@ LEAST_FACE, LEAST_PART = 0.3, 0.2
 of a part of one, or of a thing that is a change because it is found elsewhere as well."""
 LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
+LEAST_FACING = 0.1
+"""Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
 CERTAIN = 2
 """A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
 
@@ -83,11 +85,19 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
-    """Whether a piece is large enough, wider than the depth edges there, and was seen often enough."""
+    """Whether a piece is large enough, wider than the depth edges there, and was seen often enough, from its front."""
     if piece.area < LEAST_FACE * min_size**2 or np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
+        return False
+    if np.median(_facing(found, piece.vertices[:: max(1, len(piece.vertices) // 500)])) < LEAST_FACING:
         return False
     blur = float(np.median(found.blur[piece.vertices]))
     return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
+
+
+def _facing(found: Evidence, vertices: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Cosine (n,) of the angle at which some keyframe sees each of some vertices best; negative from behind."""
+    rays = found.cameras[:, None] - found.points[vertices]
+    return (((rays * found.mesh.normals[vertices]).sum(axis=2)) / np.linalg.norm(rays, axis=2)).max(axis=0)
 
 
 def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
