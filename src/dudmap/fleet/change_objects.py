@@ -1,6 +1,5 @@
 """From denied surface to things: connected pieces, which of them moved, which came, went, or got other colours."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,14 +14,15 @@ LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 BRIDGE = 0.15
 """The same where no free space was seen between them, metres."""
-LEAST_FACE, LEAST_PART = 0.3, 0.2
-"""Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly. And that
-of a part of one, or of a thing that is a change because it is found elsewhere as well."""
+REACH = 0.25
+"""The same beside a larger piece, in its lengths."""
+LEAST_FACE = 0.3
+"""Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
 LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 LEAST_FACING = 0.1
 """Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
-CERTAIN = 2
+CERTAIN = 3
 """A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
 
 
@@ -54,23 +54,24 @@ class Piece:
 def denied_pieces(found: Evidence, own: Visit, voxel_size: float, min_size: float) -> list[Piece]:
     """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
     pieces = connected(found.mesh, opened(found, found.state == DENIED), LINK * voxel_size)
-    return assembled([piece for piece in pieces if piece.area > LEAST_PART * min_size**2], own, lambda _: BRIDGE)
+    return assembled([piece for piece in pieces if piece.area > LEAST_FACE * min_size**2], own, 0.0)
 
 
-def assembled(pieces: list[Piece], own: Visit, reach: Callable[[Piece], float]) -> list[Piece]:
-    """Pieces, the largest first, joined with smaller ones in reach (m) if their own visit saw no free space between:
-    something stood before the middle of one thing."""
+def assembled(pieces: list[Piece], own: Visit, reach: float = REACH) -> list[Piece]:
+    """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space: something
+    stood before the middle of one thing. ``reach`` is that of the larger one, in its lengths."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
-        near = [
-            n
-            for n, one in enumerate(out)
-            if gap_between(one, piece) < reach(one) and is_hidden_between(one, piece, own)
-        ]
-        for n in reversed(near):
-            piece = joined([out.pop(n), piece])
+        for n in reversed(range(len(out))):
+            if is_part(piece, out[n], own, reach):
+                piece = joined([out.pop(n), piece])
         out.append(piece)
     return sorted(out, key=lambda one: -one.area)
+
+
+def is_part(piece: Piece, thing: Piece, own: Visit, reach: float = REACH) -> bool:
+    """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
+    return gap_between(thing, piece) < max(BRIDGE, reach * thing.length) and is_hidden_between(thing, piece, own)
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:

@@ -13,7 +13,16 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.fleet.change_colors import SOLID, recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import LEAST_FIT, Body, Motion, motion_between
-from dudmap.fleet.change_objects import Piece, assembled, connected, denied_pieces, gap_between, is_certain, joined
+from dudmap.fleet.change_objects import (
+    Piece,
+    assembled,
+    connected,
+    denied_pieces,
+    gap_between,
+    is_certain,
+    is_part,
+    joined,
+)
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 from dudmap.io.exporting.gravity import CONE, PARALLEL
 from dudmap.io.exporting.mesh_editing import with_faces
@@ -23,8 +32,6 @@ NEAR = 0.3
 """Gap between surfaces of one thing that moved by less than its size, metres: they then are its opposite faces."""
 ON_SURFACE = 0.02
 """Gap to a change beside which other colours are those that it has left at the border, metres."""
-REACH = 0.25
-"""Gap between parts of one thing that nothing was seen of, in its lengths."""
 LEAST_UNKNOWN = 0.25
 """Surface of a part of the place that only one visit saw, square metres, from which on it is listed."""
 
@@ -84,7 +91,7 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     missing, new = (denied_pieces(one, own, voxel, min_size) for one, own in zip(found, (before, after), strict=True))
     out = _moved(before, after, found, missing, new, min_size) if missing and new else []
     for kind, pieces, one, own in (("disappeared", missing, found[0], before), ("appeared", new, found[1], after)):
-        for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own, lambda p: REACH * p.length):
+        for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own):
             sides = (piece, None) if kind == "disappeared" else (None, piece)
             out.append(Change(kind, *sides, _confidence(piece, one)))
     painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
@@ -122,17 +129,26 @@ def _moved(
     out: list[Change] = []
     surfaces = (surface_tree(after.mesh.vertices), surface_tree(before.mesh.vertices)) if motions else ()
     for motion, old, now in sorted(motions, key=lambda row: -row[0].explained):
-        if not (any(old is piece for piece in missing) and any(now is piece for piece in new)):
+        if old not in missing or now not in new:
             continue
         both, T, length = [], motion.T_after_before, max(old.length, now.length)
-        for pieces, first, one, there, T_there, tree in zip(
-            (missing, new), (old, now), found, (after, before), (T, se3.inverse(T)), surfaces, strict=True
+        for pieces, first, one, own, there, T_there, tree in zip(
+            (missing, new),
+            (old, now),
+            found,
+            (before, after),
+            (after, before),
+            (T, se3.inverse(T)),
+            surfaces,
+            strict=True,
         ):
             parts = [
                 p for p in pieces
                 if p is first or (gap_between(p, first) < length and _goes_along(p, one, there, T_there, tree))
             ]  # fmt: skip
-            pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
+            thing = joined(parts)
+            parts += [p for p in pieces if p not in parts and p.area < thing.area and is_part(p, thing, own)]
+            pieces[:] = [p for p in pieces if p not in parts]
             both.append(joined(parts))
         out.append(Change("moved", both[0], both[1], motion.fit, T))
     return out
