@@ -14,11 +14,19 @@ from scipy.spatial import KDTree
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.fleet.changes import Change
+from dudmap.fleet.change_evidence import Visit
+from dudmap.fleet.changes import Change, vertical
 from dudmap.fleet.diff import compared
+from dudmap.fleet.map_samples import OBSERVED
+from dudmap.io.sequences import Sequence as Recording
 from dudmap.lab.benchmark.measure import save
+from dudmap.lab.synthetic.inserted import WithThing
 from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.scene import Primitive
+from dudmap.lab.synthetic.visits import THINGS as MAKERS
 from dudmap.lab.synthetic.visits import TrueChange, visits
 
 SCENES = {"room": 0.5, "corridor": 0.2, "desk": 0.3}
@@ -155,6 +163,56 @@ def measure_pair(job: tuple[dict[str, Any], Config, float]) -> dict[str, Any]:
             return row | {"error": str(error), "things": [], "false": []}
         row["seconds"] = round(time.perf_counter() - start, 2)
     return row | score_pair(changes, truth, recordings[0].ground_truth.Ts_world_camera[0])
+
+
+def measure_insertions(
+    recording: Recording, seed: int, count: int, config: Config, min_size: float, done: Callable[[dict[str, Any]], None]
+) -> list[dict[str, Any]]:
+    """Rows of so many things that are put into the second half of a real recording, or cut out of it: every other pair
+    is compared the other way round."""
+    rng, middle, rows = np.random.default_rng([seed, 35]), len(recording) // 2, []
+    halves = range(middle), range(middle, len(recording))
+    with tempfile.TemporaryDirectory() as folder:
+        plain = [Path(folder) / "before", Path(folder) / "plain"]
+        empty = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+        for frames, out in zip(halves, plain, strict=True):
+            run(WithThing(recording, frames, empty, []), config, out, progress=False)
+        trajectory = Trajectory.load(plain[1] / "trajectory.txt")
+        visit = Visit.of(SavedMap.load(plain[1]), np.eye(4))
+        for number in range(count):
+            size = float(rng.uniform(SMALL, 0.3))
+            thing = WithThing(recording, halves[1], trajectory, _stood(visit, rng, size))
+            after = Path(folder) / "after"
+            run(thing, config, after, progress=False)
+            points = np.unique(np.concatenate(thing.seen).round(2), axis=0)
+            none, kind = np.empty((0, 3)), ("appeared", "disappeared")[number % 2]
+            sides = (none, points) if kind == "appeared" else (points, none)
+            true = TrueChange("box", kind, size, np.eye(4), *sides, symmetric=False, at=points.mean(axis=0))
+            found = compared(*((plain[0], after) if kind == "appeared" else (after, plain[0])), min_size)
+            T = se3.inverse(found.visits[1].T_common_map) if kind == "appeared" else np.eye(4)
+            rows.append({"pair": number, "scene": recording.name} | score_pair(found.changes, [true], T))
+            done(rows[-1])
+    return rows
+
+
+def _stood(visit: Visit, rng: np.random.Generator, size: float) -> list[Primitive]:
+    """A box on a level surface in view of a visit, where nothing is in its way."""
+    up, mesh, camera = vertical(visit), visit.mesh, visit.volume.camera
+    level = np.flatnonzero(mesh.normals @ up > 0.95)
+    for vertex in rng.permutation(level)[:5000]:
+        at = mesh.vertices[vertex].astype(np.float64)
+        local = np.einsum("nij,j->ni", np.linalg.inv(visit.views), np.append(at + up * size / 2, 1))[:, :3]
+        pixel = camera.project(local)
+        inside = (local[:, 2] > 0.7) & (local[:, 2] < 2.5) & np.all((pixel > 60) & (pixel < (580, 420)), axis=1)
+        side = np.cross(up, rng.normal(size=3))
+        side /= np.linalg.norm(side)
+        T = np.eye(4)
+        T[:3] = np.stack([side, np.cross(up, side), up, at], axis=1)
+        solids = [solid.moved(T) for solid in MAKERS["box"][0](rng, size)]
+        around = rng.uniform(-0.6, 0.6, (300, 3)) * size + at + up * 0.75 * size
+        if inside.mean() > 0.3 and np.all(visit.sample(around).state != OBSERVED):
+            return solids
+    raise ConfigError("no level surface in the second half of the recording has room for a thing of 30 cm in view")
 
 
 def measure_changes(
