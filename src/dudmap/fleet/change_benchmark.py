@@ -20,7 +20,7 @@ from dudmap.errors import ConfigError, DudmapError
 from dudmap.fleet.change_evidence import Visit
 from dudmap.fleet.changes import Change, vertical
 from dudmap.fleet.diff import compared
-from dudmap.fleet.map_samples import OBSERVED
+from dudmap.fleet.map_samples import OBSERVED, UNSEEN
 from dudmap.io.sequences import Sequence as Recording
 from dudmap.lab.benchmark.measure import save
 from dudmap.lab.synthetic.inserted import WithThing
@@ -209,18 +209,29 @@ def _stood(visit: Visit, rng: np.random.Generator, size: float) -> list[Primitiv
         T = np.eye(4)
         T[:3] = np.stack([side, np.cross(up, side), up, at], axis=1)
         solids = [solid.moved(T) for solid in MAKERS["box"][0](rng, size)]
-        around = rng.uniform(-0.6, 0.6, (300, 3)) * size + at + up * 0.75 * size
-        if inside.mean() > 0.3 and np.all(visit.sample(around).state != OBSERVED):
+        around = rng.uniform(-0.5, 0.5, (300, 3)) * size + at + up * 0.7 * size
+        samples = visit.sample(around)
+        blocked = (samples.state == OBSERVED) & (samples.sdf < 0.1 * size)
+        if inside.mean() > 0.3 and not blocked.any() and np.mean(samples.state != UNSEEN) > 0.7:
             return solids
-    raise ConfigError("no level surface in the second half of the recording has room for a thing of 30 cm in view")
+    raise ConfigError("no level surface in the second half of the recording has room for a box in view")
 
 
 def measure_changes(
-    seed: int, count: int, config: Config, out: Path, min_size: float, done: Callable[[dict[str, Any]], None]
+    seed: int,
+    count: int,
+    config: Config,
+    out: Path,
+    min_size: float,
+    done: Callable[[dict[str, Any]], None],
+    recording: Recording | None = None,
 ) -> tuple[list[dict[str, Any]], str]:
-    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``."""
-    rows = []
-    for number in range(count):
+    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``.
+
+    The pairs are rendered ones, or with a recording its halves, see ``measure_insertions``.
+    """
+    rows = [] if recording is None else measure_insertions(recording, seed, count, config, min_size, done)
+    for number in range(count) if recording is None else ():
         row = {"pair": number} | measure_pair((draw_pair(seed, number), config, min_size))
         rows.append(row)
         done(row)

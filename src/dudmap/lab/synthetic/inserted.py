@@ -14,7 +14,7 @@ from dudmap.lab.synthetic.sensors import Sensor
 
 
 class WithThing:
-    """Some frames of a recording, with solids where nothing nearer hides them.
+    """Some frames of a recording, with solids where nothing nearer hides them; a pixel without a reading does not.
 
     Args:
         recording: Its colour must be registered to its depth.
@@ -54,7 +54,7 @@ class WithThing:
         rendering = self._renderer.render(self.camera, T, np.empty((0, 4, 4)), np.empty(0, bool))
         depth, color = self._sensor.measure(rendering, self.camera.fx, index)
         before = (rendering.depth > 0) & ((frame.depth == 0) | (rendering.depth < frame.depth))
-        shown = before & (frame.depth > 0) & (depth > 0)
+        shown = before & (depth > 0)
         points = self.camera.backproject(np.where(shown, rendering.depth, 0))[shown].astype(np.float64)
         self.seen.append(points @ T[:3, :3].T + T[:3, 3])
         return replace(
