@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.bootstrap import WINDOW_STEP, Bootstrap, StartFrame
-from dudmap.core.dynamics.masks import grown_mask
+from dudmap.core.dynamics.masks import outside
 from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -75,8 +75,8 @@ class Mapper:
         """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
         if self._config.relocalization.enabled and not (view.blind or self._localize):
             with view.timer("keyframe"):
-                T_world_camera = estimate.T_world_camera
-                self._atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self._atlas.current)
+                atlas, T_world_camera = self._atlas, estimate.T_world_camera
+                atlas.keyframes.add(view.observation, T_world_camera, dynamic_mask, atlas.current)
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
         if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
@@ -127,7 +127,7 @@ class Mapper:
 
     def _static(self, dynamic_mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Pixels (H, W) that are fused."""
-        return ~grown_mask(dynamic_mask, self._config.dynamics.margin_px * self._camera.width // 640)
+        return outside(dynamic_mask, self._config.dynamics.margin_px * self._camera.width // 640)
 
     def integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""

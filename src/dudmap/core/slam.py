@@ -139,6 +139,7 @@ class Slam(SlamResults):
         if isinstance(frame, Frame):
             start = time.perf_counter()
             observation = self.preprocess(frame)
+            _ = observation.num_readings  # cached there for the result
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
@@ -183,7 +184,7 @@ class Slam(SlamResults):
         view = self.color_motion.predicted(view)
         if self.reference.is_empty:
             return self._start_map(view)
-        view = replace(view, blind=self._is_blind(view))
+        view = replace(view, blind=True) if self._is_blind(view) else view
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
             self._refine_start()
@@ -240,7 +241,8 @@ class Slam(SlamResults):
     def _resumed(self, view: FrameView) -> FrameView:
         """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
         may be elsewhere."""
-        view = replace(view, observation=self.stream.restamped(view.observation))
+        if self.stream.clock_offset != 0:
+            view = replace(view, observation=self.stream.restamped(view.observation))
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
@@ -335,9 +337,10 @@ class Slam(SlamResults):
         if self.atlas.history is None or view.blind:
             return T_world_camera, False
         with view.timer("loops"):
-            levels = view.pyramid.tracked
-            weights = estimate.static_weights(levels)
-            query = LoopQuery(view.observation, levels, weights, ~dynamic_mask, estimate.tracking)
+            query = LoopQuery(
+                view.observation, view.pyramid.tracked, estimate.tracking, dynamic_mask, estimate.labels,
+                estimate.unverified_mask,
+            )  # fmt: skip
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
@@ -375,13 +378,13 @@ class Slam(SlamResults):
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
-        readings = view.observation.depth > 0
+        readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
-            dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
+            dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,

@@ -14,27 +14,24 @@ class StageTimer:
 
     def __init__(self, timings: dict[str, float] | None = None) -> None:
         self.timings = timings or {}
+        self._running: tuple | None = None  # stage, start, milliseconds within the outer stage, the outer stage
+        self._stage = ""
         self._within = 0.0  # milliseconds of the stages that ran within the one that is running
 
-    def __call__(self, stage: str) -> "_Block":
+    def __call__(self, stage: str) -> "StageTimer":
         """Context manager that measures a block of code; a block left by an exception is not counted."""
-        return _Block(self, stage)
-
-
-class _Block:
-    """A block of code that is measured; a generator with ``contextmanager`` would take three times as many calls."""
-
-    __slots__ = ("_before", "_stage", "_start", "_timer")
-
-    def __init__(self, timer: StageTimer, stage: str) -> None:
-        self._timer, self._stage = timer, stage
+        self._stage = stage
+        return self
 
     def __enter__(self) -> None:
-        timer = self._timer
-        self._start, self._before, timer._within = time.perf_counter(), timer._within, 0.0
+        self._running = self._stage, time.perf_counter(), self._within, self._running
+        self._within = 0.0
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        assert self._running is not None
+        stage, start, before, self._running = self._running
+        within, self._within = self._within, before
         if kind is None:
-            timer, ms = self._timer, 1000 * (time.perf_counter() - self._start)
-            timer.timings[self._stage] = timer.timings.get(self._stage, 0.0) + ms - timer._within
-            timer._within = self._before + ms
+            ms, timings = 1000 * (time.perf_counter() - start), self.timings
+            timings[stage] = (timings[stage] if stage in timings else 0.0) + ms - within
+            self._within += ms

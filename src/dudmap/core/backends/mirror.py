@@ -60,7 +60,7 @@ class Mirror:
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
     """An array as it is, and a mirror's array up to date."""
-    return array.host if isinstance(array, Mirror) else array
+    return array.host if type(array) is Mirror else array
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:

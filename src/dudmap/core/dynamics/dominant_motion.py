@@ -142,18 +142,16 @@ def dominant_motion(
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
     camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
-    expected = reproject(T_expected, _points(fine, before.corners), camera)
-    pixels, targets, difference = track_forward_backward(first, second, before.corners, expected)
-    points = _points(fine, pixels)
-    candidate = np.ones(len(points), dtype=bool)
-    if moving is not None:
-        columns, rows = _pixels_of_level(pixels, fine, before.labelled).T
-        candidate = ~moving[rows, columns]
+    points = before.corner_points
+    expected = reproject(T_expected, points, camera)
+    pixels, targets, difference, found = track_forward_backward(first, second, before.corners, expected)
+    points, labelled = points[found], _pixels_of_level(pixels, fine, before.labelled)
+    candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
         return None
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected)
     predicted = reproject(T, points, camera)
-    error = np.linalg.norm(predicted - targets, axis=1)
+    error = _lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
     inlier, areas = error < threshold, points[:, 2] ** 2
     if np.count_nonzero(candidate & inlier) < FEWEST:
@@ -162,24 +160,22 @@ def dominant_motion(
     near = error < MOVES_SIGMAS * threshold
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
-    limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
+    limit = least + MOVES_SHARE * _lengths(targets - pixels)
     moves = error > limit
     kept = ~moves
     moves &= (error <= intervals * limit) & (_depth_change(T, points, targets, fine_after) <= intervals * limit)
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
-    pixels, targets, points, moves = pixels[kept], targets[kept], points[kept], moves[kept]
-    columns, rows = np.clip(np.rint(targets), 0, np.array(fine_after.depth.shape[::-1]) - 1).astype(np.int64).T
+    targets, points, moves = targets[kept], points[kept], moves[kept]
+    columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
     seen = z > 0
     points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], z)[seen]
     return DominantMotion(
         T,
         share,
-        LabelledCorners(
-            before.labelled, segmentations[0], points, _pixels_of_level(pixels, fine, before.labelled), moves
-        ),
+        LabelledCorners(before.labelled, segmentations[0], points, labelled[kept], moves),
         LabelledCorners(
             after.labelled,
             segmentations[1],
@@ -201,7 +197,7 @@ def _depth_change(
         targets: (n, 2) where they were found in the second image; without a reading there is no change.
         level: The second image.
     """
-    u, v = np.clip(np.rint(targets), 0, np.array(level.depth.shape[::-1]) - 1).astype(np.int64).T
+    u, v = _nearest_pixels(targets, level).T
     found, expected = level.depth[v, u], points @ T[2, :3] + T[2, 3]
     change = np.maximum(np.abs(found - expected) - SAME_SURFACE * expected, 0) / np.maximum(expected, 1e-6)
     return np.where(found > 0, change * level.camera.fx, 0.0)
@@ -209,9 +205,9 @@ def _depth_change(
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Smallest of the values (n,), n > 0, that together with the smaller ones has half of the weight (n,)."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+    order = values.argsort()
+    total = weights[order].cumsum()
+    return float(values[order[total.searchsorted(total[-1] / 2)]])
 
 
 def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
@@ -253,14 +249,19 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     return static[corners.segmentation.labels]
 
 
-def _points(level: Level, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Points (n, 3) at pixels (n, 2) u, v of an image, metres, camera frame."""
-    u, v = pixels.T
-    return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n,) of vectors (n, 2)."""
+    squares = vectors * vectors
+    return np.sqrt(squares[:, 0] + squares[:, 1])
 
 
 def _pixels_of_level(pixels: NDArray[np.number], level: Level, other: Level) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
-    last = np.array(other.depth.shape[::-1]) - 1
-    return np.clip(np.rint((pixels + 0.5) * scale - 0.5), 0, last).astype(np.int64)
+    return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
+
+
+def _nearest_pixels(positions: NDArray[np.float64], level: Level) -> NDArray[np.int64]:
+    """Pixels (n, 2) int u, v of a level nearest to positions (n, 2)."""
+    last = level.camera.width - 1, level.camera.height - 1
+    return np.minimum(np.maximum(np.rint(positions), 0), last).astype(np.int64)

@@ -1,6 +1,8 @@
 """Labels of a frame, and the masks derived from them."""
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +66,11 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     if not (hidden or labels.dynamic.any()):
         return np.zeros(depth.shape, dtype=bool)
     element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
-    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, element)
+    low = cv2.morphologyEx(labels.dynamic.view(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
     if hidden:
         low[labels.hidden] = 1
-    return full_size(low > 0, level.depth, depth)
+    return full_size(low.view(np.bool_), level.depth, depth)
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -79,23 +81,24 @@ def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDA
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
     """
-    halvings = round(np.log2(depth.shape[1] / low.shape[1]))
+    halvings = round(math.log2(depth.shape[1] / low.shape[1]))
     return labeling.upsample_labels(low, low_depth, depth, 1 << halvings)
 
 
-def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """Mask (H, W) dilated by some pixels."""
+def outside(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
+    """Pixels (H, W) that lie farther than so many pixels from those of a mask."""
     import cv2
 
-    if pixels == 0 or not mask.any():
-        return mask
-    marks, grown = mask.astype(np.uint8), np.zeros_like(mask)
+    marks, out = mask.view(np.uint8), np.full(mask.shape, 1, np.uint8)
     x, y, width, height = cv2.boundingRect(marks)
-    around = np.s_[max(y - pixels, 0) : y + height + pixels, max(x - pixels, 0) : x + width + pixels]
-    grown[around] = cv2.dilate(marks[around], elliptical_kernel(pixels)) > 0
-    return grown
+    if width:
+        rows, columns = slice(max(y - margin, 0), y + height + margin), slice(max(x - margin, 0), x + width + margin)
+        grown = cv2.dilate(marks[rows, columns], elliptical_kernel(margin)) if margin else marks[rows, columns]
+        out[rows, columns] = 1 - grown
+    return out.view(np.bool_)
 
 
+@lru_cache(maxsize=16)
 def elliptical_kernel(radius: float) -> NDArray[np.uint8]:
     """Elliptical structuring element of at least 3x3 pixels."""
     import cv2

@@ -1,5 +1,7 @@
 """Robust estimation of the rigid motion that most of the visible surface follows (RANSAC, Fischler and Bolles 1981)."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,14 +62,14 @@ def rigid_motion(
         T_expected: (4, 4) predicted motion.
     """
     areas, n = points[:, 2] ** 2, len(points)
-    rng = np.random.default_rng(0)
-    draws = np.concatenate([
-        rng.integers(0, n, (HYPOTHESES, 3)),
-        rng.choice(n, (HYPOTHESES, 3), p=areas / areas.sum()),
-    ])  # fmt: skip
+    rng, draws = np.random.default_rng(0), np.empty((2 * HYPOTHESES, 3), np.int64)
+    draws[:HYPOTHESES] = rng.integers(0, n, (HYPOTHESES, 3))
+    shares = (areas / areas.sum()).cumsum()
+    draws[HYPOTHESES:] = (shares / shares[-1]).searchsorted(rng.random((HYPOTHESES, 3)), side="right")
     expected = reproject(T_expected, points, camera)
-    at, seen_at, expected_at = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
-    found = consensus.Correspondences(at, seen_at, expected_at, areas, camera.intrinsics)
+    found = consensus.Correspondences(
+        points.T.copy(), targets.T.copy(), expected.T.copy(), areas, camera.intrinsics
+    )  # fmt: skip
     return consensus.best_motion(draws, found, _params(camera), T_expected)
 
 
@@ -76,6 +78,7 @@ def pixels_at_width(distance: float, camera: Camera) -> float:
     return distance * camera.width / REFERENCE_WIDTH
 
 
+@lru_cache(maxsize=8)
 def _params(camera: Camera) -> ConsensusParams:
     levels = np.array(NOISE_LEVELS)
     gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
@@ -86,5 +89,4 @@ def _params(camera: Camera) -> ConsensusParams:
 def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Pixels (n, 2) of points (n, 3) after a motion T (4, 4); points behind the camera land far outside the image."""
     moved = points @ T[:3, :3].T + T[:3, 3]
-    z = np.maximum(moved[:, 2], 1e-6)
-    return np.stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy], axis=1)
+    return camera.focal * moved[:, :2] / np.maximum(moved[:, 2:], 1e-6) + camera.centre

@@ -1,6 +1,7 @@
 """A preprocessed frame and the levels of its image pyramid."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,16 @@ class Observation:
     color_offset: float = 0.0
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
+
+    @cached_property
+    def readings(self) -> NDArray[np.bool_]:
+        """(H, W) bool, pixels with a depth."""
+        return self.depth > 0
+
+    @cached_property
+    def num_readings(self) -> int:
+        """Number of pixels with a depth."""
+        return np.count_nonzero(self.readings)
 
     @property
     def as_recorded(self) -> Frame:

@@ -57,6 +57,12 @@ class Pyramid:
         """Corners (n, 2) int of the finest level, pixels u, v."""
         return corners(self.fine, self.grey)
 
+    @cached_property
+    def corner_points(self) -> NDArray[np.float64]:
+        """Points (n, 3) at the corners, metres, camera frame."""
+        (u, v), level = self.corners.T, self.fine
+        return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
+
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
     """Mask (H, W) at the size of a level: a pixel is set if any part of it lies in the mask."""

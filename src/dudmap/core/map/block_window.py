@@ -109,7 +109,10 @@ class BlockWindow:
             MapError: A cell lies too far from where the map began.
         """
         assert self.origin is not None
-        coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
+        coords, (_, size_y, size_z) = np.empty((len(cells), 3), np.int64), self.shape
+        planes, coords[:, 2] = np.divmod(cells, size_z)
+        coords[:, 0], coords[:, 1] = np.divmod(planes, size_y)
+        coords += self.origin
         if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
             farthest = MAX_COORDINATE * self.block_size
             raise MapError(

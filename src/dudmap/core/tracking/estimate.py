@@ -47,10 +47,6 @@ class PoseEstimate:
         """Gain and offset that map the frame's intensities to those of the map."""
         return self.tracking.exposure
 
-    def static_weights(self, levels: list[Level]) -> list[NDArray[np.float32]] | None:
-        """Registration weights (h, w) in [0, 1] of each level; None counts every pixel fully."""
-        return None if self.labels is None else static_weights(self.labels, levels, self.unverified_mask)
-
 
 def static_weights(
     labels: Labels, levels: list[Level], unverified_mask: NDArray[np.bool_] | None = None

@@ -51,4 +51,7 @@ class FrameView:
     @property
     def textureless(self) -> bool:
         """Whether the intensities carry no information."""
-        return bool(self.pyramid.coarse.intensity.std() < TEXTURELESS)
+        import cv2
+
+        _, deviation = cv2.meanStdDev(self.pyramid.coarse.intensity)
+        return bool(deviation[0, 0] < TEXTURELESS)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.image_comparison import compare_images
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.cpu.reprojection import reproject
 from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
@@ -135,10 +135,12 @@ class ImageConsistency:
         level, (last, moved, blind) = view.pyramid.coarse, self._last
         T_world_camera = estimate.T_world_camera if T_world_camera is None else T_world_camera
         T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
-        target = ReprojectionTarget(T_last_camera, last.depth, last.intensity, moved)
-        ((gap, difference, marks),) = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])
+        older = np.array([(last.depth, last.intensity)])
+        gaps, differences, marks = reproject(
+            level.depth, level.intensity, level.camera.intrinsics, T_last_camera[None], older, moved[None]
+        )  # fmt: skip
         shift, agreeing, readings, seen = compare_images(
-            level.depth, level.intensity, _dynamic(estimate, level), gap, difference, marks,
+            level.depth, level.intensity, _dynamic(estimate, level), gaps[0], differences[0], marks[0],
             noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
         )  # fmt: skip
         shift = np.nan if view.blind or blind else shift

@@ -72,6 +72,7 @@ class QualityMonitor:
         self._residuals: deque[float] = deque(maxlen=HISTORY)
         self._shares: deque[float] = deque(maxlen=HISTORY)
         self._colors: deque[float] = deque(maxlen=HISTORY)
+        self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN where they are not known yet
         self.recovering = False
         self.images.reset()
 
@@ -85,6 +86,7 @@ class QualityMonitor:
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
         self._colors.extend(history.colors)
+        self._update_usual()
 
     def judge(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> Verdict:
         """Figures of a registered frame, and the reason of the first check of ``CHECKS`` that it fails.
@@ -124,17 +126,15 @@ class QualityMonitor:
 
     def limits(self, mode: str, *, crowded: bool = False) -> Limits:
         """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
-        usual = (np.nan, np.nan, np.nan)
-        if len(self._residuals) >= MIN_HISTORY:
-            usual = 1000 * _median(self._residuals), _median(self._shares), _median(self._colors)
-        config = self.config
-        return Limits(config.tracker, config.sensor, config.dynamics.max_share, mode, crowded, *usual)
+        config, (residual, overlap, color) = self.config, self._usual
+        share = config.dynamics.max_share
+        return Limits(config.tracker, config.sensor, share, mode, crowded, 1000 * residual, overlap, color)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
         if len(self._residuals) < MIN_HISTORY:
             return 1.0, 1.0
-        residual, color = (_median(q) for q in (self._residuals, self._colors))
+        residual, _, color = self._usual
         return tracking.residual / max(residual, 1e-6), tracking.color_residual / max(color, SMALL_COLOR_RESIDUAL)
 
     def is_unusual(self, tracking: TrackingResult) -> bool:
@@ -148,13 +148,15 @@ class QualityMonitor:
         self._shares.append(tracking.inlier_share)
         if np.isfinite(tracking.color_residual):
             self._colors.append(tracking.color_residual)
+        self._update_usual()
         self.recovering = False
+
+    def _update_usual(self) -> None:
+        if len(self._residuals) >= MIN_HISTORY:
+            median = statistics.median
+            colors = median(self._colors) if self._colors else np.nan
+            self._usual = median(self._residuals), median(self._shares), colors
 
     def lose(self) -> None:
         """Judge strictly until a frame is accepted again."""
         self.recovering = True
-
-
-def _median(values: deque[float]) -> float:
-    """Median of a few values, NaN of none."""
-    return statistics.median(values) if values else np.nan
