@@ -7,8 +7,7 @@ import pytest
 
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.dynamics import dominant_motion as dominant
-from dudmap.core.dynamics.dominant_motion import dominant_motion
-from dudmap.core.dynamics.ransac import reproject, rigid_motion
+from dudmap.core.dynamics.dominant_motion import dominant_motion, reproject, rigid_motion
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera

@@ -10,8 +10,7 @@ from dudmap import Config, Slam
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
 from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.image_consistency import ImageComparison
-from dudmap.core.tracking.quality_monitor import MIN_HISTORY
+from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 
 CONFIG = Config()

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
-from dudmap.core.bootstrap import Bootstrap
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import full_mask
@@ -23,7 +22,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.mapper import Mapper
+from dudmap.core.mapper import Bootstrap, Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
@@ -34,11 +33,10 @@ from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult
 from dudmap.core.slam_results import SlamResults
-from dudmap.core.stage_timer import StageTimer
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.observability import sentence as unobserved

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.splatting import PointImage, overwrite, splat
-from dudmap.core.dynamics.label_scale import scaled_length
+from dudmap.core.dynamics.segments import scaled_length
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 

@@ -24,13 +24,10 @@ from dudmap.core.backends.cpu.segment_motion import moving_segments
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.background_model import BackgroundModel
-from dudmap.core.dynamics.label_scale import pixel_scale, scaled_length
-from dudmap.core.dynamics.masks import SEAM, Labels, elliptical_kernel
-from dudmap.core.dynamics.mixture import RULES, Mixture
-from dudmap.core.dynamics.segments import Segmentation, segment
+from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
+from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
-from dudmap.core.frames.exposure import exposed
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, exposed
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
 
 MAX_GAP = 1.5

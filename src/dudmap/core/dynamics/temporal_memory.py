@@ -11,8 +11,7 @@ from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.reprojection import Reprojection, reproject
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-from dudmap.core.dynamics.label_scale import scaled_side
-from dudmap.core.dynamics.segments import Segmentation
+from dudmap.core.dynamics.segments import Segmentation, scaled_side
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 

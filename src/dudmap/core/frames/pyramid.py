@@ -69,12 +69,12 @@ def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
     import cv2
 
     size = level.depth.shape[::-1]
-    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
 
 
 def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
     """Whether more than half of the readings of a level are marked as moving (h, w) bool."""
-    return bool(2 * np.count_nonzero(moving) > np.count_nonzero(level.depth))
+    return bool(2 * np.count_nonzero(moving) > level.num_readings)
 
 
 def halved(observation: Observation, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

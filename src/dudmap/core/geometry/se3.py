@@ -127,7 +127,7 @@ def log_rotation(R: Matrix) -> Matrix:
 
 def inverse(T: Matrix) -> Matrix:
     """Inverse of rigid motions (..., 4, 4): ``inverse(T) @ T == identity``."""
-    R_t = T[..., :3, :3].swapaxes(-1, -2)
+    R_t = T[:3, :3].T if T.ndim == 2 else T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros(T.shape, T.dtype)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]

@@ -49,7 +49,10 @@ class BlockWindow:
         then."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         last = self.origin if left is None else left
-        stays = last is not None and np.abs(origin - last).max() <= MARGIN
+        if last is None:
+            return origin
+        x, y, z = (origin - last).tolist()
+        stays = -MARGIN <= x <= MARGIN and -MARGIN <= y <= MARGIN and -MARGIN <= z <= MARGIN
         return left if stays else origin
 
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:

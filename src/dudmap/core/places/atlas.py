@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import exposed_color
 from dudmap.core.frames.stream_check import Repeats
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera

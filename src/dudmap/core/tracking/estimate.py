@@ -77,9 +77,11 @@ def initial_weights(
         return None
     out = []
     for level in levels:
-        weights = np.ones(level.depth.shape, np.float32)
-        if previously_dynamic is not None:
-            weights -= np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT) * reduced(previously_dynamic, level)
+        if previously_dynamic is None:
+            weights = np.ones(level.depth.shape, np.float32)
+        else:
+            reduction = np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT)
+            weights = np.float32(1) - reduction * reduced(previously_dynamic, level)
         for mask in excluded:
             weights *= ~reduced(mask, level)
         out.append(weights)

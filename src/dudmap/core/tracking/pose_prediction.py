@@ -15,8 +15,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.image_consistency import ImagePose
 from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.quality_monitor import ImagePose
 from dudmap.core.tracking.tracker import Tracker
 
 CLEARLY_BETTER = 0.95

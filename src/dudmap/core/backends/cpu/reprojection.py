@@ -46,9 +46,10 @@ def reproject(
         older: (n, 2, h, w) float32, their depth and intensity.
         marks: (n, h, w) uint8, of their pixels.
     """
-    n, shape = len(older), marks.shape
-    out = Reprojection(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-    run_team(reproject_all, n, depth, intensity, intrinsics, Ts_older_camera.astype(np.float32), older, marks, *out)
+    shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
+    gap, difference = np.empty((2, *shape), np.float32)
+    out = Reprojection(gap, difference, np.empty(shape, np.uint8))
+    run_team(reproject_all, shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
     return out
 
 

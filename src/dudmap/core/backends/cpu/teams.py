@@ -137,9 +137,10 @@ def run_team(function, num_bands, *arguments):
     """
     team = np.zeros(16, dtype=np.int64)
     team[TICKET] = num_bands  # nothing to take before the first step
-    others = min(num_threads(), num_bands) - 1 if num_bands > 1 else 0
-    if others > 0:
-        also_in_other_threads(lambda: function(False, team, *arguments), others)
+    threads = num_threads()
+    threads = threads if threads < num_bands else num_bands
+    if threads > 1:
+        also_in_other_threads(lambda: function(False, team, *arguments), threads - 1)
     try:
         return function(True, team, *arguments)
     finally:
