@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.bootstrap import WINDOW_STEP, Bootstrap, StartFrame
-from dudmap.core.dynamics.masks import grown_mask
+from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -134,6 +134,8 @@ class Mapper:
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask)
+            if self._predictor.slow_crowd and estimate.unverified_mask is not None:
+                static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
