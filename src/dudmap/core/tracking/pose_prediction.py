@@ -89,7 +89,8 @@ class PosePredictor:
         moving = np.zeros(view.labelled.depth.shape, bool)
         for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
             moving = moving if mask is None else moving | mask
-        if not exceeds_noise_share(moving, view.labelled) or prediction.unverified_mask is not None:
+        verified = prediction.unverified_mask is not None and not self.slow_crowd
+        if verified or not exceeds_noise_share(moving, view.labelled):
             return ""
         return "something moves in view, and the map is too young to show what else does"
 
