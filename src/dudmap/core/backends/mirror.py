@@ -60,7 +60,7 @@ class Mirror:
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
     """An array as it is, and a mirror's array up to date."""
-    if type(array) is not Mirror:
+    if not isinstance(array, Mirror):
         return array
     return array.array if array.copy is None else array.host
 

@@ -339,7 +339,7 @@ def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(squares[:, 0] + squares[:, 1])
 
 
-def _pixels_of_level(pixels: NDArray[np.number], level: Level, other: Level) -> NDArray[np.int64]:
+def _pixels_of_level(pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
