@@ -266,6 +266,8 @@ class Mapper:
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask)
+            if self._predictor.slow_crowd and estimate.unverified_mask is not None:
+                static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
