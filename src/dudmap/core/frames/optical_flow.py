@@ -1,10 +1,13 @@
 """Corners and their sparse optical flow between two images (Lucas and Kanade 1981)."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.observation import Level
 
+Number = TypeVar("Number", np.float32, np.float64)
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
 SIMILAR = 1.5
@@ -25,6 +28,12 @@ def grey(level: Level) -> NDArray[np.uint8]:
 def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
     """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
+
+
+def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
+    """Lengths (n,) of vectors (n, 2)."""
+    squares = vectors * vectors
+    return np.sqrt(squares[:, 0] + squares[:, 1])
 
 
 def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -109,7 +118,7 @@ def track_forward_backward(
     positions, found, difference = lucas_kanade(first, second, pixels, expected, window, 3)
     back, found_back, _ = lucas_kanade(second, first, positions, pixels, window, 0)
     good = found & found_back
-    error = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1)
+    error = lengths(back[good] - pixels[good].astype(np.float32))
     good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
     return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64), good
 
@@ -136,6 +145,6 @@ def consistent_with_static(
     """
     guess = expected.astype(np.float32)
     positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)
-    near = np.linalg.norm((positions - guess)[static], axis=1) < allowed[static]
+    near = lengths((positions - guess)[static]) < allowed[static]
     static[static] = near & (other[static] <= SIMILAR * difference[static])
     return static
