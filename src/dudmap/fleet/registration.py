@@ -9,8 +9,7 @@ towards equal variance, which lowers the weight of what many places have in comm
 (whitening, Jegou and Chum 2012). All are compared with all: 10,000 keyframes of 1,000 short runs in seconds.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,21 +127,16 @@ def _faiss() -> Any:  # noqa: ANN401
     return faiss
 
 
-@dataclass(frozen=True, eq=False)
-class RegisteredPair:
-    """What was found about two runs; see ``MapPair``."""
+Pairs = dict[tuple[int, int], MapPair]
+"""What was found about pairs (a, b) of runs, a < b."""
 
-    a: int
-    b: int
-    pair: MapPair
 
-    @property
-    def join(self) -> Join | None:
-        """The accepted relative pose, if there is one."""
-        T, alignment, agreement = self.pair.T_a_b, self.pair.alignment, self.pair.agreement
-        if T is None or alignment is None or agreement is None:
-            return None
-        return Join(self.a, self.b, T, drift_covariance(T, alignment.center, agreement.overlap))
+def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
+    """The accepted relative pose of two runs, if there is one."""
+    T, alignment, agreement = pair.T_a_b, pair.alignment, pair.agreement
+    if T is None or alignment is None or agreement is None:
+        return None
+    return Join(*runs, T, drift_covariance(T, alignment.center, agreement.overlap))
 
 
 def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
@@ -160,26 +154,19 @@ def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
     return similarity(list(workers.map(_described, [(path, words) for path in runs])))
 
 
-def register_pairs(
-    runs: Sequence[Path],
-    pairs: Sequence[tuple[int, int]],
-    workers: Workers,
-    guesses: Mapping[tuple[int, int], NDArray[np.float64]],
-) -> list[RegisteredPair]:
-    """Relative pose of each pair (a, b) of runs, or why they are not to be joined.
-
-    ``guesses`` are relative poses ``T_a_b`` (4, 4) of some pairs, which are tried before those of the features.
-    """
+def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], workers: Workers, guesses: Guesses) -> Pairs:
+    """Relative pose of each pair of runs, or why they are not to be joined; ``guesses`` are tried before the features.
+    Pairs with the same first run are one job, which reads that run once."""
     groups: dict[int, list[int]] = {}
     for a, b in pairs:
         groups.setdefault(a, []).append(b)
     jobs = [(runs[a], [(runs[b], guesses.get((a, b))) for b in others]) for a, others in groups.items()]
     found = workers.map(_compare, jobs)
-    return [
-        RegisteredPair(a, b, pair)
+    return {
+        (a, b): pair
         for (a, others), results in zip(groups.items(), found, strict=True)
         for b, pair in zip(others, results, strict=True)
-    ]
+    }
 
 
 def _sample(job: tuple[Path, int]) -> NDArray[np.float32]:
@@ -215,12 +202,7 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
     return decided(surface_of(a), surface_of(b), found, many=True)
 
 
-Pairs = dict[tuple[int, int], RegisteredPair]
-
-
-def registered_runs(
-    runs: Sequence[Path], workers: Workers, note: Callable[[str], None]
-) -> tuple[list[RegisteredPair], RunGraph]:
+def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str], None]) -> tuple[Pairs, RunGraph]:
     """Relative poses of pairs of runs, and the poses of all.
 
     The first round compares each run with the most similar others. Each further round compares runs that overlap at the
@@ -241,20 +223,19 @@ def registered_runs(
         if not wanted:
             break
         note(f"round {number + 1}: {len(wanted)} of {n * (n - 1) // 2} pairs of runs are compared")
-        for one in register_pairs(runs, wanted, workers, guesses):
-            found[one.a, one.b] = one
+        found |= register_pairs(runs, wanted, workers, guesses)
         graph = _graph(n, found, guesses)
         near = _brought_together(graph, blocks, found, guesses)
         guesses |= {(a, b): se3.inverse(graph.Ts[a]) @ graph.Ts[b] for a, b in near}
         wanted = sorted({*near, *_more_partners(graph, similar, found)})
-    return list(found.values()), graph
+    return found, graph
 
 
 def _graph(count: int, found: Pairs, guesses: Guesses) -> RunGraph:
     """Poses of the runs from all joins, without those that pairs brought together by them deny."""
-    joins = [join for one in found.values() if (join := one.join) is not None]
+    joins = [join for runs, pair in found.items() if (join := join_of(runs, pair)) is not None]
     graph = solve(count, joins)
-    denied = [pair for pair, guess in guesses.items() if found[pair].pair.contradicted and _is_at(graph, pair, guess)]
+    denied = [pair for pair, guess in guesses.items() if found[pair].contradicted and _is_at(graph, pair, guess)]
     return solve(count, joins, denied) if denied else graph
 
 
@@ -272,7 +253,7 @@ def _brought_together(
     for part in graph.components:
         shares[np.ix_(part, part)] = predicted_overlap([transformed(graph.Ts[run], blocks[run]) for run in part], CELL)
     shares[shares < MIN_PREDICTED] = 0
-    known = [pair for pair, one in found.items() if one.pair.T_a_b is not None]
+    known = [runs for runs, pair in found.items() if pair.T_a_b is not None]
     for a, b in [*known, *(pair for pair, guess in guesses.items() if _is_at(graph, pair, guess))]:
         shares[a, b] = shares[b, a] = 0
     return most_similar(shares, PARTNERS)

@@ -106,12 +106,7 @@ class KeyframeDatabase:
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
     def extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
-        """SIFT features of a frame that lie on one static surface.
-
-        Args:
-            observation: The frame.
-            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
-        """
+        """SIFT features of a frame that lie on one static surface; ``static_mask`` (H, W), None = all pixels."""
         self.settle()
         return self._extract(observation, static_mask)
 
@@ -145,15 +140,6 @@ class KeyframeDatabase:
 
         A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. One that turns out
         to have fewer than ``relocalization.min_inliers`` features is removed when it is settled.
-
-        Args:
-            observation: The frame.
-            T_world_camera: (4, 4).
-            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
-            submap: Number of the submap it belongs to.
-
-        Returns:
-            Whether the frame was added.
         """
         self.settle()
         self._frames_since_last += 1
@@ -180,15 +166,8 @@ class KeyframeDatabase:
             self._remove_most_redundant()
 
     def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
-        """Keyframes that a frame with these features may show, with the frame's pose.
-
-        Args:
-            features: Features of the frame.
-            among: Keyframes to compare with; None = all.
-
-        Returns:
-            Matches with distinct poses, those with more inliers first.
-        """
+        """Keyframes (``among`` these, None = all) that a frame with these features may show, with the frame's pose; the
+        poses are distinct, those with more inliers first."""
         among = self.keyframes if among is None else among
         if len(features) < self.config.min_inliers or not among:
             return []

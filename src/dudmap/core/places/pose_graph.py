@@ -38,12 +38,8 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
     are solved by SciPy (SuperLU). The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
     series of the inverse right Jacobian; the derivative by ``xi_a`` is that times ``-Ad(T_b^-1 T_a)``.
 
-    Args:
-        Ts_world: (N, 4, 4) initial poses.
-        edges: Measured motions; they must connect all poses.
-
-    Returns:
-        (N, 4, 4) optimized poses; not finite if the normal equations are singular.
+    The edges must connect all initial poses (N, 4, 4). Returns the optimized ones; they are not finite if the normal
+    equations are singular.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
