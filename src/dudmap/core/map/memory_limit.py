@@ -19,10 +19,8 @@ class MemoryLimit:
     """Memory limit of the process, shared by all its maps.
 
     What the program needs besides the voxels differs between cameras, configurations and platforms, so that it is
-    measured each time: the maps may have what the others leave. Which blocks are in memory changes no result.
-
-    Args:
-        limit: Largest resident memory of the process, bytes.
+    measured each time: the maps may have what is left of ``limit`` bytes of resident memory. Which blocks are in memory
+    changes no result.
 
     Raises:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.

@@ -42,12 +42,7 @@ class PagedMap:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
-        hash table.
-
-        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
-        is the window, whose size depends on the view and the voxels, not on the map.
-        """
+        """Memory of the map as of ``VoxelBlocks.num_bytes``; the size of the window depends on the view alone."""
         return self.blocks.num_bytes
 
     @property
@@ -124,8 +119,7 @@ class PagedMap:
         self._frame_number = number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
-        """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one, as frame
-        ``number``."""
+        """Replace the colours of a level (0 = coarsest) within blocks (n,) of the coarsest one, as frame ``number``."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)
 

@@ -190,12 +190,6 @@ class TsdfVolume(PagedMap):
             window.set_free(empty, blocks, count)
         return slots, touched
 
-    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
-        """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
-        if self.config.weighting == "constant":
-            return np.ones(depth.shape, dtype=np.uint8)
-        return reading_weights(depth, camera.intrinsics, self.band.noise)
-
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
@@ -261,16 +255,11 @@ class TsdfVolume(PagedMap):
     def known_share(
         self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share of the information on the surface at each reading (h, w) that the map has without it.
+        """Share of the information on the surface at each reading (h, w) of a camera that the map has without it.
 
         Weights are information: the running average of readings of weight g has the variance 1 / w where w is the sum
         of their weights (eq. 4.19), and one more reading brings it to 1 / (w + g). The share is w / (w + g), n / (n +
         1) after n equal readings; 0 where the map has no surface or there is no reading.
-
-        Args:
-            depth: (h, w) float32, metres, 0 = none.
-            camera: Its camera.
-            T_world_camera: (4, 4).
         """
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
@@ -280,7 +269,8 @@ class TsdfVolume(PagedMap):
         words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        gains = self._reading_weights(depth, camera)
+        constant = self.config.weighting == "constant"
+        gains = np.ones(depth.shape) if constant else reading_weights(depth, camera.intrinsics, self.band.noise)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
@@ -367,6 +357,4 @@ class TsdfVolume(PagedMap):
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        from dudmap.core.map.adaptive_volume import volume_of
-
-        return volume_of(read_map(path))
+        return read_map(path)

@@ -10,16 +10,8 @@ MODULES = tuple(f"dudmap.core.backends.warp.kernels.{name}" for name in ("fusion
 
 
 def compile_kernels(folder: str | Path, architectures: tuple[int, ...] = (80, 90), ptx: bool = True) -> list[Path]:
-    """Compile the kernels of all modules.
-
-    Args:
-        folder: Where the files are written.
-        architectures: Compute capabilities, e.g. 90 for 9.0.
-        ptx: Write PTX, which a driver compiles for its GPU, instead of machine code (cubin).
-
-    Returns:
-        The files, one per module and architecture.
-    """
+    """Compile the kernels of all modules for compute capabilities, 90 for 9.0: to PTX, which a driver compiles for its
+    GPU, or machine code (cubin). Returns the files, one per module and architecture."""
     before = set(Path(folder).rglob("*")) if Path(folder).exists() else set()
     for name in MODULES:
         import_module(name)

@@ -47,11 +47,8 @@ PER_THREAD = 8
 
 
 class WarpBackend(CpuBackend):
-    """``Backend`` on a device of Warp; operations that are not defined here are the CPU's.
-
-    Args:
-        device: Name of the device: "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
-    """
+    """``Backend`` on a device of Warp, "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
+    Operations that are not defined here are the CPU's."""
 
     def __init__(self, device: str) -> None:
         super().__init__()

@@ -41,9 +41,6 @@ class RowCopy:
     """Copy of an int32 array (rows,) or (rows, width) on a device; see ``mirror.DeviceCopy``.
 
     What a device that has failed wrote since the last ``pull`` is lost.
-
-    Args:
-        device: Name of the device.
     """
 
     def __init__(self, device: str) -> None:
