@@ -9,7 +9,6 @@ al. 2020), which gives up those that still contradict the others, and once more 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,12 +164,8 @@ def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] =
 
 def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
     """Connected runs, ascending; the largest component first, then by the first run."""
-    parts, seen = [], set()
-    for start in range(count):
-        if start not in seen:
-            nodes = sorted(_chained(start, joins))
-            seen.update(nodes)
-            parts.append(nodes)
+    number = _labels(np.array([(join.a, join.b) for join in joins], int).reshape(-1, 2), count)
+    parts = [np.flatnonzero(number == n).tolist() for n in range(number.max(initial=-1) + 1)]
     return sorted(parts, key=lambda nodes: (-len(nodes), nodes[0]))
 
 
@@ -278,15 +273,10 @@ def _chained(start: int, joins: Sequence[Join]) -> dict[int, NDArray[np.float64]
     return out
 
 
-def _gtsam() -> Any:  # noqa: ANN401
-    with extra("fleet", "the merging of more than two runs"):
-        import gtsam
-    return gtsam
-
-
 def _problem(nodes: Sequence[int], joins: Sequence[Join], Ts: dict[int, NDArray[np.float64]], robust: bool) -> tuple:
     """Factor graph and initial values; twists of GTSAM are (omega, v)."""
-    gtsam = _gtsam()
+    with extra("fleet", "the merging of more than two runs"):
+        import gtsam
     order = np.array([3, 4, 5, 0, 1, 2])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for join in joins:

@@ -299,16 +299,10 @@ class VoxelBlocks:
             ValueError: The arrays do not belong together, or a block is there twice.
         """
         _check_restored(coords, free_count, entries, geometry, colors)
-        blocks, n, m = cls(), len(coords), len(entries)
-        blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
-        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int32), free_count.copy(), n
-        hashing.rebuild(blocks.table, blocks.coords, n)
-        blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
-        blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
-        blocks.written = np.zeros(m, np.int32)
-        blocks.fused = np.zeros(m, np.uint8)
-        blocks.slot_of = np.full(n, -1, dtype=np.int32)
-        blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
+        blocks = cls(len(entries))
+        blocks.table = np.full(max(1 << 14, 2 * len(coords)), hashing.EMPTY, dtype=np.int32)
+        fused = np.zeros(len(entries), np.uint8)
+        blocks.insert(BlockRecords(coords, free_count, entries, geometry, colors, fused), frame_number=0)
         return blocks
 
 
