@@ -245,12 +245,8 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
-    """Blocks of the result that a map can contribute to.
-
-    Attributes:
-        near: (n,) int64 Morton codes, ascending, of blocks that its voxels reach into.
-        empty: (m,) int64 the same of its blocks without voxels; a block can be in both.
-    """
+    """Blocks of the result that a map can contribute to, as ascending Morton codes: ``near`` (n,), which its voxels
+    reach into, and ``empty`` (m,), which its blocks without voxels do; a block can be in both."""
 
     near: NDArray[np.int64]
     empty: NDArray[np.int64]

@@ -38,13 +38,8 @@ degrees: that of a relocalised frame (``relocalization.max_distance``)."""
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A relative pose that some pairs of keyframes agree on.
-
-    Attributes:
-        T_a_b: (4, 4) world of b to world of a.
-        num_keyframes: Keyframes of b that were recognised at this relative pose.
-        num_inliers: Feature matches of all pairs of keyframes that agree.
-    """
+    """World of b to world of a (4, 4), on which some pairs of keyframes agree; numbers of the keyframes of b that were
+    recognised at it, and of the feature matches of all pairs that agree."""
 
     T_a_b: NDArray[np.float64]
     num_keyframes: int

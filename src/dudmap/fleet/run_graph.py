@@ -123,14 +123,9 @@ Cycle = list[tuple[Join, int]]
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """Poses of runs.
-
-    Attributes:
-        components: Runs that are joined with each other, ascending; the largest component first.
-        Ts: (n, 4, 4) world of each run to that of the first run of its component.
-        kept: Joins that were used.
-        rejected: Joins that contradict others.
-    """
+    """Poses of runs: the runs that are joined with each other, ascending, the largest component first; the world of
+    each run to that of the first run of its component (n, 4, 4); the joins that were used, and those that contradict
+    others."""
 
     components: list[list[int]]
     Ts: NDArray[np.float64]

@@ -44,13 +44,8 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class MapHeader:
-    """What a map file says without its voxels.
-
-    Attributes:
-        camera, config, sensor, depth_max: Parameters of the volume.
-        coords: (n, 3) coordinates of its blocks.
-        has_voxels: (n,) bool, blocks that own voxels; the others are known to be empty.
-    """
+    """What a map file says without its voxels: the parameters of the volume, the coordinates (n, 3) of its blocks, and
+    which of them (n,) own voxels; the others are known to be empty."""
 
     camera: Camera
     config: VolumeConfig

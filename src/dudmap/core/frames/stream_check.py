@@ -35,12 +35,8 @@ Repeats = Literal["", "frame", "depth", "color"]
 
 
 class Rejection(NamedTuple):
-    """Why a frame is not used.
-
-    Attributes:
-        kind: Key under which it is counted: ``duplicate``, ``order``, ``burst``, ``clock`` or ``unit``.
-        reason: Sentence.
-    """
+    """Why a frame is not used: the key under which it is counted (``duplicate``, ``order``, ``burst``, ``clock`` or
+    ``unit``), and a sentence."""
 
     kind: str
     reason: str

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import meshing
+from dudmap.core.backends.cpu import meshing, raycasting
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.fusion import reading_weights
 from dudmap.core.backends.parameters import (
@@ -288,7 +288,7 @@ class TsdfVolume(PagedMap):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return self.backend.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
+        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
@@ -330,10 +330,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        Args:
-            slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
-            chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
-            min_weight: As of ``extract_mesh``.
+        ``slots`` (n,) are the blocks to mesh and all that touch one of them, ``chunks`` (n,) the group of each, counted
+        from 0; -1 for blocks that only lend their voxels.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbours(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(

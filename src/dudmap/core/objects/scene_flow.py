@@ -21,14 +21,8 @@ REFERENCE_WIDTH = 160
 
 @dataclass(frozen=True, eq=False)
 class InstanceFrame:
-    """Moving pixels of a frame with the object that each belongs to.
-
-    Attributes:
-        timestamp: Seconds.
-        grey: (h, w) uint8.
-        ids: (h, w) int32, number of the object in each pixel, 0 = none.
-        points: (h, w, 3) float32, metres, world frame, 0 where nothing moves.
-    """
+    """Moving pixels of a frame: grey image (h, w), number of the object (h, w) in each pixel, 0 = none, and point (h,
+    w, 3) float32, metres, world frame, 0 where nothing moves."""
 
     timestamp: float
     grey: NDArray[np.uint8]

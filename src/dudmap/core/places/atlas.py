@@ -43,13 +43,9 @@ class TimedPose:
 class Atlas:
     """The submaps and everything whose pose changes when a submap is corrected or joined with another.
 
-    Args:
-        make_volume: Creates an empty map.
-        keyframes: Keyframes of all submaps.
-        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
-        number: Number of the first submap.
-
     Attributes:
+        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
+        keyframes: Of all submaps.
         volumes: Maps by the numbers of their submaps; while one is rebuilt, its provisional map.
         rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
         current: Number of the submap that is tracked.

@@ -48,28 +48,19 @@ class StoredFrame:
 class FrameStore:
     """A selection of the fused frames in a temporary file, which the operating system removes.
 
-    A frame is stored if the camera has moved or turned since the last stored frame, or if a number of frames were
-    fused since; other frames increase the count of the stored frame before them. Frames are encoded (16-bit PNG and
-    JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about 1.5 kB per stored frame. Frames are
-    numbered in the order of time; those whose images were removed keep their number and their pose. Not for concurrent
-    calls.
-
-    Args:
-        camera: Camera of the frames.
-        distance: Distance from the last stored frame from which on a frame is stored, metres.
-        angle_deg: Angle to the last stored frame from which on a frame is stored, degrees.
-        gap: Largest count of a stored frame; 1 stores every frame.
-        registered: Registers the colour of a frame that was stored as it was recorded; None for colours that are
-            registered as they are.
+    A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
+    frame, or if ``gap`` frames were fused since; other frames increase the count of the stored frame before them.
+    Frames are encoded (16-bit PNG and JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about
+    1.5 kB per stored frame. Frames are numbered in the order of time; those whose images were removed keep their number
+    and their pose. Not for concurrent calls.
 
     Attributes:
-        timestamps: Of the stored frames, seconds.
-        Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
+        registered: Registers the colour of a frame that was stored as it was recorded; None for registered colours.
+        timestamps, Ts_world_camera: Times (s) and poses (4, 4); these are updated when the map is corrected.
         counts: Number of fused frames that each represents; 0 for those whose images were removed.
         cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
         submaps: Numbers of their submaps; -1 for frames that are as if they had never been.
-        archived: Returns a frame, by its number, that is not in the file of this store, but in the database of a
-            continued run.
+        archived: Returns a frame, by its number, that is in the database of a continued run.
     """
 
     def __init__(

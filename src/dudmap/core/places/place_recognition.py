@@ -89,11 +89,6 @@ class KeyframeDatabase:
 
     The features of a new keyframe are extracted in another thread, and are there after ``settle``. Not for concurrent
     calls of ``extract``.
-
-    Args:
-        config: Distances, limits and thresholds.
-        camera: Camera of the observations.
-        sensor: Noise model of the depth readings.
     """
 
     def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:

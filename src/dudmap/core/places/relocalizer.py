@@ -24,12 +24,8 @@ Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
 
 @dataclass(frozen=True, eq=False)
 class Relocalization:
-    """Verified pose of a frame after tracking was lost.
-
-    Attributes:
-        estimate: Pose and labels of the frame in the map of ``submap``.
-        submap: Number of the submap that the frame was recognised in. It may differ from the current one.
-    """
+    """Verified pose and labels of a frame after tracking was lost, in the map of the submap that it was recognised in,
+    which may differ from the current one."""
 
     estimate: PoseEstimate
     submap: int
