@@ -67,7 +67,6 @@ CASES = [
     ("study", "pandas", ["study", "thesis", "--published"]),
     ("gpu", "warp", ["run", "desk", "--device", "warp-cpu"]),
     ("fleet", "faiss", ["merge", "run", "run", "run"]),
-    ("fleet", "gtsam", ["merge", "run", "run", "run"]),
     ("cluster", "ray", ["study", "thesis", "--cluster", "auto"]),
 ]
 

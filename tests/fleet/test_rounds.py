@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from dudmap.core.geometry import se3
 from dudmap.fleet import registration
@@ -75,7 +74,6 @@ def similarity():
 
 
 def test_groups_ask_more_runs_and_a_ring_is_closed_by_its_geometry(monkeypatch):
-    pytest.importorskip("gtsam")
     oracle = Oracle()
     pairs, graph = register(monkeypatch, oracle, similarity())
     assert (5, 6) not in oracle.asked[0]

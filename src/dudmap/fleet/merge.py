@@ -149,7 +149,7 @@ def merge_fleet(
         MapError: A run folder is incomplete, or no two runs can be joined.
         DudmapError: ``out`` cannot be used.
     """
-    need("fleet", "the merging of more than two runs", ("faiss", "gtsam"))
+    need("fleet", "the merging of more than two runs", ("faiss",))
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)
     _check_out(out)

@@ -209,7 +209,7 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
     poses found so far, from these poses, and runs of the smaller groups with the next similar runs of other groups.
 
     Raises:
-        MissingExtraError: faiss or GTSAM is not installed.
+        MissingExtraError: faiss is not installed.
         MapError: A file is damaged.
     """
     n = len(runs)

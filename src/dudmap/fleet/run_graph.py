@@ -1,4 +1,4 @@
-"""Poses of many runs from relative poses of pairs: rejection by cycles, and a pose graph with robust weights (GTSAM).
+"""Poses of many runs from relative poses of pairs: rejection by cycles, and a pose graph with robust weights.
 
 Relative poses around a cycle must compose to the identity. Where a cycle does not close, the relative poses in it that
 no other cycle confirms are given up, all of them if it cannot be told which one is wrong: a false join costs more than
@@ -15,12 +15,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from dudmap.core.geometry import se3
-from dudmap.extras import extra
+from dudmap.core.places.pose_graph import Edge, optimize
 
 Pair = tuple[int, int]
 
-SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
-"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, deg), per axis: drift
+SIGMA_DISTANCE, SIGMA_ANGLE = 0.01, np.radians(0.2)
+"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, rad), per axis: drift
 within the runs. The surfaces themselves determine it more exactly."""
 HALF = 0.5
 """Overlap for which these hold. Joins of rendered runs with more than half of the smaller map in common are off by
@@ -89,7 +89,7 @@ def drift_covariance(
 
 
 def _usual_covariance() -> NDArray[np.float64]:
-    return np.diag(np.repeat([SIGMA_DISTANCE**2, np.radians(SIGMA_ANGLE_DEG) ** 2], 3))
+    return np.diag(np.repeat([SIGMA_DISTANCE**2, SIGMA_ANGLE**2], 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,11 +134,7 @@ class RunGraph:
 
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
     """Poses of ``count`` runs from relative poses of pairs; ``denied`` pairs disagree where these put them
-    (``supported``).
-
-    Raises:
-        MissingExtraError: GTSAM is not installed.
-    """
+    (``supported``)."""
     kept = consistent(supported(joins, denied))
     parts, Ts = components(count, kept), np.tile(np.eye(4), (count, 1, 1))
     for nodes in parts:
@@ -146,7 +142,8 @@ def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] =
         for node, T in _chained(nodes[0], inside).items():
             Ts[node] = T
         if len(inside) >= len(nodes):  # with fewer there is no cycle: the tree is the answer
-            Ts[nodes] = _optimised(nodes, inside, Ts)
+            edges = [Edge(nodes.index(j.a), nodes.index(j.b), j.T_a_b, SIGMA_DISTANCE, SIGMA_ANGLE) for j in inside]
+            Ts[nodes] = optimize(Ts[nodes], edges, np.stack([join.covariance for join in inside]), HUBER)
     return RunGraph(parts, Ts, kept, [join for join in joins if join not in kept])
 
 
@@ -258,25 +255,4 @@ def _chained(start: int, joins: Sequence[Join]) -> dict[int, NDArray[np.float64]
             if other not in out:
                 out[other] = out[node] @ join.motion(node)
                 queue.append(other)
-    return out
-
-
-def _optimised(nodes: Sequence[int], joins: Sequence[Join], Ts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (nodes, 4, 4) of connected runs by Levenberg-Marquardt steps with a Huber kernel; the first is fixed."""
-    with extra("fleet", "the merging of more than two runs"):
-        import gtsam
-    order = np.array([3, 4, 5, 0, 1, 2])  # twists of GTSAM are (omega, v)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for join in joins:
-        noise = gtsam.noiseModel.Gaussian.Covariance(join.covariance[np.ix_(order, order)])
-        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), noise)
-        graph.add(gtsam.BetweenFactorPose3(join.a, join.b, gtsam.Pose3(join.T_a_b), noise))
-    for node in nodes:
-        values.insert(node, gtsam.Pose3(Ts[node]))
-    fixed = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-6))
-    graph.add(gtsam.PriorFactorPose3(nodes[0], gtsam.Pose3(np.eye(4)), fixed))
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    out = np.stack([result.atPose3(node).matrix() for node in nodes])
-    out[0] = np.eye(4)
-    out[:, :3, :3] = se3.nearest_rotation(out[:, :3, :3])
     return out

@@ -15,10 +15,10 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
 AT_ONCE = 24
-"""Stored frames that are fused at once, those nearest to the present view: a map of no more is rebuilt at once."""
+"""A map of at most this many stored frames is rebuilt at once, of a larger one those nearest to the present view."""
 PER_FRAME = 2
 """Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
-one is stored meanwhile, and those that are near come to an end, so that the rebuilding does."""
+one is stored with a frame, so that the rebuilding ends."""
 SHOWN = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
