@@ -60,7 +60,6 @@ def test_a_tree_is_kept_and_runs_without_joins_stay_alone(world):
 
 
 def test_runs_of_one_place_are_proposed():
-    pytest.importorskip("faiss")
     from dudmap.fleet.registration import most_similar, similarity
 
     rng = np.random.default_rng(0)

@@ -20,7 +20,6 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DatasetError, DudmapError, MapError
-from dudmap.extras import need
 from dudmap.fleet.fusion import (
     MAP_FOLDER,
     TILE_FOLDER,
@@ -144,12 +143,10 @@ def merge_fleet(
     the number of processes; ``note`` is told what is being done.
 
     Raises:
-        MissingExtraError: A library is not installed.
         ConfigError: A run is named twice, or the voxels differ in size.
         MapError: A run folder is incomplete, or no two runs can be joined.
         DudmapError: ``out`` cannot be used.
     """
-    need("fleet", "the merging of more than two runs", ("faiss",))
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)
     _check_out(out)

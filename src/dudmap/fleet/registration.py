@@ -11,10 +11,11 @@ towards equal variance, which lowers the weight of what many places have in comm
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.linalg import eigh
 from scipy.sparse import csr_array
 
 from dudmap.core.geometry import se3
@@ -22,7 +23,6 @@ from dudmap.core.geometry.alignment import agree
 from dudmap.core.map import morton
 from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.saved_map import MAP_FILE
-from dudmap.extras import extra
 from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair, decided, relative_poses
 from dudmap.fleet.map_samples import transformed
 from dudmap.fleet.run_graph import Join, RunGraph, drift_covariance, solve
@@ -58,17 +58,10 @@ SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
 
 
 def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Visual words (WORDS, 128) of features (n, 128); the same for the same features.
-
-    Raises:
-        MissingExtraError: faiss is not installed.
-    """
-    kmeans = _faiss().Kmeans(
-        features.shape[1], min(WORDS, len(features)), niter=20, seed=1, min_points_per_centroid=1,
-        max_points_per_centroid=TRAINING,
-    )  # fmt: skip
-    kmeans.train(np.ascontiguousarray(features, np.float32))
-    return kmeans.centroids
+    """Visual words (WORDS, 128) of features (n, 128); the same for the same features."""
+    some = features[:: max(1, len(features) // TRAINING)].astype(np.float64)
+    words, _ = kmeans2(some, min(WORDS, len(some)), iter=20, minit="++", seed=1)
+    return words.astype(np.float32)
 
 
 def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -114,17 +107,15 @@ def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, i
 def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), scaled, unit length."""
     count, size = descriptors.shape
-    pca = _faiss().PCAMatrix(size, max(1, min(COMPONENTS, count // 2, size)), -WHITENING)
-    pca.epsilon = LEAST_VARIANCE
-    pca.train(np.ascontiguousarray(descriptors))
-    out = pca.apply(np.ascontiguousarray(descriptors))
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-
-
-def _faiss() -> Any:  # noqa: ANN401
-    with extra("fleet", "the merging of more than two runs"):
-        import faiss
-    return faiss
+    centred = (descriptors - descriptors.mean(axis=0)).astype(np.float64)
+    wide = count < size  # of the two products, whose eigenvalues are the same, the smaller one
+    product = centred @ centred.T if wide else centred.T @ centred
+    kept = max(1, min(COMPONENTS, count // 2, size))
+    squares, axes = eigh(product, subset_by_index=[len(product) - kept, len(product) - 1])
+    squares = np.maximum(squares, 0)
+    out = axes * np.sqrt(squares) if wide else centred @ axes
+    out *= (squares / count + LEAST_VARIANCE) ** -WHITENING
+    return (out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)).astype(np.float32)
 
 
 Pairs = dict[tuple[int, int], MapPair]
@@ -143,7 +134,6 @@ def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
     """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, which are all to be compared.
 
     Raises:
-        MissingExtraError: faiss is not installed.
         MapError: A keyframe file is damaged.
     """
     n = len(runs)
@@ -209,7 +199,6 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
     poses found so far, from these poses, and runs of the smaller groups with the next similar runs of other groups.
 
     Raises:
-        MissingExtraError: faiss is not installed.
         MapError: A file is damaged.
     """
     n = len(runs)
