@@ -175,9 +175,7 @@ class AdaptiveVolume(TsdfVolume):
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
     ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
-        parameters = self._mesh_parameters(min_weight)
-        meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
-        return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
+        return extract_groups(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))
 
 
 def extract_groups(
@@ -190,7 +188,7 @@ def extract_groups(
     """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are those of the coarsest level."""
     number = int(groups.max(initial=-1)) + 1
     if len(slots) == 0:
-        return []
+        return [joined([])] * number
     keys, places, colors, polygons, rows = _contours(blocks, levels, slots, groups >= 0, parameters)
     corners = np.searchsorted(keys, polygons).astype(np.int32)
     vertices = np.ascontiguousarray(places[:, :3])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dudmap.core.map import morton
 from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
-from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, VoxelBlocks, blobs_of, records_of
+from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.scratch_store import ScratchStore
 
 REGION_BITS = 4
@@ -74,12 +74,6 @@ class BlockPager:
         self._archive: Callable[[Region], BlockRecords] | None = None
         self._middle = np.zeros(3)
         self._retry_in = 0
-
-    def new_blocks(self) -> VoxelBlocks:
-        """Empty blocks, with room for as many as will be in memory."""
-        if isinstance(self.max_blocks, int):
-            return VoxelBlocks()
-        return VoxelBlocks(self.max_blocks.capacity(VoxelBlocks()))
 
     @property
     def num_blocks(self) -> int:

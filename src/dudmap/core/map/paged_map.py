@@ -9,6 +9,7 @@ from dudmap.config import VolumeConfig
 from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import BlockTree, FineBlocks
+from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
 
 
@@ -60,8 +61,9 @@ class PagedMap:
         return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
-        """Empty blocks, with room for as many as will be in memory."""
-        return VoxelBlocks() if self.pager is None else self.pager.new_blocks()
+        """Empty blocks; below a memory limit with room for all that fit, so that growing does not copy them."""
+        blocks, limit = VoxelBlocks(), None if self.pager is None else self.pager.max_blocks
+        return VoxelBlocks(limit.limit // blocks.slot_bytes) if isinstance(limit, MemoryLimit) else blocks
 
     def _empty(self) -> None:
         """Have no blocks and no window in memory."""

@@ -95,11 +95,8 @@ class TsdfVolume(PagedMap):
         self.depth_max = depth_max
         self.backend: Backend = backend or CpuBackend()
         self.parameters = fusion_parameters(self.config, self.sensor, depth_max)
-        self.voxel_size, self.sdf_unit, self.band = (
-            self.config.voxel_size,
-            self.parameters.sdf_unit,
-            self.parameters.band,
-        )
+        self.voxel_size = self.config.voxel_size
+        self.sdf_unit, self.band = self.parameters.sdf_unit, self.parameters.band
         self.block_size = BLOCK * self.voxel_size
         self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
