@@ -58,14 +58,6 @@ class FusedRange:
             self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
         )
 
-    @classmethod
-    def of(cls, volume: TsdfVolume) -> "FusedRange":
-        """All blocks of a map."""
-        blocks, n = volume.blocks, volume.blocks.num_entries
-        has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
-        codes = morton.encode(blocks.coords[:n])
-        return cls(codes, has_voxels, blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots])
-
     def volume(self, like: TsdfVolume) -> TsdfVolume:
         """The blocks as a map with the camera and the parameters of another."""
         out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
