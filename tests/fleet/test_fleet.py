@@ -63,7 +63,7 @@ def fuse(runs, out, limit, workers=1, bits=9):
     for name in ("map", "tiles", ".work"):
         shutil.rmtree(out / name, ignore_errors=True)
         (out / name).mkdir(parents=True)
-    like = MapHeader.read(runs[0].folder / MAP_FILE, blocks=False)
+    like = MapHeader.read(runs[0].folder / MAP_FILE)
     with pytest.MonkeyPatch.context() as patch, Workers(workers) as crew:
         patch.setattr(fusion, "CELL_BITS", bits)
         ranges = planned_ranges(runs, crew, limit)

@@ -175,7 +175,7 @@ def _described(job: tuple[Path, NDArray[np.float32]]) -> NDArray[np.float32]:
 def _compare(job: tuple[Path, list[tuple[Path, NDArray[np.float64] | None]]]) -> list[MapPair]:
     """Decisions on a run and others."""
     a, others = job
-    header = MapHeader.read(a / MAP_FILE, blocks=False)
+    header = MapHeader.read(a / MAP_FILE)
     return [_compare_two(a, b, guess, header) for b, guess in others]
 
 
