@@ -121,13 +121,11 @@ class FleetReport:
     Attributes:
         out: Folder of the largest world; others lie in it as part-2, part-3, ...
         tree: Content of its world.json.
-        graph: Poses of the runs.
         sentences: What the user should know: runs that were not joined, joins that contradict others.
     """
 
     out: Path
     tree: dict[str, Any]
-    graph: RunGraph
     sentences: list[str]
 
 
@@ -173,7 +171,7 @@ def merge_fleet(
         tree |= {"compared_pairs": len(pairs), "workers": workers, "cpu_s": round(crew.cpu_s, 1)} | times
         tree["peak_rss_mb"] = sorted(crew.peak_rss_mb.values(), reverse=True)
         write_text(out / WORLD_FILE, json.dumps(tree, indent=1) + "\n")
-    return FleetReport(out, tree, graph, _sentences(graph, folders))
+    return FleetReport(out, tree, _sentences(graph, folders))
 
 
 def _write_world(
