@@ -10,18 +10,19 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
     """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
     import cv2
 
-    if exposure == (1.0, 0.0):
-        return rgb
     gain, offset = exposure
-    curve = np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
-    return np.asarray(cv2.LUT(rgb, curve), dtype=np.uint8)
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
 
 
 def exposed(level: Level, exposure: tuple[float, float]) -> Level:
     """Level with gain and offset applied to its intensities."""
-    if exposure == (1.0, 0.0):
-        return level
     gain, offset = exposure
+    if (gain, offset) == (1.0, 0.0):
+        return level
     return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
 
 
