@@ -67,14 +67,8 @@ def lucas_kanade(
     window: int,
     halvings: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """Pyramidal Lucas-Kanade flow.
-
-    Args:
-        first, second: (h, w) uint8 images.
-        pixels: (n, 2) positions u, v in the first image.
-        guess: (n, 2) positions in the second image that the search starts from.
-        window: Edge of the matched window, pixels.
-        halvings: Halved copies of the images that are searched before the images themselves; 0 searches these alone.
+    """Pyramidal Lucas-Kanade flow of pixels (n, 2) u, v of the first image (h, w), searched from a guess (n, 2) with a
+    window of so many pixels, in copies of the images halved up to ``halvings`` times before the images themselves.
 
     Returns:
         Positions (n, 2) in the second image, arbitrary where not found; whether each was found (n,); mean absolute
@@ -136,12 +130,8 @@ def consistent_with_static(
     The coarse levels of the search see more than the window and may follow a nearer surface, and textures repeat.
     Therefore the search is repeated from the position of a static point, at full resolution alone.
 
-    Args:
-        first, second: (h, w) uint8 images.
-        pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) positions in the second if the points are static.
-        allowed: (n,) largest distance of a match from there, pixels.
-        difference: (n,) mean differences of the grey values of the windows of the matches found elsewhere.
+    ``expected`` (n, 2) are these positions, ``allowed`` (n,) the largest distances of a match from there, pixels, and
+    ``difference`` (n,) those of ``lucas_kanade`` for the matches found elsewhere.
     """
     guess = expected.astype(np.float32)
     positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)
