@@ -333,7 +333,9 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     return static[corners.segmentation.labels]
 
 
-def _pixels_of_level(pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level) -> NDArray[np.int64]:
+def _pixels_of_level(
+    pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level
+) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
