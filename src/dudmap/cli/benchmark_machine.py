@@ -1,14 +1,11 @@
 """``dudmap benchmark speed | gpu | roofline | soak``: time and memory of the machine at hand."""
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from dudmap.app.terminal import say
-from dudmap.atomic_file import write_text
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
@@ -16,6 +13,10 @@ RUNS = Path("runs/benchmark")
 """Folder of the output folders, unless another one is named."""
 
 QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
+
+
+def _announced(what: str) -> None:
+    say(f"measuring {what}", err=True)
 
 
 def gpu(
@@ -42,31 +43,16 @@ def gpu(
 
     Without a GPU, only the CPU is measured, and the table says why.
     """
-    from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark import gpu as measurements
-    from dudmap.lab.benchmark.gpu import find_open3d
+    from dudmap.lab.benchmark.measure import save
 
-    rows, python = [], find_open3d(open3d)
     steps, shapes = measurements.numbers(voxels, sizes)
     if quick:
         steps, shapes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
-    for name, each in measurements.recordings(shapes, max_frames, sequence or []):
-        for step in steps:
-            for one in measurements.devices(device):
-                say(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
-                rows.append(measurements.measure(name, each, max_frames, step, one))
-        if python is not None:
-            other = measurements.devices(device)[0].upper()
-            say(f"measuring {name}, Open3D's dense SLAM", err=True)
-            rows += measurements.measure_open3d(
-                python, name, each, max_frames, steps, "CPU:0" if other == "CPU" else other
-            )
+    content, python = measurements.recordings(shapes, max_frames, sequence or []), measurements.find_open3d(open3d)
+    rows = measurements.measure_devices(content, steps, max_frames, device, python, _announced)
     text = measurements.table(rows)
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "gpu.md", text)
-    content = {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
-    write_text(out / "gpu.json", json.dumps(content, indent=2) + "\n")
-    answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
+    answer(save(None, text, out, "gpu", {"rows": rows}), text, as_json=as_json, out=out)
 
 
 def speed(
@@ -86,24 +72,15 @@ def speed(
     as_json: o.JsonOption = False,
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
-    from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.gpu import find_open3d
+    from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.speed import markdown, speed_figures
 
-    frames, long_frames = (20, 60) if quick else (300, 2000)
-    figures = speed_figures(
-        frames,
-        long_frames if long else 0,
-        lambda what: say(f"measuring {what}", err=True),
-        find_open3d(open3d),
-        sequence,
-    )
-    text = markdown(figures)
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "speed.md", text)
-    content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
-    write_text(out / "speed.json", json.dumps(content, indent=2) + "\n")
-    answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
+    frames, long_frames = (20, 60) if quick else (300, 2000 if long else 0)
+    python = find_open3d(open3d)
+    figures = speed_figures(frames, long_frames, _announced, python, sequence)
+    text, tree = markdown(figures), {"figures": [figure._asdict() for figure in figures]}
+    answer(save(None, text, out, "speed", tree), text, as_json=as_json, out=out)
 
 
 def roofline(
@@ -113,15 +90,11 @@ def roofline(
     as_json: o.JsonOption = False,
 ) -> None:
     """Compare the time of each stage with what its bytes and operations need at least on this machine."""
-    from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark import roofline as measurements
+    from dudmap.lab.benchmark.measure import save
 
     figures, text = measurements.roofline(max_frames, voxel)
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "roofline.md", text)
-    content = {"machine": machine(), "versions": versions(), **figures}
-    write_text(out / "roofline.json", json.dumps(content, indent=2) + "\n")
-    answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
+    answer(save(None, text, out, "roofline", figures), text, as_json=as_json, out=out)
 
 
 def soak(

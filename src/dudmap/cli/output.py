@@ -20,8 +20,10 @@ class DefaultGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
-    """Print the result of a command to stdout: as one JSON object, as text, or not at all."""
+def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False, out: Path | None = None) -> None:
+    """Print the result of a command, and where it is written, to stdout: as one JSON object, as text, or not at all."""
+    if out is not None:
+        tree, text = {**tree, "out": out}, f"{text}\nwritten to {out}"
     if as_json:
         say(json.dumps(plain(tree), allow_nan=False))
     elif not quiet:

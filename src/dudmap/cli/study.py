@@ -59,7 +59,7 @@ def run(
     out = out or Path("runs/study") / design.stem
     report = _shown_with(cost_per_core_hour)
     outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
-    _answer(outcome, out, as_json=as_json)
+    answer({"outcome": outcome}, outcome, as_json=as_json, out=out)
 
 
 @app.command()
@@ -92,7 +92,7 @@ def thesis(
         out = out or Path("runs/study") / f"thesis-{table}"
         report = _shown_with(cost_per_core_hour)
         outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
-    _answer(outcome, out, as_json=as_json)
+    answer({"outcome": outcome}, outcome, as_json=as_json, out=out)
 
 
 @app.command()
@@ -114,11 +114,7 @@ def tune(
     out = out or Path("runs/study") / f"{design.stem}-tune"
     report = _shown_with(cost_per_core_hour)
     outcome = run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=report)
-    _answer(outcome, out, as_json=as_json)
-
-
-def _answer(outcome: str, out: Path, *, as_json: bool) -> None:
-    answer({"outcome": outcome, "out": out}, f"{outcome}\nwritten to {out}", as_json=as_json)
+    answer({"outcome": outcome}, outcome, as_json=as_json, out=out)
 
 
 def _executor(jobs: int, cluster: str) -> "Executor":

@@ -1,4 +1,7 @@
-"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map."""
+"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map.
+
+A recording without true poses is a ``DatasetError``.
+"""
 
 from typing import NamedTuple
 
@@ -55,9 +58,6 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[P
     clocks are exact, every mean correction must vanish.
 
     The world frame is the first camera's, as in a run. Frames without a true pose are left out.
-
-    Raises:
-        DatasetError: The recording has no true poses for at least two frames.
     """
     truth = sequence.ground_truth
     if truth is None:
@@ -150,9 +150,6 @@ def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAME
     """Track the first frames by distances only, as configured, and by colour almost only; of the final trajectory.
 
     Both trajectories begin with the first camera: what its noise does to the world frame is no error.
-
-    Raises:
-        DatasetError: The recording has no true poses.
     """
     truth = sequence.ground_truth
     if truth is None:

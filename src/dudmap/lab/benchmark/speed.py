@@ -1,4 +1,7 @@
-"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process."""
+"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process.
+
+A measurement that fails is a ``DudmapError``.
+"""
 
 import os
 import statistics
@@ -59,9 +62,6 @@ def speed_figures(
             it.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
-
-    Raises:
-        DudmapError: A measurement failed.
     """
     figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
@@ -169,11 +169,7 @@ def _start_times() -> list[SpeedFigure]:
 
 
 def program_seconds(arguments: list[str], times: int = 5, **variables: str) -> float:
-    """Median duration of a Python program with environment variables, seconds.
-
-    Raises:
-        DudmapError: The program fails.
-    """
+    """Median duration of a Python program with environment variables, seconds."""
     seconds = []
     for _ in range(times):
         start = time.perf_counter()
@@ -224,9 +220,9 @@ def time_frames(job: tuple[float, int]) -> Row:
     row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
     row["free_share"] = slam.volume.blocks.entry_bytes / (2 * 512 * 4)
     pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
-    seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
+    seconds, mesh = median_seconds(slam.volume.extract_mesh, 3)
     row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
-    row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
+    row["view_ms"] = 1000 * median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
     return row | _time_again(slam, sequence[frames])
 
 
@@ -242,7 +238,7 @@ def _time_again(slam: "Slam", frame: "Frame") -> Row:
     return {"again_ms": 1000 * (time.perf_counter() - start), "stale": len(stale)}
 
 
-def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
+def median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
     """Median duration after one call for warm-up, and the last result."""
     result, seconds = action(), []
     for _ in range(times):
@@ -271,7 +267,7 @@ def time_iteration(frames: int) -> Row:
     level = Level(slam.camera.scaled(halvings), depth, intensity)
     pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
     slam.volume.look_at(pose)
-    seconds, _ = _median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
+    seconds, _ = median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
     return {"iteration_ms": 1000 * seconds}
 
 
@@ -297,7 +293,7 @@ def time_walk(frames: int) -> Row:
     assert slam is not None
     row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
     row["growth"] = row["last_ms"] / row["first_ms"]
-    row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
+    row["mesh_ms"] = 1000 * median_seconds(slam.volume.extract_mesh, 1)[0]
     return row | _time_again(slam, sequence[frames])
 
 

@@ -60,11 +60,7 @@ class StudyFolder:
             (self.root / name).mkdir(parents=True, exist_ok=True)
 
     def result(self, key: str) -> dict[str, Any] | None:
-        """Result of a run, None if it has none.
-
-        Raises:
-            DudmapError: The file was changed by something else and cannot be read.
-        """
+        """Result of a run, None if it has none."""
         path = self.root / "runs" / key / "result.json"
         try:
             return json.loads(path.read_text(encoding="utf-8"))
@@ -166,9 +162,6 @@ def measure_run(run: Run, out: Path | None) -> dict[str, Any]:
     """Figures of one run of the system, as ``dudmap.lab.benchmark.measure`` makes them.
 
     Frames are not prepared ahead in a second thread, so that the time per frame is all the time a frame takes.
-
-    Raises:
-        DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.lab.benchmark.measure import measure_sequence
 

@@ -118,11 +118,7 @@ SCENES = tables("synthetic/scenes.toml")
 
 
 def build_scene(name: str) -> Scene:
-    """Build a scene by name.
-
-    Raises:
-        ConfigError: There is no scene of this name.
-    """
+    """Build a scene by name."""
     row = dict(find(name, SCENES, "scene"))
     if "painted" in row:
         scene = build_scene(row["painted"])
