@@ -124,6 +124,8 @@ def mesh(
     A run folder and a recording with groundtruth.txt are aligned at their first pose. Other surfaces must share one
     coordinate frame.
     """
+    import numpy as np
+
     from dudmap.evaluation import reconstruction
     from dudmap.evaluation.files import first_pose_alignment, load_mesh
     from dudmap.evaluation.surface import moved, register
@@ -140,28 +142,19 @@ def mesh(
     if register_first:
         registration = register(found, true, T)
         T = registration.T_reference_estimate
-        figures |= {
-            "icp_rmse_m": round(registration.rmse, 6),
-            "icp_iterations": registration.num_iterations,
-            "icp_free_directions": registration.free_directions,
-        }
-    figures["T_reference_estimate"] = None if T is None else [[round(float(x), 9) for x in row] for row in T]
+        figures |= {"icp_rmse_m": round(registration.rmse, 6), "icp_iterations": registration.num_iterations}
+        figures["icp_free_directions"] = registration.free_directions
+    figures["T_reference_estimate"] = None if T is None else np.round(T, 9).tolist()
     found = found if T is None else moved(found, T)
+    distances = o.numbers(thresholds, None, "--distances")
     result = reconstruction.compare_surfaces(
-        found,
-        true,
-        observed=observed,
-        thresholds=tuple(o.numbers(thresholds, None, "--distances")),
-        ghost_distance=ghost_distance,
-        samples=samples,
+        found, true, observed=observed, thresholds=distances, ghost_distance=ghost_distance, samples=samples,
         points=points,
-    )
-    figures |= result.figures()
-    figures["histogram"] = {
-        "edges_m": [round(float(edge), 6) for edge in result.histogram_edges],
-        "accuracy": [round(float(share), 6) for share in result.accuracy_histogram],
-        "completeness": [round(float(share), 6) for share in result.completeness_histogram],
-    }
+    )  # fmt: skip
+    columns = result.histogram_edges, result.accuracy_histogram, result.completeness_histogram
+    histogram = {name: np.round(column, 6).tolist()
+                 for name, column in zip(("edges_m", "accuracy", "completeness"), columns, strict=True)}  # fmt: skip
+    figures |= result.figures() | {"histogram": histogram}
     target = _output_folder(out, estimate if estimate.is_dir() else file.parent)
     stem = "mesh" if estimate.is_dir() else file.stem
     pictures: list[Path] = []

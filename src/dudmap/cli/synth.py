@@ -1,5 +1,6 @@
 """``dudmap synth``: render a synthetic recording with exact ground truth."""
 
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -115,22 +116,10 @@ def synth(
         answer(tree, f"{out}: two visits, {', '.join(kinds) or 'nothing changed'}", as_json=as_json, quiet=quiet)
         return
     sequence = synthetic.sequence(
-        scene=scene,
-        movers=_names(movers),
-        camera_path=camera_path,
-        speed=speed,
-        coverage=coverage,
-        start_dynamic=start_dynamic,
-        situation=situation,
-        seed=seed,
-        motion_blur=motion_blur,
-        exposure_change=exposure_change,
-        sensor=sensor,
-        faults=parse_faults(fault or []),
-        **options,
-    )
-    import time
-
+        scene, _names(movers), camera_path, speed=speed, coverage=coverage, start_dynamic=start_dynamic,
+        situation=situation, seed=seed, motion_blur=motion_blur, exposure_change=exposure_change, sensor=sensor,
+        faults=parse_faults(fault or []), **options,
+    )  # fmt: skip
     start, count = time.perf_counter(), len(sequence)
     with counted("rendering", quiet=quiet or as_json) as progress:
         write_folder(sequence, out, overwrite=overwrite, progress=lambda done: progress(done, count))

@@ -261,10 +261,10 @@ def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
     return "\n".join(lines) + "\n"
 
 
-def markdown(rows: list[Row], columns: tuple[Column, ...] = COLUMNS) -> str:
+def markdown(rows: list[Row]) -> str:
     """Markdown table of the rows, followed by a list of the failed ones."""
     good = [row for row in rows if "error" not in row]
-    used = [column for column in columns if any(row.get(column.key) is not None for row in good)]
+    used = [column for column in COLUMNS if any(row.get(column.key) is not None for row in good)]
     header = ["sequence", "system", *(column.heading for column in used)]
     body = [
         [str(row["sequence"]), str(row["system"]), *(shown(row.get(column.key), column) for column in used)]
