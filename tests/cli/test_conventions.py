@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dudmap.cli import COMMANDS, app
+from dudmap.cli import COMMANDS, app, application_of
 from dudmap.cli.options import GROUPS, arranged
 from dudmap.cli.output import answer, plain
 from exported_runs import make_run
@@ -35,9 +34,7 @@ def leaves(name, command):
 ALL = {
     words: command
     for name in COMMANDS
-    for words, command in leaves(
-        name, arranged(typer.main.get_command(import_module(f"dudmap.cli.{name}").app))
-    ).items()
+    for words, command in leaves(name, arranged(typer.main.get_command(application_of(name)))).items()
 }
 
 

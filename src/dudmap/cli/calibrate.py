@@ -14,11 +14,7 @@ if TYPE_CHECKING:
     from dudmap.core.calibration.estimator import Estimate
     from dudmap.core.geometry.calibration import Calibration
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def calibrate(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,

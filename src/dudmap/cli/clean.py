@@ -10,11 +10,7 @@ from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import DatasetError
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def clean(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,

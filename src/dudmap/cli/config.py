@@ -3,18 +3,13 @@
 import textwrap
 from typing import TYPE_CHECKING
 
-import typer
-
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from dudmap.config import Config
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def config(
     preset: o.PresetOption = None,
     as_json: o.JsonOption = False,

@@ -20,11 +20,7 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
     from dudmap.core.result import FrameResult
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def demo(
     watching: o.WatchingOptions,
     out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/demo.")] = None,

@@ -8,10 +8,7 @@ import typer
 from dudmap.cli import options as o
 from dudmap.cli.output import answer, free_folder
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def diff(
     before: Annotated[Path, typer.Argument(help="Run folder of the first visit.", metavar="BEFORE")],
     after: Annotated[Path, typer.Argument(help="Run folder of the second visit.", metavar="AFTER")],

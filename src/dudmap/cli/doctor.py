@@ -8,12 +8,9 @@ import typer
 from dudmap.app.terminal import plain_console, say
 from dudmap.cli import options as o
 
-app = typer.Typer(add_completion=False)
-
 MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", "red")}
 
 
-@app.command()
 def doctor(
     as_json: o.JsonOption = False,
 ) -> None:

@@ -10,11 +10,9 @@ from dudmap.cli.output import answer
 from dudmap.io.exporting.exporters import EXPORTERS
 from dudmap.io.exporting.run_content import SPECK, ExportOptions
 
-app = typer.Typer(add_completion=False)
 _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS.items())
 
 
-@app.command()
 def export(
     run: o.RunArgument,
     out: Annotated[Path, typer.Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],

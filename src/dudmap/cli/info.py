@@ -11,14 +11,11 @@ from dudmap.cli.output import answer
 if TYPE_CHECKING:
     from dudmap.app.pipeline.inspection import Inspection
 
-app = typer.Typer(add_completion=False)
 
 SHOWN_GAPS = 5
 """Number of gaps in the times that are printed one by one."""
 
 
-@app.command()
-@o.grouped
 def info(
     reading: o.ReadingOptions,
     sequence: o.SequenceArgument,

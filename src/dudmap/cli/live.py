@@ -10,11 +10,7 @@ from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.run import run_parameters
 from dudmap.cli.view import observers
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def live(
     parameters: o.ParameterOptions,
     mapped: o.MapOptions,

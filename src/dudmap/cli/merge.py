@@ -9,10 +9,7 @@ from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.output import answer, free_folder
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def merge(
     runs: Annotated[
         list[Path], typer.Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")

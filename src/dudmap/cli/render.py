@@ -10,10 +10,7 @@ from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import ConfigError
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def render(
     run: o.RunArgument,
     out: Annotated[

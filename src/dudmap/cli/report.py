@@ -8,10 +8,7 @@ import typer
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def report(
     run: o.RunArgument,
     out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html in the run folder.")] = None,

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
     from dudmap.config import Config
     from dudmap.core.places.saved_map import SavedMap
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def run(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,

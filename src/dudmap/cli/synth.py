@@ -10,10 +10,7 @@ from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def synth(
     out: Annotated[Path, typer.Argument(help="Output folder, in TUM layout with ground truth.")],
     scene: Annotated[str, typer.Option(help="room, corridor, desk, yard, textureless, plane or box.")] = "room",

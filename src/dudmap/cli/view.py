@@ -16,10 +16,7 @@ from dudmap.errors import DudmapError
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def view(
     run: o.RunArgument,
     host: o.HostOption = "127.0.0.1",
