@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
+from dudmap.app.pipeline.environment import machine
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark.suites import Entry, Excerpt
 from dudmap.lab.study.plan import Run
@@ -111,12 +112,6 @@ class StudyFolder:
         line = {"event": event, "run": key, "pid": os.getpid(), "host": host, "time": time.time()}
         with (self.root / f"journal-{host}.jsonl").open("ab", buffering=0) as file:
             file.write((json.dumps(line) + "\n").encode())
-
-    def journal(self) -> list[dict[str, Any]]:
-        """All lines of the journals in the order of time; a line cut off by a full disk is left out."""
-        lines = [line for path in self.root.glob("journal*.jsonl")
-                 for line in path.read_text(encoding="utf-8").splitlines()]  # fmt: skip
-        return sorted((json.loads(line) for line in lines if line.endswith("}")), key=lambda line: line["time"])
 
 
 Do = Callable[[Run, Path | None], dict[str, Any]]
@@ -227,7 +222,7 @@ class LocalExecutor:
 
     def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:
         self.workers = workers
-        self.cores = threads or max(1, usable_cores() // workers)
+        self.cores = threads or max(1, machine()["cores_usable"] // workers)
         self._pids: dict[ProcessPoolExecutor, int] = {}
         self._idle: list[ProcessPoolExecutor] = []
         self._lock = threading.Lock()
@@ -266,11 +261,6 @@ class LocalExecutor:
                 os.kill(pid, signal.SIGTERM)
             except OSError:  # it ended by itself: ProcessLookupError, on Windows another one
                 continue
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def set_threads(threads: int) -> None:
