@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
@@ -22,7 +23,7 @@ app = typer.Typer(
 
 SystemsOption = Annotated[
     str,
-    typer.Option(
+    Option(
         "--systems",
         help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of the suite ablation, the "
         "default with one part switched off at a time.",
@@ -30,20 +31,20 @@ SystemsOption = Annotated[
 ]
 
 DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Folder of the recordings; nothing is downloaded.", metavar="FOLDER")
+    Path | None, Option("--data", help="Folder of the recordings; nothing is downloaded.", metavar="FOLDER")
 ]
 
 
 def suite_command(
     context: typer.Context,
     systems: SystemsOption = "",
-    out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
+    out: Annotated[Path | None, Option(help="Default: runs/benchmark/<suite>.")] = None,
     data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     score: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=FOLDER",
             help="Score results of another system, FOLDER/<sequence>/trajectory.txt and mesh.ply; repeatable.",
         ),
@@ -77,8 +78,8 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 @app.command()
 def sensors(
-    out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
-    only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
+    out: Annotated[Path, Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
+    only: Annotated[str, Option(help="Comma-separated sensors; default: all.")] = "",
     data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
@@ -102,10 +103,10 @@ def sensors(
 
 @app.command()
 def random(
-    number: Annotated[int, typer.Option("--count", min=1, help="Number of worlds.")] = 40,
+    number: Annotated[int, Option("--count", min=1, help="Number of worlds.")] = 40,
     seed: o.SeedOption = 0,
-    only: Annotated[str, typer.Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
-    out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = RUNS / "random",
+    only: Annotated[str, Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
+    out: Annotated[Path, Option(help="Output folder for the rows and the report.")] = RUNS / "random",
     jobs: o.JobsOption = 1,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
@@ -136,10 +137,10 @@ def _print_world(row: dict[str, Any]) -> None:
 @app.command()
 def bias(
     recording: Annotated[
-        Path | None, typer.Argument(help="Static recording with true poses; default: exact synthetic rooms.")
+        Path | None, Argument(help="Static recording with true poses; default: exact synthetic rooms.")
     ] = None,
-    stride: Annotated[int, typer.Option(min=1, help="Register every so many frames.")] = 4,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of synthetic rooms.")] = 3,
+    stride: Annotated[int, Option(min=1, help="Register every so many frames.")] = 4,
+    seeds: Annotated[int, Option(min=1, help="Number of synthetic rooms.")] = 3,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -163,7 +164,7 @@ def bias(
 
 @app.command("first-second")
 def first_second(
-    seeds: Annotated[int, typer.Option(min=1, help="Number of worlds of each scene.")] = 3,
+    seeds: Annotated[int, Option(min=1, help="Number of worlds of each scene.")] = 3,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -184,10 +185,8 @@ def first_second(
 
 @app.command()
 def calls(
-    recording: Annotated[
-        Path | None, typer.Argument(help="Recording; default: a synthetic room with a person.")
-    ] = None,
-    max_frames: Annotated[int, typer.Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    recording: Annotated[Path | None, Argument(help="Recording; default: a synthetic room with a person.")] = None,
+    max_frames: Annotated[int, Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -205,13 +204,13 @@ def calls(
 @app.command()
 def faults(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room with people.")
+        Path | None, Argument(help="Recording with true poses; default: a synthetic room with people.")
     ] = None,
-    max_frames: Annotated[int, typer.Option(min=20, help="Number of frames of the recording.")] = 120,
-    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    max_frames: Annotated[int, Option(min=20, help="Number of frames of the recording.")] = 120,
+    width: Annotated[int, Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
     seed: o.SeedOption = 0,
-    only: Annotated[str, typer.Option(help="Comma-separated faults; default: all.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Also write the table to this file (Markdown).")] = None,
+    only: Annotated[str, Option(help="Comma-separated faults; default: all.")] = "",
+    out: Annotated[Path | None, Option(help="Also write the table to this file (Markdown).")] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -242,10 +241,10 @@ def faults(
 @app.command("wrong-input")
 def wrong_input(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic desk and room.")
+        Path | None, Argument(help="Recording with true poses; default: a synthetic desk and room.")
     ] = None,
-    max_frames: Annotated[int, typer.Option(min=4, help="Number of frames from the start.")] = 40,
-    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    max_frames: Annotated[int, Option(min=4, help="Number of frames from the start.")] = 40,
+    width: Annotated[int, Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
     as_json: o.JsonOption = False,
 ) -> None:
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
@@ -269,11 +268,9 @@ def wrong_input(
 
 @app.command()
 def gate(
-    figures: Annotated[Path, typer.Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
-    fixtures: Annotated[Path, typer.Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path(
-        "tests/fixtures"
-    ),
-    update: Annotated[bool, typer.Option("--update", help="Record the measured figures; margins are kept.")] = False,
+    figures: Annotated[Path, Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
+    fixtures: Annotated[Path, Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path("tests/fixtures"),
+    update: Annotated[bool, Option("--update", help="Record the measured figures; margins are kept.")] = False,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -300,7 +297,7 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
+    out: Annotated[Path, Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
@@ -328,11 +325,11 @@ def limits(
 
 @app.command()
 def consistency(
-    recording: Annotated[Path, typer.Argument(help="Recording.")],
+    recording: Annotated[Path, Argument(help="Recording.")],
     trajectories: Annotated[
-        list[Path] | None, typer.Argument(help="Trajectories of it in TUM text, or folders of runs.")
+        list[Path] | None, Argument(help="Trajectories of it in TUM text, or folders of runs.")
     ] = None,
-    max_frames: Annotated[int | None, typer.Option(min=2, help="Number of frames from the start.")] = None,
+    max_frames: Annotated[int | None, Option(min=2, help="Number of frames from the start.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""

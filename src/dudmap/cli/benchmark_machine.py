@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
@@ -12,7 +13,7 @@ from dudmap.cli.output import answer
 RUNS = Path("runs/benchmark")
 """Folder of the output folders, unless another one is named."""
 
-QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
+QuickOption = Annotated[bool, Option("--quick", help="Reduced version for a quick check.")]
 
 
 def _announced(what: str) -> None:
@@ -20,22 +21,19 @@ def _announced(what: str) -> None:
 
 
 def gpu(
-    device: Annotated[
-        str, typer.Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")
-    ] = "auto",
-    max_frames: Annotated[int, typer.Option(min=2, help="Number of frames of each run.")] = 120,
-    voxels: Annotated[str, typer.Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
+    device: Annotated[str, Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")] = "auto",
+    max_frames: Annotated[int, Option(min=2, help="Number of frames of each run.")] = 120,
+    voxels: Annotated[str, Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
     sizes: Annotated[
-        str, typer.Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
+        str, Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
     ] = "640x480,1280x720",
     sequence: Annotated[
-        list[Path] | None, typer.Option(help="Also measure this recording; repeatable.", metavar="SEQUENCE")
+        list[Path] | None, Option(help="Also measure this recording; repeatable.", metavar="SEQUENCE")
     ] = None,
     open3d: Annotated[
-        Path | None,
-        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."),
+        Path | None, Option(metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Output folder for gpu.md and gpu.json.")] = RUNS / "gpu",
+    out: Annotated[Path, Option(help="Output folder for gpu.md and gpu.json.")] = RUNS / "gpu",
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -56,17 +54,15 @@ def gpu(
 
 
 def speed(
-    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
+    out: Annotated[Path, Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
     long: Annotated[
-        bool, typer.Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
+        bool, Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
     ] = False,
     open3d: Annotated[
-        Path | None,
-        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."),
+        Path | None, Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM.")
     ] = None,
     sequence: Annotated[
-        Path | None,
-        typer.Option(help="Recording of that comparison; default: a synthetic room.", metavar="SEQUENCE"),
+        Path | None, Option(help="Recording of that comparison; default: a synthetic room.", metavar="SEQUENCE")
     ] = None,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
@@ -84,9 +80,9 @@ def speed(
 
 
 def roofline(
-    max_frames: Annotated[int, typer.Option(min=2, help="Number of frames.")] = 60,
-    voxel: Annotated[float, typer.Option(help="Voxel size, metres.")] = 0.01,
-    out: Annotated[Path, typer.Option(help="Output folder for roofline.md and roofline.json.")] = RUNS / "roofline",
+    max_frames: Annotated[int, Option(min=2, help="Number of frames.")] = 60,
+    voxel: Annotated[float, Option(help="Voxel size, metres.")] = 0.01,
+    out: Annotated[Path, Option(help="Output folder for roofline.md and roofline.json.")] = RUNS / "roofline",
     as_json: o.JsonOption = False,
 ) -> None:
     """Compare the time of each stage with what its bytes and operations need at least on this machine."""
@@ -98,7 +94,7 @@ def roofline(
 
 
 def soak(
-    max_frames: Annotated[int, typer.Option(min=20, help="Number of frames, at 15 Hz.")] = 20_000,
+    max_frames: Annotated[int, Option(min=20, help="Number of frames, at 15 Hz.")] = 20_000,
     size: o.SizeOption = "320x240",
     seed: o.SeedOption = 0,
     as_json: o.JsonOption = False,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import counted
 from dudmap.cli import options as o
@@ -16,11 +16,11 @@ def clean(
     parameters: o.ParameterOptions,
     sequence: o.SequenceArgument,
     out: Annotated[
-        Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
+        Path, Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
     ],
     run: Annotated[
         Path | None,
-        typer.Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
+        Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
     ] = None,
     passes: o.PassesOption = 2,
     max_frames: o.MaxFramesOption = None,

@@ -11,9 +11,7 @@ from dudmap.cli import options as o
 MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", "red")}
 
 
-def doctor(
-    as_json: o.JsonOption = False,
-) -> None:
+def doctor(as_json: o.JsonOption = False) -> None:
     """Check the installation and say what to do: versions, processor, threads, GPU, caches, extras, port of the page.
 
     Ends with 1 if something stops the program. Notes only limit a part of it.

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
@@ -11,7 +11,7 @@ from dudmap.cli.output import answer
 
 def report(
     run: o.RunArgument,
-    out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html in the run folder.")] = None,
+    out: Annotated[Path | None, Option(help="HTML file; default: report.html in the run folder.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
@@ -28,18 +29,14 @@ app = typer.Typer(
 class SearchOptions:
     """Options of all studies: where the results lie, and what does the runs."""
 
-    out: Annotated[Path | None, typer.Option("--out", help="Study folder; an interrupted study in it goes on.")] = None
-    jobs: Annotated[int, typer.Option("--jobs", min=0, help="Runs at a time; 0: one per core.", metavar="N")] = 0
-    max_runs: Annotated[int, typer.Option("--max-runs", min=1, help="Refuse a design with more runs.")] = 1000
+    out: Annotated[Path | None, Option("--out", help="Study folder; an interrupted study in it goes on.")] = None
+    jobs: Annotated[int, Option("--jobs", min=0, help="Runs at a time; 0: one per core.", metavar="N")] = 0
+    max_runs: Annotated[int, Option("--max-runs", min=1, help="Refuse a design with more runs.")] = 1000
     cluster: Annotated[
-        str,
-        typer.Option(
-            "--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine."
-        ),
+        str, Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine.")
     ] = ""
     cost_per_core_hour: Annotated[
-        float,
-        typer.Option("--cost-per-core-hour", min=0, help="Price of a core for one hour; the progress shows the cost."),
+        float, Option("--cost-per-core-hour", min=0, help="Price of a core for one hour; the progress shows the cost.")
     ] = 0.0
     as_json: o.JsonOption = False
 
@@ -67,7 +64,7 @@ class SearchOptions:
 class StudyOptions(SearchOptions):
     """Options of a study whose runs may be kept."""
 
-    keep: Annotated[bool, typer.Option("--keep", help="Keep trajectory, mesh and map of every run.")] = False
+    keep: Annotated[bool, Option("--keep", help="Keep trajectory, mesh and map of every run.")] = False
 
     def run(self, plan: "Plan", out: Path) -> None:
         """Run a study."""
@@ -79,7 +76,7 @@ class StudyOptions(SearchOptions):
 
 @app.command()
 @o.grouped
-def run(options: StudyOptions, design: Annotated[Path, typer.Argument(help="Design file (docs/study.md).")]) -> None:
+def run(options: StudyOptions, design: Annotated[Path, Argument(help="Design file (docs/study.md).")]) -> None:
     """Run the study of a design file; the word run may be left out."""
     from dudmap.lab.study.plan import load_plan
 
@@ -92,12 +89,12 @@ def run(options: StudyOptions, design: Annotated[Path, typer.Argument(help="Desi
 def thesis(
     options: StudyOptions,
     recordings: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings; default: a synthetic room with a walking person.")
+        list[Path] | None, Argument(help="Recordings; default: a synthetic room with a walking person.")
     ] = None,
-    table: Annotated[str, typer.Option(help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
+    table: Annotated[str, Option(help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
     max_frames: o.MaxFramesOption = None,
     published: Annotated[
-        bool, typer.Option("--published", help="Analyse the printed values of table 6.1; nothing is run.")
+        bool, Option("--published", help="Analyse the printed values of table 6.1; nothing is run.")
     ] = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
@@ -116,7 +113,7 @@ def thesis(
 @o.grouped
 def tune(
     options: SearchOptions,
-    design: Annotated[Path, typer.Argument(help="Design file with a second set of recordings (judge).")],
+    design: Annotated[Path, Argument(help="Design file with a second set of recordings (judge).")],
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
     from dudmap.lab.study.plan import load_plan

@@ -9,18 +9,7 @@ from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
 from dudmap.evaluation.trajectory import accuracy
-from dudmap.lab.benchmark.measure import (
-    COLUMNS,
-    SCORED,
-    Job,
-    Row,
-    grid,
-    markdown,
-    measure_all,
-    save,
-    score_mesh,
-    shown,
-)
+from dudmap.lab.benchmark.measure import COLUMNS, SCORED, Job, Row, grid, markdown, measure_all, save, score_mesh, shown
 from dudmap.lab.benchmark.suites import Entry, Suite
 from dudmap.lab.data import tables
 
