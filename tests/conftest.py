@@ -44,6 +44,21 @@ def float_errors_are_errors():
 
 
 @pytest.fixture
+def give_threads(monkeypatch):
+    """Sets the number of threads of a test."""
+    from dudmap.core.backends import threads
+
+    def give(count):
+        monkeypatch.setenv("DUDMAP_THREADS", str(count))
+        threads.num_threads.cache_clear()
+        threads._tasks.cache_clear()
+
+    yield give
+    threads.num_threads.cache_clear()
+    threads._tasks.cache_clear()
+
+
+@pytest.fixture
 def slam(monkeypatch):
     """Replace ``dudmap.core.slam.Slam`` by ``FakeSlam``; tests set ``slam.script``."""
     fake = type("Slam", (FakeSlam,), {"script": {}})

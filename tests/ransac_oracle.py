@@ -3,7 +3,7 @@
 import numpy as np
 
 from dudmap.core.backends.cpu.consensus import REFINED, REGULAR, ROUNDS
-from dudmap.core.dynamics.ransac import reproject
+from dudmap.core.dynamics.dominant_motion import reproject
 from dudmap.core.geometry import se3
 
 

@@ -77,7 +77,7 @@ def test_cores_are_counted_without_affinity(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.delenv("DUDMAP_THREADS", raising=False)
     monkeypatch.setattr(threads, "_num_cores", threads._num_cores.__wrapped__)  # without what it has counted before
-    assert threads.num_threads() == environment.machine()["cores_usable"] == os.cpu_count()
+    assert threads.num_threads.__wrapped__() == environment.machine()["cores_usable"] == os.cpu_count()
 
 
 def test_closing_workers_that_are_gone_is_no_error(monkeypatch):

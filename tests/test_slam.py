@@ -224,8 +224,8 @@ def digest():
     return found.hexdigest()
 
 
-def test_the_result_does_not_depend_on_the_number_of_threads_or_the_run(monkeypatch):
-    monkeypatch.setenv("DUDMAP_THREADS", "3")
+def test_the_result_does_not_depend_on_the_number_of_threads_or_the_run(give_threads):
+    give_threads(3)
     command = [sys.executable, "-c", "import test_slam; print(test_slam.digest())"]
     done = subprocess.run(
         command, cwd=Path(__file__).parent, env={**os.environ, "DUDMAP_THREADS": "1"}, capture_output=True, text=True,

@@ -2,13 +2,13 @@
 
 import pytest
 
-from dudmap.core import stage_timer
-from dudmap.core.stage_timer import StageTimer
+from dudmap.core.tracking import frame_view
+from dudmap.core.tracking.frame_view import StageTimer
 
 
 def test_no_time_counts_twice(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(stage_timer.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(frame_view.time, "perf_counter", lambda: now[0])
     timer = StageTimer({"before": 5.0})
     with timer("outer"):
         now[0] += 0.010

@@ -8,7 +8,7 @@ import pytest
 from dudmap.config import Config
 from dudmap.core.backends.cpu import labeling
 from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
-from dudmap.core.dynamics.mixture import Mixture, fit_mixture
+from dudmap.core.dynamics.masks import Mixture, fit_mixture
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic

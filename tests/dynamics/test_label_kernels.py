@@ -18,7 +18,7 @@ from dudmap.core.backends.cpu.labeling import opened
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, moving_segments, stand_still
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.parameters import SURFACE, MapSample, single
-from dudmap.core.dynamics.mixture import RULES, fit_mixture
+from dudmap.core.dynamics.masks import RULES, fit_mixture
 
 NOISE = single(NoiseParameters(0.001, 0.0019, 1.6e-5, 3, 0.02, 0.03, 4.0))
 SHAPE = 60, 80

@@ -7,8 +7,7 @@ import pytest
 
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.dynamics import dominant_motion as dominant
-from dudmap.core.dynamics.dominant_motion import dominant_motion
-from dudmap.core.dynamics.ransac import reproject, rigid_motion
+from dudmap.core.dynamics.dominant_motion import dominant_motion, reproject, rigid_motion
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
@@ -47,12 +46,12 @@ def test_the_best_motion_is_that_of_all_hypotheses_and_their_refinement(seed):
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_the_search_is_the_same_with_any_number_of_threads(monkeypatch):
+def test_the_search_is_the_same_with_any_number_of_threads(give_threads):
     rng = np.random.default_rng(9)
     points, targets = noisy(rng, 500)
     found = []
-    for threads in ("1", "2"):
-        monkeypatch.setenv("DUDMAP_THREADS", threads)
+    for threads in (1, 2):
+        give_threads(threads)
         found.append(rigid_motion(points, targets, CAMERA, np.eye(4)))
     assert np.array_equal(*found)
 
@@ -110,9 +109,12 @@ def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
     people, wall = rng.integers([5, 5], [190, 230], (200, 2)), rng.integers([210, 5], [310, 230], (100, 2))
     pixels = np.concatenate([people, wall])
     targets = pixels + np.where(np.arange(300)[:, None] < 200, [6.0, 0.0], 0.0)
-    monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: (pixels, targets, np.zeros(300)))
+    monkeypatch.setattr(
+        dominant, "track_forward_backward", lambda *_: (pixels, targets, np.zeros(300), np.ones(300, bool))
+    )
     monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
-    view = SimpleNamespace(fine=level, grey=None, corners=pixels, labelled=level)
+    points = CAMERA.points(*pixels.T, level.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64))
+    view = SimpleNamespace(fine=level, grey=None, corners=pixels, corner_points=points, labelled=level)
     motion = dominant_motion(view, view, (None, None))
     np.testing.assert_allclose(motion.T_after_before, np.eye(4), atol=1e-6)
     assert motion.share == pytest.approx(16 / 18)

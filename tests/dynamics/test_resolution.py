@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.core.dynamics.label_scale import REFERENCE_WIDTH
 from dudmap.core.dynamics.masks import full_size
-from dudmap.core.dynamics.segments import MIN_PIXELS
+from dudmap.core.dynamics.segments import MIN_PIXELS, REFERENCE_WIDTH
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam

@@ -11,12 +11,9 @@ from dudmap.core.backends import threads
 
 
 @pytest.fixture(autouse=True)
-def four_threads(monkeypatch):
+def four_threads(give_threads):
     """As on four cores, whatever this machine has."""
-    monkeypatch.setenv("DUDMAP_THREADS", "4")
-    threads._tasks.cache_clear()
-    yield
-    threads._tasks.cache_clear()
+    give_threads(4)
 
 
 def squares(count):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from dudmap import Config
-from dudmap.core.backends import threads
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.registration import write_lattice
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, run_team, take, wait_for_all, wait_for_work
@@ -45,11 +44,9 @@ def count_visits(leads, team, visits):
 
 
 @pytest.fixture(params=["1", "2", "4"])
-def num_threads(request, monkeypatch):
-    monkeypatch.setenv("DUDMAP_THREADS", request.param)
-    threads._tasks.cache_clear()
-    yield int(request.param)
-    threads._tasks.cache_clear()
+def num_threads(request, give_threads):
+    give_threads(int(request.param))
+    return int(request.param)
 
 
 def test_each_band_of_each_step_is_done_once(num_threads):
@@ -79,8 +76,7 @@ def registration():
 def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, columns, monkeypatch):
     monkeypatch.setattr("dudmap.core.backends.cpu.backend.PIXELS_PER_BAND", 256)  # several bands
     volume, tracker, level, weights, T = registration()
-    seen = tracker._observability(volume, level, T, weights, tracker.linearize(volume, level, T, weights), None)
-    rules = tracker._rules(8, False, seen)._replace(basis=np.eye(6)[:, :columns])
+    rules = tracker._rules(8, finest=False)._replace(basis=np.eye(6)[:, :columns].copy())
     first = tracker.linearize(volume, level, T, weights) if known else None
     parameters = tracker.parameters(volume.band)
     images = level.depth, level.intensity, weights, level.camera.intrinsics

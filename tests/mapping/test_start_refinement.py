@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap import Config, Slam
-from dudmap.core import bootstrap
+from dudmap.core import mapper
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.lab import synthetic
@@ -23,7 +23,7 @@ def room():
 
 def run(room, monkeypatch, window, spoil=lambda slam, index: None, *, live=False):
     """A run of 25 frames whose poses are estimated again after so many, and the poses as they were returned."""
-    monkeypatch.setattr(bootstrap, "WINDOW", window)
+    monkeypatch.setattr(mapper, "WINDOW", window)
     slam, returned = Slam(room.camera, Config(), live=live), []
     for index in range(25):
         spoil(slam, index)

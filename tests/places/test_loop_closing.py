@@ -81,7 +81,7 @@ def query_of(T, timestamp):
     image = np.zeros(TINY.shape, np.float32)
     observation = Observation(timestamp, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
     tracking = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
-    return LoopQuery(observation, [], None, np.ones(TINY.shape, dtype=bool), tracking)
+    return LoopQuery(observation, [], tracking, np.zeros(TINY.shape, dtype=bool))
 
 
 @pytest.mark.parametrize("solvable", [True, False])

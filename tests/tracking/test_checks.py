@@ -10,8 +10,7 @@ from dudmap import Config, Slam
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
 from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.image_consistency import ImageComparison
-from dudmap.core.tracking.quality_monitor import MIN_HISTORY
+from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 
 CONFIG = Config()
@@ -30,11 +29,11 @@ def test_each_check_fails_just_beyond_its_limit_and_names_its_figure(number):
     inside, outside = (limit * (1 + side * (-1 if check.at_least else 1)) for side in (-1e-6, 1e-6))
     if limit == 0:
         pytest.skip("no limit in this situation")
-    assert check.failure(GOOD | {check.figure: inside}, LIMITS) == ""
-    sentence = check.failure(GOOD | {check.figure: outside}, LIMITS)
+    assert first_failure([check], GOOD | {check.figure: inside}, LIMITS) == ""
+    sentence = first_failure([check], GOOD | {check.figure: outside}, LIMITS)
     assert sentence
     assert "{" not in sentence
-    assert check.failure(GOOD | {check.figure: np.nan}, LIMITS) == ""  # what is not known does not reject
+    assert first_failure([check], GOOD | {check.figure: np.nan}, LIMITS) == ""  # what is not known does not reject
     assert first_failure(CHECKS, GOOD, LIMITS) == ""
 
 

@@ -6,7 +6,7 @@ import pytest
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.tracking.color_noise import motion_discount
+from dudmap.core.tracking.color_motion import motion_discount
 
 CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
 

@@ -139,7 +139,9 @@ def test_noise_is_the_sum_over_the_readings(robust):
     volume = TsdfVolume(CAMERA, CONFIG.volume, config.sensor, 6.0)
     R = se3.exp_rotation(np.array([0.4, -0.3, 0.2]))
     parameters = Tracker(config.tracker, config.sensor).parameters(volume.band)
-    found = gradient_noise(level, residuals, weights, R, 0.03, CAMERA.width, FILTER_PX, parameters)
+    found = gradient_noise(
+        level, residuals, weights, R, 0.03, CAMERA.width, FILTER_PX, parameters, np.zeros((6, 6)), 1.0
+    )
     distances, intensities, total = np.zeros((6, 6)), np.zeros((6, 6)), 0.0
     stride, t, scale = level.camera.width // 40, config.tracker, level.camera.width / CAMERA.width
     for v in range(stride // 2, shape[0], stride):

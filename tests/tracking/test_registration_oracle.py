@@ -8,9 +8,8 @@ import pytest
 from dudmap.config import Config, TrackerConfig, VolumeConfig
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.parameters import NormalEquations
-from dudmap.core.frames.exposure import chained, exposed
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import retract

@@ -1,7 +1,7 @@
 """Result of processing one frame."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -81,9 +81,11 @@ class FrameResult:
 
     def without_details(self) -> "FrameResult":
         """Pose and mask alone, as of a frame that repeats this one."""
-        return replace(
-            self, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, find_movers=None,
-            corrected=False, blind=False, calibrated=False, uncertain="", checks={},
+        return FrameResult(
+            self.timestamp, self.state, self.lost_reason, self.T_world_camera, fused=False, skipped_similar=False,
+            dynamic_mask=self.dynamic_mask, dynamic_share=self.dynamic_share, residuals=self.residuals, labels=None,
+            tracking=None, timings=self.timings, submap=self.submap, rejected=self.rejected, repeats=self.repeats,
+            unobservable=self.unobservable,
         )  # fmt: skip
 
     @property

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
-from dudmap.core.bootstrap import Bootstrap
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import full_mask
@@ -23,7 +22,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.mapper import Mapper
+from dudmap.core.mapper import Bootstrap, Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
@@ -34,11 +33,10 @@ from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult
 from dudmap.core.slam_results import SlamResults
-from dudmap.core.stage_timer import StageTimer
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.observability import sentence as unobserved
@@ -139,6 +137,7 @@ class Slam(SlamResults):
         if isinstance(frame, Frame):
             start = time.perf_counter()
             observation = self.preprocess(frame)
+            _ = observation.num_readings  # cached there for the result
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
@@ -183,7 +182,7 @@ class Slam(SlamResults):
         view = self.color_motion.predicted(view)
         if self.reference.is_empty:
             return self._start_map(view)
-        view = replace(view, blind=self._is_blind(view))
+        view = replace(view, blind=True) if self._is_blind(view) else view
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
             self._refine_start()
@@ -240,7 +239,8 @@ class Slam(SlamResults):
     def _resumed(self, view: FrameView) -> FrameView:
         """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
         may be elsewhere."""
-        view = replace(view, observation=self.stream.restamped(view.observation))
+        if self.stream.clock_offset != 0:
+            view = replace(view, observation=self.stream.restamped(view.observation))
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
@@ -335,9 +335,10 @@ class Slam(SlamResults):
         if self.atlas.history is None or view.blind:
             return T_world_camera, False
         with view.timer("loops"):
-            levels = view.pyramid.tracked
-            weights = estimate.static_weights(levels)
-            query = LoopQuery(view.observation, levels, weights, ~dynamic_mask, estimate.tracking)
+            query = LoopQuery(
+                view.observation, view.pyramid.tracked, estimate.tracking, dynamic_mask, estimate.labels,
+                estimate.unverified_mask,
+            )  # fmt: skip
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
@@ -375,13 +376,13 @@ class Slam(SlamResults):
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
-        readings = view.observation.depth > 0
+        readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
-            dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
+            dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,

@@ -39,7 +39,7 @@ class RunRecord:
             of the right size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
-        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
+        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
         postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
         counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
             directions of motion are observable.
@@ -160,7 +160,7 @@ class RunRecord:
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
         """
         from dudmap.core.backends.cpu.evidence import EDGES
-        from dudmap.core.dynamics.mixture import fit_mixture
+        from dudmap.core.dynamics.masks import fit_mixture
 
         if not self.residuals.any():
             return

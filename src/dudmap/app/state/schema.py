@@ -20,17 +20,17 @@ app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 core.backends.cpu.consensus:ConsensusParams,Correspondences
 core.backends.cpu.evidence:NoiseParameters,MixtureRules,RegionRules
-core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segment_motion:SegmentImage
+core.backends.cpu.reprojection:Reprojection core.backends.cpu.segment_motion:SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FreeSpace,TouchedBlocks,FusedBlocks,NormalEquations,MapSample,RaycastResult
-core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
+core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
 core.calibration.keyframes:ColorKeyframe,KeyframeCollector core.calibration.pairs:Pair,PairSet
 core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
 core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
-core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
-core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation
+core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels,Mixture
+core.dynamics.segments:Segmentation
 core.dynamics.temporal_memory:RememberedFrame,TemporalMemory
 core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level core.frames.preprocess:Preprocessor
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck
@@ -41,7 +41,8 @@ core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks,BlockTree core
 core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
 core.map.paged_map:PagedMap
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
-core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectView,ObjectFusion
+core.mapper:StartFrame,Bootstrap,Mapper
+core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectView,ObjectFusion
 core.objects.object_map:RigidObject,ObjectVolume,ObjectTrack
 core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker
 core.objects.regions:MovingPixels,Region core.objects.scene_flow:InstanceFrame core.places.atlas:TimedPose,Atlas
@@ -53,12 +54,12 @@ core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge
 core.places.redundancy:SimilarityTest,_Place,RedundantViews
 core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap,PriorMap core.result:FrameResult
-core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
-core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
+core.slam:Slam core.tracking.color_motion:RegisteredLevel,ColorMotion
+core.tracking.estimate:PoseEstimate core.tracking.frame_view:StageTimer,FrameView
 core.tracking.front_end:FrontEnd core.tracking.gradient_agreement:GradientAgreement
-core.tracking.image_consistency:ImageComparison,ImageConsistency core.tracking.motion_model:MotionModel
+core.tracking.motion_model:MotionModel
 core.tracking.observability:Observability,GradientNoise core.tracking.pose_prediction:PosePrediction,PosePredictor
-core.tracking.quality_monitor:RegistrationHistory,Verdict,QualityMonitor
+core.tracking.quality_monitor:ImageComparison,ImageConsistency,RegistrationHistory,Verdict,QualityMonitor
 core.tracking.tracker:TrackingResult,Minimum,Tracker
 """
 """All classes whose objects may be stored, and made from what is stored: modules of this package and names in them."""

@@ -60,7 +60,9 @@ class Mirror:
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
     """An array as it is, and a mirror's array up to date."""
-    return array.host if isinstance(array, Mirror) else array
+    if type(array) is not Mirror:
+        return array
+    return array.array if array.copy is None else array.host
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:

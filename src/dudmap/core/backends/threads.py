@@ -69,8 +69,10 @@ products together with those around it; takes longer to compile than ``scalar``.
 Result = TypeVar("Result")
 
 
+@cache
 def num_threads() -> int:
-    """Cores this process may use; the environment variable DUDMAP_THREADS overrides."""
+    """Cores this process may use; the environment variable DUDMAP_THREADS overrides. It is read once, since a frame
+    asks twenty times."""
     override = os.environ.get("DUDMAP_THREADS", "")
     return int(override) if override.isdigit() and int(override) > 0 else _num_cores()
 
@@ -108,6 +110,7 @@ def _tasks() -> SimpleQueue[Callable[[], object] | None]:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_tasks.cache_clear)  # a forked process has none of the threads
+    os.register_at_fork(after_in_child=num_threads.cache_clear)  # and may be given fewer
 
 
 def submit(function: Callable[[], Result]) -> Callable[[], Result]:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.splatting import PointImage, overwrite, splat
-from dudmap.core.dynamics.label_scale import scaled_length
+from dudmap.core.dynamics.segments import scaled_length
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 
@@ -19,6 +19,7 @@ MIN_KNOWN = 0.2
 """Share of that square behind which the background must be known."""
 STRIDE = 2
 """Pixels of the label image per subsampled pixel, across and down, at REFERENCE_WIDTH."""
+SQUARE = np.ones((3, 3), np.uint8)
 MIN_AREA = 0.005
 """Smallest region without readings that is examined, as a share of the image."""
 
@@ -55,23 +56,22 @@ class BackgroundModel:
         """
         import cv2
 
-        none = np.zeros(level.depth.shape, dtype=bool)
         stride = _stride(level)
         farthest = cv2.dilate(level.depth, np.ones((stride, stride), np.uint8), anchor=(0, 0))[::stride, ::stride]
-        hole = np.asarray(farthest) <= 0
+        hole = farthest <= 0
+        none = np.zeros(level.depth.shape, bool)
         if self._background is None or not hole.any():
             return none
-        depth, intensity = _subsampled(level)
-        _, background, times = self._seen_from(timestamp, level, depth.shape, T_world_camera)
+        intensity = _subsampled(level, stride)[1]
+        _, background, times = self._seen_from(timestamp, level, stride, T_world_camera)
         missing = np.isnan(background)
-        square = np.ones((3, 3), np.uint8)
-        darkest = cv2.erode(np.where(missing, np.float32(9), background), square)
-        brightest = cv2.dilate(np.where(missing, np.float32(-9), background), square)
+        darkest = cv2.erode(np.where(missing, np.float32(9), background), SQUARE)
+        brightest = cv2.dilate(np.where(missing, np.float32(-9), background), SQUARE)
         static = ~missing & (times[..., 1] - times[..., 0] >= MIN_AGE)
-        known = hole & (cv2.dilate(static.astype(np.uint8), square) > 0)
+        known = hole & (cv2.dilate(static.view(np.uint8), SQUARE) > 0)
         limit = np.float32(SAME_INTENSITY)
         different = known & ((intensity < darkest - limit) | (intensity > brightest + limit))
-        different = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_OPEN, square)  # without seams along edges
+        different = cv2.morphologyEx(different.view(np.uint8), cv2.MORPH_OPEN, SQUARE)  # without seams along edges
         if not different.any():
             return none
         votes = cv2.blur(different.astype(np.float32), (VOTING_SIDE, VOTING_SIDE))
@@ -81,7 +81,7 @@ class BackgroundModel:
         large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA * hidden.size
         large[0] = False
         found = large[np.asarray(numbers, np.int32)].astype(np.uint8)
-        found = cv2.resize(found, none.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        found = cv2.resize(found, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         return (found > 0) & (level.depth <= 0)
 
     def update(
@@ -95,11 +95,11 @@ class BackgroundModel:
             T_world_camera: (4, 4).
             dynamic: (h, w) bool, pixels whose readings are left out.
         """
-        depth, intensity = _subsampled(level)
-        self._background = self._seen_from(timestamp, level, depth.shape, T_world_camera)
         stride = _stride(level)
-        static = ~dynamic[::stride, ::stride]
-        overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, _intrinsics(level))
+        depth, intensity = _subsampled(level, stride)
+        self._background = self._seen_from(timestamp, level, stride, T_world_camera)
+        static, intrinsics = ~dynamic[::stride, ::stride], level.camera.intrinsics / np.float32(stride)
+        overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, intrinsics)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
         """Move the points with a correction (4, 4) of the world."""
@@ -108,26 +108,21 @@ class BackgroundModel:
             self._background = self._background._replace(points=points.astype(np.float32))
 
     def _seen_from(
-        self, timestamp: float, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
+        self, timestamp: float, level: Level, stride: int, T_world_camera: NDArray[np.float64]
     ) -> PointImage:
-        """The background in a subsampled image at a pose."""
+        """The background in an image at a pose, subsampled by a stride."""
         if self._background is None:
-            return PointImage.empty(shape)
-        since = timestamp - self.config.settle_time
-        return splat(self._background, se3.inverse(T_world_camera), _intrinsics(level), since)
+            return PointImage.empty(level.depth[::stride, ::stride].shape)
+        since, intrinsics = timestamp - self.config.settle_time, level.camera.intrinsics / np.float32(stride)
+        return splat(self._background, se3.inverse(T_world_camera), intrinsics, since)
 
 
-def _subsampled(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _subsampled(level: Level, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth of one pixel per stride across and down, and mean intensity around it."""
     import cv2
 
-    stride = _stride(level)
     depth = level.depth[::stride, ::stride]
     return depth, np.asarray(cv2.resize(level.intensity, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _intrinsics(level: Level) -> NDArray[np.float32]:
-    return level.camera.intrinsics / np.float32(_stride(level))
 
 
 def _stride(level: Level) -> int:

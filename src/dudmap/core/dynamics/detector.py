@@ -24,13 +24,10 @@ from dudmap.core.backends.cpu.segment_motion import moving_segments
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.background_model import BackgroundModel
-from dudmap.core.dynamics.label_scale import pixel_scale, scaled_length
-from dudmap.core.dynamics.masks import SEAM, Labels, elliptical_kernel
-from dudmap.core.dynamics.mixture import RULES, Mixture
-from dudmap.core.dynamics.segments import Segmentation, segment
+from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
+from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
-from dudmap.core.frames.exposure import exposed
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, exposed
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
 
 MAX_GAP = 1.5
@@ -122,7 +119,7 @@ class DynamicDetector:
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
-        return submit(compute) if needed else cache(compute)
+        return cache(submit(compute) if needed else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
         """Begin with the first frame of a map, of which no pixel is known to move.
@@ -163,7 +160,7 @@ class DynamicDetector:
         config, depth = self.config, level.depth
         noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
-        sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
+        sigma, tolerance, probability = np.empty((3, *depth.shape), np.float32)
         histogram = np.zeros(BINS, np.int64)
         unknown, (prior, static, moves) = weigh_readings(
             depth, sample.distance, sample.occupancy, noise, RULES, CENTERS, sigma, tolerance, histogram
@@ -174,7 +171,7 @@ class DynamicDetector:
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = Mixture((1 - prior, prior), (static, moves))
         offset, slope = mixture.coefficients
-        dynamic, seeds = np.empty(depth.shape, np.bool_), np.empty(depth.shape, np.bool_)
+        dynamic, seeds = np.empty((2, *depth.shape), np.bool_)
         rules = RegionRules(
             MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, SEEDED_SHARE,
             config.free_space, config.regions,
@@ -194,7 +191,7 @@ class DynamicDetector:
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
-        if self.config.free_space:
+        if config.free_space:
             hidden = self.background.hidden(timestamp, exposed(level, exposure), T_world_camera)
         return Labels(probability, dynamic, mixture, histogram, sample, segments, hidden)
 

@@ -6,17 +6,101 @@ Errors are measured in pixels: a near person then weighs no more than a far wall
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.consensus import neighbour_votes
-from dudmap.core.dynamics.ransac import NOISE_PX, pixels_at_width, reproject, rigid_motion
+from dudmap.core.backends.cpu import consensus
+from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.optical_flow import consistent_with_static, track_forward_backward
 from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.geometry.camera import Camera
+
+REFERENCE_WIDTH = 320
+"""Image width that distances in pixels are given for; they grow in proportion to the width of an image."""
+NOISE_PX = 0.7
+"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
+degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
+NOISE_LEVELS = 1.0, 0.5, 0.25
+"""Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
+corners of a right motion are measured with 0.07 px per coordinate."""
+OUTLIER_GAIN = 2.996
+"""Log-likelihood ratio of a corner without error to an outlier at the largest noise level, 5.99 / 2: a corner is an
+inlier up to the error at which both are equally likely."""
+NEAR_PX = 5.0
+"""Scale of the prior on the distance of a motion from the expected one, pixels: a turn by 1.1 degrees at a focal length
+of 262 pixels, by which a prediction at constant velocity errs where a turn of 33 degrees/s begins within 1/30 s."""
+HYPOTHESES = 150
+"""Hypotheses from uniform samples, and as many from samples weighted by area. With a share of inliers of 1/3, samples
+of three miss all of the inliers with probability (1 - 1/27)^150 = 0.3 %."""
+
+
+def rigid_motion(
+    points: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    camera: Camera,
+    T_expected: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Motion T_after_before (4, 4) with the highest score among hypotheses from samples of three correspondences.
+
+    Three correspondences determine the twist of a small motion linearly (Longuet-Higgins and Prazdny 1980). The score
+    of a motion is that of MSAC (Torr and Zisserman 2000), each correspondence weighted by its depth squared, to
+    which the surface that it stands for is proportional, times a prior:
+
+        score(T, sigma) = gain sum_n z_n^2 (1 - min(e_n^2 / (2 gain sigma^2), 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
+        gain = log(A / (2 pi sigma^2))
+
+    where e_n is the reprojection error and d the mean distance, in pixels, of the reprojected points from where the
+    expected motion puts them. The sum is the log-likelihood of normally distributed errors against that of outliers
+    spread over an area A. The noise sigma is unknown like the motion, and the pair of the highest score is searched: at
+    a noise fixed too large, a motion between that of the static world and that of slow people explains both.
+
+    The prior decides between two motions that explain nearly as much surface: a crowd that
+    walks abreast may cover more of it than the static world, and two images alone cannot tell which of the two moves.
+    The prior ranges from 1 to 1/2 only, because the expected motion is a prediction and may be wrong.
+
+    The REFINED best hypotheses of each noise level and the expected motion are refined on their inliers with the exact
+    projection, and the one of the highest score is returned.
+
+    Args:
+        points: (n, 3) metres, first camera's frame.
+        targets: (n, 2) their pixels in the second image.
+        camera: Camera of both images.
+        T_expected: (4, 4) predicted motion.
+    """
+    areas, n = points[:, 2] ** 2, len(points)
+    rng, draws = np.random.default_rng(0), np.empty((2 * HYPOTHESES, 3), np.int64)
+    draws[:HYPOTHESES] = rng.integers(0, n, (HYPOTHESES, 3))
+    shares = (areas / areas.sum()).cumsum()
+    draws[HYPOTHESES:] = (shares / shares[-1]).searchsorted(rng.random((HYPOTHESES, 3)), side="right")
+    expected = reproject(T_expected, points, camera)
+    found = consensus.Correspondences(
+        points.T.copy(), targets.T.copy(), expected.T.copy(), areas, camera.intrinsics
+    )  # fmt: skip
+    return consensus.best_motion(draws, found, _params(camera), T_expected)
+
+
+def pixels_at_width(distance: float, camera: Camera) -> float:
+    """Distance in pixels of an image, given that in an image of REFERENCE_WIDTH with the same view."""
+    return distance * camera.width / REFERENCE_WIDTH
+
+
+@lru_cache(maxsize=8)
+def _params(camera: Camera) -> ConsensusParams:
+    levels = np.array(NOISE_LEVELS)
+    gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
+    limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
+    return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(NEAR_PX, camera))
+
+
+def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Pixels (n, 2) of points (n, 3) after a motion T (4, 4); points behind the camera land far outside the image."""
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    return camera.focal * moved[:, :2] / np.maximum(moved[:, 2:], 1e-6) + camera.centre
+
 
 MOVES_PX = 1.0
 """Smallest reprojection error of a moving corner, pixels of an image 320 wide: 3.5 sigma of a static corner."""
@@ -101,7 +185,7 @@ class DominantMotion:
 
 def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
     """Whether the moving pixels (h, w) are a larger share of the readings of an image than noise produces."""
-    return bool(np.count_nonzero(moving) > NOISE_SHARE * np.count_nonzero(level.depth))
+    return bool(np.count_nonzero(moving) > NOISE_SHARE * level.num_readings)
 
 
 def dominant_motion(
@@ -142,18 +226,16 @@ def dominant_motion(
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
     camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
-    expected = reproject(T_expected, _points(fine, before.corners), camera)
-    pixels, targets, difference = track_forward_backward(first, second, before.corners, expected)
-    points = _points(fine, pixels)
-    candidate = np.ones(len(points), dtype=bool)
-    if moving is not None:
-        columns, rows = _pixels_of_level(pixels, fine, before.labelled).T
-        candidate = ~moving[rows, columns]
+    points = before.corner_points
+    expected = reproject(T_expected, points, camera)
+    pixels, targets, difference, found = track_forward_backward(first, second, before.corners, expected)
+    points, labelled = points[found], _pixels_of_level(pixels, fine, before.labelled)
+    candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
         return None
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected)
     predicted = reproject(T, points, camera)
-    error = np.linalg.norm(predicted - targets, axis=1)
+    error = _lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
     inlier, areas = error < threshold, points[:, 2] ** 2
     if np.count_nonzero(candidate & inlier) < FEWEST:
@@ -162,24 +244,22 @@ def dominant_motion(
     near = error < MOVES_SIGMAS * threshold
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
-    limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
+    limit = least + MOVES_SHARE * _lengths(targets - pixels)
     moves = error > limit
     kept = ~moves
     moves &= (error <= intervals * limit) & (_depth_change(T, points, targets, fine_after) <= intervals * limit)
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
-    pixels, targets, points, moves = pixels[kept], targets[kept], points[kept], moves[kept]
-    columns, rows = np.clip(np.rint(targets), 0, np.array(fine_after.depth.shape[::-1]) - 1).astype(np.int64).T
+    targets, points, moves = targets[kept], points[kept], moves[kept]
+    columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
     seen = z > 0
     points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], z)[seen]
     return DominantMotion(
         T,
         share,
-        LabelledCorners(
-            before.labelled, segmentations[0], points, _pixels_of_level(pixels, fine, before.labelled), moves
-        ),
+        LabelledCorners(before.labelled, segmentations[0], points, labelled[kept], moves),
         LabelledCorners(
             after.labelled,
             segmentations[1],
@@ -201,7 +281,7 @@ def _depth_change(
         targets: (n, 2) where they were found in the second image; without a reading there is no change.
         level: The second image.
     """
-    u, v = np.clip(np.rint(targets), 0, np.array(level.depth.shape[::-1]) - 1).astype(np.int64).T
+    u, v = _nearest_pixels(targets, level).T
     found, expected = level.depth[v, u], points @ T[2, :3] + T[2, 3]
     change = np.maximum(np.abs(found - expected) - SAME_SURFACE * expected, 0) / np.maximum(expected, 1e-6)
     return np.where(found > 0, change * level.camera.fx, 0.0)
@@ -209,9 +289,9 @@ def _depth_change(
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Smallest of the values (n,), n > 0, that together with the smaller ones has half of the weight (n,)."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+    order = values.argsort()
+    total = weights[order].cumsum()
+    return float(values[order[total.searchsorted(total[-1] / 2)]])
 
 
 def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
@@ -253,14 +333,19 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     return static[corners.segmentation.labels]
 
 
-def _points(level: Level, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Points (n, 3) at pixels (n, 2) u, v of an image, metres, camera frame."""
-    u, v = pixels.T
-    return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n,) of vectors (n, 2)."""
+    squares = vectors * vectors
+    return np.sqrt(squares[:, 0] + squares[:, 1])
 
 
 def _pixels_of_level(pixels: NDArray[np.number], level: Level, other: Level) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
-    last = np.array(other.depth.shape[::-1]) - 1
-    return np.clip(np.rint((pixels + 0.5) * scale - 0.5), 0, last).astype(np.int64)
+    return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
+
+
+def _nearest_pixels(positions: NDArray[np.float64], level: Level) -> NDArray[np.int64]:
+    """Pixels (n, 2) int u, v of a level nearest to positions (n, 2)."""
+    last = level.camera.width - 1, level.camera.height - 1
+    return np.minimum(np.maximum(np.rint(positions), 0), last).astype(np.int64)

@@ -75,11 +75,13 @@ class SlowMotion:
     Attributes:
         T_world_camera: (4, 4) pose of the new image, from that of the older one.
         moving: (h, w) bool, pixels of the new image in segments that moved as a whole in between.
+        static: (h, w) bool, pixels of the new image in segments that rested in between.
         moving_first: (h, w) bool, the same of the older image if that is the first one of the map; else None.
     """
 
     T_world_camera: NDArray[np.float64]
     moving: NDArray[np.bool_]
+    static: NDArray[np.bool_]
     moving_first: NDArray[np.bool_] | None
 
 
@@ -209,10 +211,11 @@ class EgoMotionSegmenter:
         if motion is None:
             return None
         T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
-        moving = propagate_to_segments(motion.after, whole_only=True)
+        moving, static = propagate_to_segments(motion.after, whole_only=True), motion.static_after
         first = oldest.moving if oldest.timestamp == self._started else None
         if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
             motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
             if motion is not None:
                 moving = moving | propagate_to_segments(motion.after, whole_only=True)
-        return SlowMotion(T_world_camera, moving, first)
+                static = static | motion.static_after
+        return SlowMotion(T_world_camera, moving, static & ~moving, first)

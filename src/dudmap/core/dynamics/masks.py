@@ -1,16 +1,80 @@
-"""Labels of a frame, and the masks derived from them."""
+"""Labels of a frame: the mixture of its normalised residuals (thesis section 4.6, eq. 4.52-4.56), and its masks."""
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import labeling
-from dudmap.core.dynamics.label_scale import pixel_scale, scaled_side
-from dudmap.core.dynamics.mixture import Mixture
-from dudmap.core.dynamics.segments import Segmentation
+from dudmap.core.backends.cpu.evidence import MAX_RESIDUAL, MixtureRules, mixture_log_odds
+from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_side
 from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import MapSample
+
+START = 0.1, 1.0, 6.0
+"""Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
+PRIOR_BOUNDS = 0.02, 0.98
+"""Bounds of the prior of the dynamic density; they keep its logarithm finite."""
+STATIC_BOUNDS = 0.5, 2.0
+"""Bounds of the standard deviation of the static density, which is 1 where the sensor model is exact."""
+SEPARATION = 3.0
+"""Least ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
+
+RULES = MixtureRules(30, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION)
+"""Rules of the fit of a frame."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56), static and dynamic.
+
+    Attributes:
+        prior: Prior probabilities of both components.
+        sigma: Their standard deviations.
+    """
+
+    prior: tuple[float, float]
+    sigma: tuple[float, float]
+
+    @property
+    def coefficients(self) -> tuple[float, float]:
+        """Offset and slope of the log odds static : dynamic over the squared normalised residual."""
+        (p_static, p_dynamic), (s, d) = self.prior, self.sigma
+        return np.log(p_static / p_dynamic * d / s), 0.5 / d**2 - 0.5 / s**2
+
+    def log_odds(self, residual: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Log odds static : dynamic of normalised residuals >= 0."""
+        offset, slope = self.coefficients
+        return mixture_log_odds.py_func(np.square(residual, dtype=np.float32), offset, np.float32(slope))
+
+    def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Densities (2, ...) of both components, priors included."""
+        r = np.asarray(residual, dtype=np.float64)
+        return np.stack(
+            [
+                p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2)
+                for p, s in zip(self.prior, self.sigma, strict=True)
+            ]
+        )
+
+
+def fit_mixture(
+    histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = RULES.iterations
+) -> Mixture:
+    """Expectation maximisation on a histogram of normalised residuals (eq. 4.52-4.56; Dempster et al. 1977).
+
+    Args:
+        histogram: (n,) counts.
+        edges: (n + 1,) edges of the bins.
+        iterations: Most iterations.
+    """
+    centers = (edges[:-1] + edges[1:]) / 2
+    prior, static, dynamic = labeling.fit_mixture(
+        histogram.astype(np.float64), centers, iterations, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION, MAX_RESIDUAL
+    )
+    return Mixture((1 - prior, prior), (static, dynamic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +128,11 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     if not (hidden or labels.dynamic.any()):
         return np.zeros(depth.shape, dtype=bool)
     element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
-    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, element)
+    low = cv2.morphologyEx(labels.dynamic.view(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
     if hidden:
         low[labels.hidden] = 1
-    return full_size(low > 0, level.depth, depth)
+    return full_size(low.view(np.bool_), level.depth, depth)
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -79,7 +143,7 @@ def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDA
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
     """
-    halvings = round(np.log2(depth.shape[1] / low.shape[1]))
+    halvings = round(math.log2(depth.shape[1] / low.shape[1]))
     return labeling.upsample_labels(low, low_depth, depth, 1 << halvings)
 
 
@@ -87,15 +151,17 @@ def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     """Mask (H, W) dilated by some pixels."""
     import cv2
 
-    if pixels == 0 or not mask.any():
-        return mask
-    marks, grown = mask.astype(np.uint8), np.zeros_like(mask)
+    marks = mask.view(np.uint8)
     x, y, width, height = cv2.boundingRect(marks)
+    if pixels == 0 or width == 0:
+        return mask
+    grown = np.zeros(mask.shape, np.uint8)
     around = np.s_[max(y - pixels, 0) : y + height + pixels, max(x - pixels, 0) : x + width + pixels]
-    grown[around] = cv2.dilate(marks[around], elliptical_kernel(pixels)) > 0
-    return grown
+    grown[around] = cv2.dilate(marks[around], elliptical_kernel(pixels))
+    return grown.view(np.bool_)
 
 
+@lru_cache(maxsize=16)
 def elliptical_kernel(radius: float) -> NDArray[np.uint8]:
     """Elliptical structuring element of at least 3x3 pixels."""
     import cv2

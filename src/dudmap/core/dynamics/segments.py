@@ -1,4 +1,4 @@
-"""Surface segments of an image."""
+"""Surface segments of an image, and pixel counts that scale with it: they are given for images 160 pixels wide."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,8 +8,31 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.segment_motion import SegmentImage
 from dudmap.core.backends.cpu.segmentation import segment_surface
-from dudmap.core.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.core.frames.observation import Level
+
+REFERENCE_WIDTH = 160
+"""Width of the label image that pixel counts are given for: the default of ``dynamics.width``."""
+
+
+def pixel_scale(level: Level) -> float:
+    """Pixels of a label image per pixel of one of REFERENCE_WIDTH."""
+    return level.camera.width / REFERENCE_WIDTH
+
+
+def scaled_length(pixels: float, level: Level) -> int:
+    """A length given at REFERENCE_WIDTH, pixels of a label image; 1 at least."""
+    return max(1, round(pixels * pixel_scale(level)))
+
+
+def scaled_side(radius: float, level: Level) -> int:
+    """Side of a square window, given by its radius at REFERENCE_WIDTH, pixels of a label image; odd, 3 at least."""
+    return 2 * scaled_length(radius, level) + 1
+
+
+def scaled_area(pixels: float, level: Level) -> float:
+    """An area given at REFERENCE_WIDTH, pixels of a label image; 9 (a square of 3x3) at least."""
+    return max(9.0, pixels * pixel_scale(level) ** 2)
+
 
 EDGE_REACH = 3
 """Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""

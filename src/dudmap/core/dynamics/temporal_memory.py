@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.backends.cpu.evidence import free_space, seen_marked
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.cpu.reprojection import Reprojection, reproject
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-from dudmap.core.dynamics.label_scale import scaled_side
-from dudmap.core.dynamics.segments import Segmentation
+from dudmap.core.dynamics.segments import Segmentation, scaled_side
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 
@@ -143,9 +141,8 @@ class TemporalMemory:
             T_world_camera: (4, 4) its pose.
         """
         if self._last is None or not self._last.dynamic.any():
-            return np.zeros(level.depth.shape, dtype=bool)
-        (target,) = _targets(T_world_camera, [self._last])
-        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, MAX_DISPLACEMENT)
+            return np.zeros(level.depth.shape, bool)
+        return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
@@ -181,8 +178,14 @@ class TemporalMemory:
             noise: (h, w) float32, largest depth difference between two readings of one point, metres.
             frames: As of ``free_space_frames``.
         """
-        targets, side = _targets(T_world_camera, frames), scaled_side(SEAM, level)
-        return free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
+        import cv2
+
+        if not frames:
+            return np.zeros(level.depth.shape, bool)
+        gaps, side = _reprojected(level, T_world_camera, frames).gap, scaled_side(SEAM, level)
+        num_free, num_surface = (gaps > noise).sum(axis=0), (np.abs(gaps) <= noise).sum(axis=0)
+        free = (num_free > 0) & (2 * num_free >= num_surface)
+        return cv2.morphologyEx(free.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
     def settled(
         self,
@@ -251,24 +254,26 @@ def _still(
 ) -> NDArray[np.bool_]:
     """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
     ``unmarked``: and that no frame took to be dynamic."""
-    labels, image = segments.labels, (level.depth, level.intensity, level.camera.intrinsics)
-    still = np.arange(segments.count + 1) > 0
-    size = np.bincount(labels[chosen], minlength=len(still))
-    for target in _targets(T_world_camera, frames):
-        if unmarked and target.marks.any():
-            marked = chosen & seen_marked(*image, target, MAX_DISPLACEMENT)
-            still &= np.bincount(labels[marked], minlength=len(still)) < DYNAMIC_SHARE * size
-        ((gap, difference, _),) = reproject(*image, [target])
-        if not stand_still(segments, chosen, gap, difference, still):
-            return np.zeros_like(chosen)
+    labels, still = segments.labels, np.arange(segments.count + 1) > 0
+    found = _reprojected(level, T_world_camera, frames)
+    size = np.bincount(labels[chosen], minlength=segments.count + 1)
+    for n, frame in enumerate(frames):
+        if unmarked and frame.dynamic.any():
+            marked = chosen & _seen_marked(found, n)
+            still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
+        if not stand_still(segments, chosen, found.gap[n], found.difference[n], still):
+            return np.zeros(chosen.shape, bool)
     return chosen & still[labels]
 
 
-def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:
-    """Remembered frames that an image at a pose (4, 4) is compared with."""
-    return [
-        ReprojectionTarget(
-            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
-        )
-        for frame in frames
-    ]
+def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> Reprojection:
+    """Differences of an image at a pose (4, 4) to remembered frames."""
+    Ts = se3.inverse(np.array([frame.T_world_camera for frame in frames])) @ T_world_camera
+    older = np.array([(frame.level.depth, frame.level.intensity) for frame in frames])
+    marks = np.array([frame.dynamic for frame in frames])
+    return reproject(level.depth, level.intensity, level.camera.intrinsics, Ts, older, marks)
+
+
+def _seen_marked(found: Reprojection, n: int) -> NDArray[np.bool_]:
+    """Pixels (h, w) whose points a marked reading of frame n shows, within ``MAX_DISPLACEMENT``."""
+    return (found.marks[n] > 0) & (np.abs(found.gap[n]) < MAX_DISPLACEMENT)

@@ -1,6 +1,7 @@
-"""A preprocessed frame and the levels of its image pyramid."""
+"""A preprocessed frame, the levels of its image pyramid, and their exposure to the intensities of the map."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,16 @@ class Observation:
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
+    @cached_property
+    def readings(self) -> NDArray[np.bool_]:
+        """(H, W) bool, pixels with a depth."""
+        return self.depth > 0
+
+    @cached_property
+    def num_readings(self) -> int:
+        """Number of pixels with a depth."""
+        return np.count_nonzero(self.readings)
+
     @property
     def as_recorded(self) -> Frame:
         """Depth of the observation and colour as it was recorded."""
@@ -48,3 +59,33 @@ class Level:
     camera: Camera
     depth: NDArray[np.float32]
     intensity: NDArray[np.float32]
+
+    @cached_property
+    def num_readings(self) -> int:
+        """Number of pixels with a depth."""
+        return np.count_nonzero(self.depth)
+
+
+def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
+    import cv2
+
+    gain, offset = exposure
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+
+
+def exposed(level: Level, exposure: tuple[float, float]) -> Level:
+    """Level with gain and offset applied to its intensities."""
+    gain, offset = exposure
+    if (gain, offset) == (1.0, 0.0):
+        return level
+    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
+
+
+def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of two exposures applied one after the other."""
+    return then[0] * first[0], then[0] * first[1] + then[1]

@@ -78,13 +78,13 @@ def lucas_kanade(
     positions, found, difference = cv2.calcOpticalFlowPyrLK(
         first,
         second,
-        np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2),
-        np.array(guess, np.float32, order="C").reshape(-1, 1, 2),  # a copy: it is overwritten with the result
+        np.ascontiguousarray(pixels, np.float32),
+        np.array(guess, np.float32, order="C"),  # a copy: it is overwritten with the result
         winSize=(window, window),
         maxLevel=halvings,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return np.asarray(positions, np.float32)[:, 0], found[:, 0] > 0, np.asarray(difference, np.float32)[:, 0]
+    return np.asarray(positions, np.float32), found[:, 0] > 0, np.asarray(difference, np.float32)[:, 0]
 
 
 def track_forward_backward(
@@ -92,7 +92,7 @@ def track_forward_backward(
     second: NDArray[np.uint8],
     pixels: NDArray[np.int64],
     expected: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Corners that pass the forward-backward check: tracked back from where they were found, they return.
 
     Args:
@@ -101,8 +101,8 @@ def track_forward_backward(
         expected: (n, 2) predicted positions in the second, from which the search starts.
 
     Returns:
-        These corners (m, 2) int, their positions (m, 2) in the second image, and the mean differences (m,) of the grey
-        values of their windows.
+        These corners (m, 2) int, their positions (m, 2) in the second image, the mean differences (m,) of the grey
+        values of their windows, and which (n,) of all corners they are.
     """
     width = first.shape[1]
     window = scaled_window(WINDOW, width)
@@ -111,7 +111,7 @@ def track_forward_backward(
     good = found & found_back
     error = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1)
     good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
-    return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64)
+    return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64), good
 
 
 def consistent_with_static(

@@ -57,18 +57,24 @@ class Pyramid:
         """Corners (n, 2) int of the finest level, pixels u, v."""
         return corners(self.fine, self.grey)
 
+    @cached_property
+    def corner_points(self) -> NDArray[np.float64]:
+        """Points (n, 3) at the corners, metres, camera frame."""
+        (u, v), level = self.corners.T, self.fine
+        return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
+
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
     """Mask (H, W) at the size of a level: a pixel is set if any part of it lies in the mask."""
     import cv2
 
     size = level.depth.shape[::-1]
-    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
 
 
 def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
     """Whether more than half of the readings of a level are marked as moving (h, w) bool."""
-    return bool(2 * np.count_nonzero(moving) > np.count_nonzero(level.depth))
+    return bool(2 * np.count_nonzero(moving) > level.num_readings)
 
 
 def halved(observation: Observation, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

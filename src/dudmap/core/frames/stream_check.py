@@ -175,10 +175,10 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
         before, after: (h, w) metres, 0 = no reading.
         reach: How far the camera may have moved in between, metres.
     """
-    both = np.flatnonzero((before > 0) & (after > 0))
-    if len(both) < MIN_PIXELS:
+    both = (before > 0) & (after > 0)
+    before, after = before[both], after[both]
+    if len(before) < MIN_PIXELS:
         return 1.0
-    before, after = before.reshape(-1)[both], after.reshape(-1)[both]
     ratios = after / before
     usual = np.count_nonzero((ratios < SMALLEST_FACTOR) & (ratios > 1 / SMALLEST_FACTOR))
     if 2 * usual > len(ratios):  # so is the median, which takes longer
@@ -193,5 +193,5 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
 
 def _equal(a: NDArray, b: NDArray) -> bool:
     """Whether two images are equal; of most that are not, the middle row tells."""
-    middle = len(a) // 2
-    return a.shape == b.shape and np.array_equal(a[middle], b[middle]) and np.array_equal(a, b)
+    middle = a.shape[0] // 2
+    return a.shape == b.shape and a[middle].tobytes() == b[middle].tobytes() and np.array_equal(a, b)

@@ -76,6 +76,16 @@ class Camera:
         """(4,) float32 fx, fy, cx, cy in pixels, the form that kernels use."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float32)
 
+    @cached_property
+    def focal(self) -> NDArray[np.float64]:
+        """(2,) fx, fy in pixels."""
+        return np.array([self.fx, self.fy])
+
+    @cached_property
+    def centre(self) -> NDArray[np.float64]:
+        """(2,) cx, cy in pixels."""
+        return np.array([self.cx, self.cy])
+
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (height, width) of an image array."""
@@ -107,8 +117,9 @@ class Camera:
 
     def points(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Scalar]) -> NDArray[Scalar]:
         """Points (n, 3) in metres, camera frame, at pixels u, v (n,) with depths z (n,), in the precision of these."""
-        x, y = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z
-        return np.stack([x, y, z], axis=1).astype(z.dtype, copy=False)
+        out = np.empty((len(z), 3), z.dtype)
+        out[:, 0], out[:, 1], out[:, 2] = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z
+        return out
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixel coordinates (..., 2) of points (..., 3) in the camera frame; points with z <= 0 give NaN (eq. 4.4)."""

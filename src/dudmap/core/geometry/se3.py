@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
+IDENTITY = np.eye(3)
 SMALL = 1e-8
 """Squared angle below which a rotation is that of the Taylor series."""
 
@@ -92,8 +93,9 @@ def log(T: Matrix) -> Matrix:
     else:
         theta = np.sqrt(theta_squared)
         c = (1 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta_squared
-    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
-    return np.concatenate([V_inverse @ T[:3, 3], omega])
+    out = np.empty(6)
+    out[:3], out[3:] = (IDENTITY - 0.5 * W + c * (W @ W)) @ T[:3, 3], omega
+    return out
 
 
 def log_all(Ts: Matrix) -> Matrix:
@@ -125,7 +127,7 @@ def log_rotation(R: Matrix) -> Matrix:
 
 def inverse(T: Matrix) -> Matrix:
     """Inverse of rigid motions (..., 4, 4): ``inverse(T) @ T == identity``."""
-    R_t = T[..., :3, :3].swapaxes(-1, -2)
+    R_t = T[:3, :3].T if T.ndim == 2 else T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros(T.shape, T.dtype)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
@@ -153,20 +155,20 @@ def interpolate(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:
 
 def rotation_to_quat_xyzw(R: Matrix) -> Matrix:
     """Unit quaternion (4,) in the order x, y, z, w with w >= 0 (Shepperd 1978: divide by the largest component)."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    candidates = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
-    k = int(np.argmax(candidates))
+    x, y, z = R[0, 0], R[1, 1], R[2, 2]
+    trace = x + y + z
     q = np.empty(4)
-    if k == 3:
+    if trace > x and trace > y and trace > z:
         q[3] = 1 + trace
         q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     else:
-        i, j, m = k, (k + 1) % 3, (k + 2) % 3
+        i = 0 if x >= y and x >= z else 1 if y >= z else 2
+        j, m = (i + 1) % 3, (i + 2) % 3
         q[i] = 1 + 2 * R[i, i] - trace
         q[j] = R[j, i] + R[i, j]
         q[m] = R[m, i] + R[i, m]
         q[3] = R[m, j] - R[j, m]
-    q /= np.linalg.norm(q)
+    q /= math.sqrt(q @ q)
     return -q if q[3] < 0 else q
 
 

@@ -49,7 +49,10 @@ class BlockWindow:
         then."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         last = self.origin if left is None else left
-        stays = last is not None and np.abs(origin - last).max() <= MARGIN
+        if last is None:
+            return origin
+        x, y, z = (origin - last).tolist()
+        stays = -MARGIN <= x <= MARGIN and -MARGIN <= y <= MARGIN and -MARGIN <= z <= MARGIN
         return left if stays else origin
 
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
@@ -109,7 +112,10 @@ class BlockWindow:
             MapError: A cell lies too far from where the map began.
         """
         assert self.origin is not None
-        coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
+        coords, (_, size_y, size_z) = np.empty((len(cells), 3), np.int64), self.shape
+        planes, coords[:, 2] = np.divmod(cells, size_z)
+        coords[:, 0], coords[:, 1] = np.divmod(planes, size_y)
+        coords += self.origin
         if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
             farthest = MAX_COORDINATE * self.block_size
             raise MapError(

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.masks import full_size
-from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.frames.observation import Level, Observation, exposed_color
 from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory

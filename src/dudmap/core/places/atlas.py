@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import exposed_color
 from dudmap.core.frames.stream_check import Repeats
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
@@ -134,7 +134,7 @@ class Atlas:
             recorded: The frame with its colour as it was recorded, which is kept; None for the same.
         """
         color = exposed_color(frame.color, exposure)
-        self.volume.integrate(replace(frame, color=color), T_world_camera, static_mask)
+        self.volume.integrate(Frame(frame.timestamp, frame.depth, color), T_world_camera, static_mask)
         if self.history is not None:
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import exposed_color
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume

@@ -135,7 +135,7 @@ class LoopCloser:
         if newest and newest.timestamp == query.observation.timestamp and np.array_equal(newest.T_world_camera, T):
             self.atlas.keyframes.settle()
             return newest.features
-        return self.atlas.keyframes.extract(query.observation, query.static_mask)
+        return self.atlas.keyframes.extract(query.observation, query.dynamic_mask)
 
     def _near(self, T_world_camera: NDArray[np.float64]) -> list[Keyframe]:
         """Keyframes of the current submap whose place is seen from a pose."""

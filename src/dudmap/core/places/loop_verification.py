@@ -3,12 +3,14 @@
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.alignment import agree
@@ -17,6 +19,7 @@ from dudmap.core.places.atlas import Atlas, TimedPose
 from dudmap.core.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
 from dudmap.core.places.map_rebuilding import view_distances
 from dudmap.core.places.place_recognition import PlaceMatch
+from dudmap.core.tracking.estimate import static_weights
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
@@ -35,16 +38,22 @@ class LoopQuery:
     Attributes:
         observation: The frame.
         levels: Its image pyramid, coarse to fine.
-        static_weights: Per level (h, w), weights of the pixels in a registration; None = 1.
-        static_mask: (H, W) bool.
         tracking: Its registration against the current map.
+        dynamic_mask: (H, W) bool.
+        labels, unverified_mask: As of ``PoseEstimate``.
     """
 
     observation: Observation
     levels: list[Level]
-    static_weights: list[NDArray[np.float32]] | None
-    static_mask: NDArray[np.bool_]
     tracking: TrackingResult
+    dynamic_mask: NDArray[np.bool_]
+    labels: Labels | None = None
+    unverified_mask: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def static_weights(self) -> list[NDArray[np.float32]] | None:
+        """Per level (h, w), weights of the pixels in a registration; None = 1."""
+        return None if self.labels is None else static_weights(self.labels, self.levels, self.unverified_mask)
 
 
 class LoopVerifier:

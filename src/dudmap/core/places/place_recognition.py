@@ -4,6 +4,7 @@ SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic
 RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -105,17 +106,17 @@ class KeyframeDatabase:
         self._frames_since_last = config.keyframe_gap
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
-    def extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
+    def extract(self, observation: Observation, dynamic_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
         """SIFT features of a frame that lie on one static surface.
 
         Args:
             observation: The frame.
-            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+            dynamic_mask: (H, W) bool, pixels that are left out; None = none.
         """
         self.settle()
-        return self._extract(observation, static_mask)
+        return self._extract(observation, dynamic_mask)
 
-    def _extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None) -> PlacedFeatures:
+    def _extract(self, observation: Observation, dynamic_mask: NDArray[np.bool_] | None) -> PlacedFeatures:
         features = self._sift.extract(reduced_grey(observation.rgb, self.config.image_width))
         if len(features) == 0:
             return NO_FEATURES
@@ -124,8 +125,8 @@ class KeyframeDatabase:
         # pixel centres lie at whole numbers in both images
         pixels = (features.pixels + 0.5) * (width / reduced_width, height / reduced_height) - 0.5
         depth, usable = _depth_at(observation.depth, pixels)
-        if static_mask is not None:
-            usable &= np.all(_neighbourhood(static_mask, pixels), axis=1)
+        if dynamic_mask is not None:
+            usable &= ~np.any(_neighbourhood(dynamic_mask, pixels), axis=1)
         order = np.argsort(-features.responses, kind="stable")
         order = order[usable[order]][: self.config.max_features]
         u, v = pixels[order].T
@@ -138,7 +139,7 @@ class KeyframeDatabase:
         self,
         observation: Observation,
         T_world_camera: NDArray[np.float64],
-        static_mask: NDArray[np.bool_] | None = None,
+        dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
         """Make a tracked frame a keyframe if none of its submap is near; call with every tracked frame.
@@ -149,7 +150,7 @@ class KeyframeDatabase:
         Args:
             observation: The frame.
             T_world_camera: (4, 4).
-            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+            dynamic_mask: (H, W) bool, pixels that are left out; None = none.
             submap: Number of the submap it belongs to.
 
         Returns:
@@ -164,7 +165,7 @@ class KeyframeDatabase:
         self._frames_since_last = 0
         timestamp = observation.timestamp
         self.keyframes.append(Keyframe(timestamp, T_world_camera.copy(), NO_FEATURES, submap, timestamp))
-        self._unsettled = submit(lambda: self._extract(observation, static_mask))
+        self._unsettled = submit(lambda: self._extract(observation, dynamic_mask))
         return True
 
     def settle(self) -> None:
@@ -224,10 +225,10 @@ class KeyframeDatabase:
         if not self.keyframes:
             return []
         Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
-        close = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
-        cosine = (np.einsum("iab,ab->i", Ts[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
-        close &= cosine > np.cos(np.radians(angle_deg))
-        return [self.keyframes[n] for n in np.flatnonzero(close) if self.keyframes[n].submap == submap]
+        squares = (Ts[:, :3, 3] - T_world_camera[:3, 3]) ** 2 @ np.ones(3)
+        cosine = (Ts[:, :3, :3].reshape(-1, 9) @ T_world_camera[:3, :3].reshape(9) - 1) / 2
+        close = (squares < distance**2) & (cosine > math.cos(math.radians(angle_deg)))
+        return [self.keyframes[n] for n in close.nonzero()[0] if self.keyframes[n].submap == submap]
 
     def _remove_most_redundant(self) -> None:
         """Remove the older of the two keyframes of one submap whose poses are nearest to each other."""

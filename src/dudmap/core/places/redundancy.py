@@ -137,14 +137,15 @@ class RedundantViews:
         place = self._place
         if config.measure == "features":
             self.features.set_reference(view.observation.rgb)
-        if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
-            place = _Place(T_world_camera, np.zeros_like(level.depth), np.zeros(level.depth.shape, np.int64))
         static = _static(view, estimate)
+        if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
+            depth, to_carve = np.where(static, level.depth, np.float32(0)), np.zeros(level.depth.shape, np.int64)
+            self._place = _Place(T_world_camera, depth, to_carve)
+            return
         behind = self._is_behind(place, level, volume)
         remaining = np.where(behind, self._learnt, place.to_carve) - 1
         place.to_carve = np.where(static, np.maximum(remaining, 0), place.to_carve)
         place.depth = np.where(static, level.depth, place.depth)
-        self._place = place
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
         """Move the place with a correction (4, 4) of the world."""

@@ -110,8 +110,7 @@ class Relocalizer:
             return None
         with view.timer("recognise"):
             keyframes = self.atlas.keyframes
-            static_mask = None if view.known_dynamic is None else ~view.known_dynamic
-            features = keyframes.extract(view.observation, static_mask)
+            features = keyframes.extract(view.observation, view.known_dynamic)
             self._counted = view.observation.timestamp, len(features)
             candidates = keyframes.match(features)
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]

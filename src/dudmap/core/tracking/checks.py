@@ -8,6 +8,7 @@ suspicion: it is overruled where independent evidence confirms the pose.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class Limits:
     overlap: float = np.nan
     color: float = np.nan
 
-    @property
+    @cached_property
     def sigma_mm(self) -> float:
         """Standard deviation of a reading at 1 m, millimetres."""
         return 1000 * self.sensor.sigma(1.0)
@@ -89,12 +90,6 @@ class Check:
     reason: str
     at_least: bool = False
     overruled_by: str = ""
-
-    def failure(self, figures: Mapping[str, float], limits: Limits) -> str:
-        """Reason of rejection, empty if the check passes."""
-        figure, limit = figures[self.figure], self.limit(limits)
-        fails = figure < limit if self.at_least else figure > limit
-        return self.reason.format(figure=figure, limit=limit) if fails else ""
 
 
 REGISTRATION = (
@@ -189,7 +184,8 @@ def first_failure(
         evidence: What decides whether a check that fails is overruled, by name; None for no evidence.
     """
     for check in checks:
-        reason = check.failure(figures, limits)
-        if reason and not (evidence and check.overruled_by and evidence[check.overruled_by]()):
-            return reason
+        figure, limit = figures[check.figure], check.limit(limits)
+        fails = figure < limit if check.at_least else figure > limit
+        if fails and not (evidence and check.overruled_by and evidence[check.overruled_by]()):
+            return check.reason.format(figure=figure, limit=limit)
     return ""

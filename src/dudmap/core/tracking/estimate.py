@@ -47,10 +47,6 @@ class PoseEstimate:
         """Gain and offset that map the frame's intensities to those of the map."""
         return self.tracking.exposure
 
-    def static_weights(self, levels: list[Level]) -> list[NDArray[np.float32]] | None:
-        """Registration weights (h, w) in [0, 1] of each level; None counts every pixel fully."""
-        return None if self.labels is None else static_weights(self.labels, levels, self.unverified_mask)
-
 
 def static_weights(
     labels: Labels, levels: list[Level], unverified_mask: NDArray[np.bool_] | None = None
@@ -81,9 +77,11 @@ def initial_weights(
         return None
     out = []
     for level in levels:
-        weights = np.ones(level.depth.shape, np.float32)
-        if previously_dynamic is not None:
-            weights -= np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT) * reduced(previously_dynamic, level)
+        if previously_dynamic is None:
+            weights = np.ones(level.depth.shape, np.float32)
+        else:
+            reduction = np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT)
+            weights = np.float32(1) - reduction * reduced(previously_dynamic, level)
         for mask in excluded:
             weights *= ~reduced(mask, level)
         out.append(weights)

@@ -1,5 +1,6 @@
-"""A frame on its way through the algorithm."""
+"""A frame on its way through the algorithm, and the time that each stage takes."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -9,7 +10,41 @@ from numpy.typing import NDArray
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.frames.pyramid import Pyramid
-from dudmap.core.stage_timer import StageTimer
+
+
+class StageTimer:
+    """Milliseconds per stage of the processing of a frame; the times of a stage that runs twice are added.
+
+    A stage that runs within another one counts for itself alone, so that no time is counted twice.
+
+    Args:
+        timings: Milliseconds per stage that were measured before.
+    """
+
+    def __init__(self, timings: dict[str, float] | None = None) -> None:
+        self.timings = timings or {}
+        self._running: tuple | None = None  # stage, start, milliseconds within the outer stage, the outer stage
+        self._stage = ""
+        self._within = 0.0  # milliseconds of the stages that ran within the one that is running
+
+    def __call__(self, stage: str) -> "StageTimer":
+        """Context manager that measures a block of code; a block left by an exception is not counted."""
+        self._stage = stage
+        return self
+
+    def __enter__(self) -> None:
+        self._running = self._stage, time.perf_counter(), self._within, self._running
+        self._within = 0.0
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        assert self._running is not None
+        stage, start, before, self._running = self._running
+        within, self._within = self._within, before
+        if kind is None:
+            ms, timings = 1000 * (time.perf_counter() - start), self.timings
+            timings[stage] = (timings[stage] if stage in timings else 0.0) + ms - within
+            self._within += ms
+
 
 TEXTURELESS = 0.01
 """Standard deviation of the intensities (0..1) below which an image carries no information: black or saturated."""
@@ -51,4 +86,7 @@ class FrameView:
     @property
     def textureless(self) -> bool:
         """Whether the intensities carry no information."""
-        return bool(self.pyramid.coarse.intensity.std() < TEXTURELESS)
+        import cv2
+
+        _, deviation = cv2.meanStdDev(self.pyramid.coarse.intensity)
+        return bool(deviation[0, 0] < TEXTURELESS)

@@ -11,8 +11,7 @@ from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
-from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.color_noise import motion_discount
+from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.motion_model import MotionModel

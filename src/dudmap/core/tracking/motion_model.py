@@ -1,5 +1,7 @@
 """Constant-velocity model of the camera's motion."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,10 +111,11 @@ class MotionModel:
             image: The image there, of any size.
         """
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
-        distance, angle = float(np.linalg.norm(motion[:3, 3])), se3.rotation_angle(motion)
+        shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)
+        distance = math.sqrt(shift @ shift)
         if self.timed:
             elapsed = self.elapsed(timestamp)
-            return {"speed_m_s": distance / elapsed, "turn_deg_s": float(np.degrees(angle)) / elapsed, "step": np.nan}
+            return {"speed_m_s": distance / elapsed, "turn_deg_s": math.degrees(angle) / elapsed, "step": np.nan}
         readings = image.depth[image.depth > 0]
         depth = float(np.median(readings)) if len(readings) else np.inf
         step = (distance / depth + angle) * image.camera.fx / image.camera.width

@@ -69,15 +69,6 @@ class GradientNoise:
     variances: tuple[float, float]
     depth: float
 
-    def is_exceeded(self, H: NDArray[np.float64], least: float) -> bool:
-        """Whether H has more than ``least`` times the information of the noise on every direction: whether their
-        difference is positive definite. Then one of its two terms has."""
-        try:
-            np.linalg.cholesky(H - least * (self.distances + self.intensities))
-        except np.linalg.LinAlgError:
-            return False
-        return True
-
     def observability(
         self,
         H_distances: NDArray[np.float64],
@@ -129,6 +120,8 @@ def gradient_noise(
     map_width: int,
     filter_px: float,
     parameters: RegistrationParameters,
+    H: NDArray[np.float64],
+    least: float,
 ) -> GradientNoise | None:
     """What noise of the gradients contributes to H in a view.
 
@@ -149,21 +142,25 @@ def gradient_noise(
         map_width: Width of the images that the map was made of, pixels.
         filter_px: Spatial standard deviation of their depth filter, pixels.
         parameters: The weights of the residuals.
+        H: (6, 6) normal equations of both terms, world axes.
+        least: Smallest information of a direction that is determined, in units of the noise.
 
     Returns:
-        None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
-        neighbouring voxels take the same reading, and the noise is another one.
+        None where H has more than ``least`` times the information of the noise on every direction (then one of its two
+        terms has), without enough readings on the map, or where the pixels of the map's images are wider than its
+        voxels: then neighbouring voxels take the same reading, and the noise is another one.
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
     s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
     sums, noise = np.zeros(NUM_SUMS), np.empty((2, 6, 6))
-    noise_information(
+    exceeded = noise_information(
         stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
-        (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST), R_world_camera, s_c, REGULAR, sums, noise,
+        (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST), R_world_camera, s_c, REGULAR, H, least, sums,
+        noise,
     )  # fmt: skip
     count, depth, weight = sums[:3]
-    if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
+    if exceeded or count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
         return None
     s_d = sums[3] / max(weight, 1e-12)
     return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)

@@ -15,8 +15,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.image_consistency import ImagePose
 from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.quality_monitor import ImagePose
 from dudmap.core.tracking.tracker import Tracker
 
 CLEARLY_BETTER = 0.95
@@ -50,6 +50,10 @@ class PosePredictor:
         motion: Velocity of the camera.
         tracker: Evaluates the cost of a pose.
         known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
+
+    Attributes:
+        slow_crowd: Whether most of the view is seen to move, but only in comparison with an older image: what has not
+            been seen to rest in between may move as well, and is neither registered nor fused.
     """
 
     def __init__(
@@ -60,6 +64,7 @@ class PosePredictor:
         self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
         self._known_poses = known_poses
         self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
+        self.slow_crowd = False
         self._crowded_start = False  # most of the view has moved in every frame so far
 
     def start(self, view: FrameView) -> None:
@@ -84,7 +89,8 @@ class PosePredictor:
         moving = np.zeros(view.labelled.depth.shape, bool)
         for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
             moving = moving if mask is None else moving | mask
-        if not exceeds_noise_share(moving, view.labelled) or prediction.unverified_mask is not None:
+        verified = prediction.unverified_mask is not None and not self.slow_crowd
+        if verified or not exceeds_noise_share(moving, view.labelled):
             return ""
         return "something moves in view, and the map is too young to show what else does"
 
@@ -102,6 +108,7 @@ class PosePredictor:
         if self._known_poses and not self.ego_motion.started:
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
+        self.slow_crowd = False
         by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
         if not self.ego_motion.active:
             return by_velocity
@@ -127,6 +134,9 @@ class PosePredictor:
             young = self.ego_motion.map_is_young(timestamp)
             self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
             unverified = ~motion.static_after if self._crowded_start else None
+            self.slow_crowd = slow is not None and is_majority_dynamic(moving, view.labelled)
+            if slow is not None and self.slow_crowd:
+                unverified = ~slow.static
             if not young:  # where the map is known, it labels better than two images
                 moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
         return PosePrediction(T_image, by_velocity.image_pose, moving, moving_before, unverified)

@@ -1,19 +1,168 @@
-"""Acceptance of registered frames: the figures of ``checks.py``, and what was usual in the frames before."""
+"""Acceptance of registered frames: the figures of ``checks.py``, and what was usual in the frames before.
+
+A camera that jumps may converge to a wrong pose that fits the map. The last image, seen from there, then shows
+something else. Shape alone does not tell: walls and desks resemble each other, their texture does not.
+"""
 
 import statistics
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.tracking.checks import CHECKS, RELATIVE, Limits, first_failure
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN
+from dudmap.core.backends.cpu.image_comparison import compare_images
+from dudmap.core.backends.cpu.reprojection import reproject
+from dudmap.core.dynamics.detector import noise_parameters
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.pyramid import reduced
+from dudmap.core.geometry import se3
+from dudmap.core.tracking.checks import (
+    CHECKS,
+    CONFIRMED_OF_SEEN,
+    CONFIRMED_SHARE,
+    MAX_IMAGE_SHIFT,
+    RELATIVE,
+    Limits,
+    first_failure,
+)
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.image_consistency import ImageConsistency, ImagePose
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
+
+ImagePose = Callable[[], NDArray[np.float64] | None]
+"""Pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
+CLEARLY_LESS = 0.5
+"""Another motion explains two images clearly better if its misregistration is below this share of the other: both are
+known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
+MIN_PIXELS = 100
+"""Pixels of the coarsest level that must show the same static surface in both images."""
+MIN_CORNERS = 60
+"""Corners of an image from which on a motion that most of them follow would be found: four times those it needs."""
+
+
+@dataclass(frozen=True)
+class ImageComparison:
+    """The last tracked frame, seen from the pose of this one.
+
+    Attributes:
+        shift: Distance by which the static pixels of the last image lie beside those of this one, pixels of the
+            coarsest level; NaN where too few are common, or an image carries no information.
+        share: Share of the readings, static and dynamic, whose depth agrees with that of the last frame.
+        share_of_seen: The same share of those at whose place the last frame has a reading.
+    """
+
+    shift: float = np.nan
+    share: float = np.nan
+    share_of_seen: float = np.nan
+
+    @property
+    def confirms(self) -> bool:
+        """Whether both frames show the same surface: their depths agree."""
+        return self.share >= CONFIRMED_SHARE and self.share_of_seen >= CONFIRMED_OF_SEEN
+
+    @property
+    def is_same_view(self) -> bool:
+        """Whether depths and images agree. In a corridor the depths do wherever the camera is."""
+        return self.confirms and self.shift <= MAX_IMAGE_SHIFT
+
+
+class ImageConsistency:
+    """Measures how well the motion since the last tracked frame explains both frames.
+
+    Args:
+        config: Noise of the sensor. Without ``dynamics.start_seconds`` images are never compared, nor are they here.
+        motion: Knows the pose of the last tracked frame.
+    """
+
+    def __init__(self, config: Config, motion: MotionModel) -> None:
+        self.config = config
+        self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
+        self.motion = motion
+        self._last: tuple[Level, NDArray[np.uint8], bool] | None = None  # coarsest level, dynamic pixels, blind
+        self._gain = 1.0  # of the exposure of the last frame
+
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Compare the next frame with this one, whose pose is accepted."""
+        level = view.pyramid.coarse
+        if self._enabled:
+            self._last = level, _dynamic(estimate, level).astype(np.uint8), view.blind
+        self._gain = estimate.exposure[0]
+
+    def reset(self) -> None:
+        """Forget the last frame: a new map begins."""
+        self._last = None
+
+    def supported(self, view: FrameView, estimate: PoseEstimate, seen: ImageComparison, image_pose: ImagePose) -> bool:
+        """Whether the images are compatible with the pose of a frame.
+
+        They are not if the last one lies more than MAX_IMAGE_SHIFT beside this one, and the corners of the two follow
+        no common motion, or one that explains the images clearly better. Where the depths confirm the pose and not that
+        motion, colour and depth were taken at different times, and the pose is that of the depth. Blur alone moves
+        corners and images alike. That corners are not found again where the exposure has changed suddenly says nothing.
+
+        Args:
+            view: The frame.
+            estimate: Its pose and labels.
+            seen: Its comparison with the last frame.
+            image_pose: Computes the pose (4, 4) that the corners predict; None if they follow no common motion.
+        """
+        if not seen.shift > MAX_IMAGE_SHIFT:
+            return True
+        T_image = image_pose()
+        if T_image is None:
+            change = estimate.exposure[0] / self._gain
+            return len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN
+        other = self.compare(view, estimate, T_image)
+        return not other.shift < CLEARLY_LESS * seen.shift or (seen.confirms and not other.confirms)
+
+    def compare(
+        self, view: FrameView, estimate: PoseEstimate, T_world_camera: NDArray[np.float64] | None = None
+    ) -> ImageComparison:
+        """Comparison of a frame with the last tracked one.
+
+        A shift by d pixels in a random direction changes intensities by the mean square d^2 |grad I|^2 / 2, so
+
+            d = sqrt(2) median |I_last - I| / median |grad I|
+
+        over pixels that show the same surface in both images, after the best gain and offset. What does not resemble at
+        all gives the correlation length of the texture, a few pixels. Two depths agree within three standard deviations
+        of their difference.
+
+        Args:
+            view: This frame.
+            estimate: Its pose and labels.
+            T_world_camera: (4, 4) another pose of this frame; None for that of the estimate.
+
+        Returns:
+            Of NaN where the last frame is not known.
+        """
+        if self._last is None:
+            return ImageComparison()
+        level, (last, moved, blind) = view.pyramid.coarse, self._last
+        T_world_camera = estimate.T_world_camera if T_world_camera is None else T_world_camera
+        T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
+        older = np.array([(last.depth, last.intensity)])
+        gaps, differences, marks = reproject(
+            level.depth, level.intensity, level.camera.intrinsics, T_last_camera[None], older, moved[None]
+        )  # fmt: skip
+        shift, agreeing, readings, seen = compare_images(
+            level.depth, level.intensity, _dynamic(estimate, level), gaps[0], differences[0], marks[0],
+            noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
+        )  # fmt: skip
+        shift = np.nan if view.blind or blind else shift
+        return ImageComparison(shift, agreeing / max(readings, 1), agreeing / max(seen, 1))
+
+
+def _dynamic(estimate: PoseEstimate, level: Level) -> NDArray[np.bool_]:
+    """Dynamic pixels (h, w) of a frame at the size of a level."""
+    return np.zeros(level.depth.shape, bool) if estimate.labels is None else reduced(estimate.labels.dynamic, level)
+
 
 HISTORY = 30
 """Accepted registrations that are remembered."""
@@ -72,6 +221,7 @@ class QualityMonitor:
         self._residuals: deque[float] = deque(maxlen=HISTORY)
         self._shares: deque[float] = deque(maxlen=HISTORY)
         self._colors: deque[float] = deque(maxlen=HISTORY)
+        self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN where they are not known yet
         self.recovering = False
         self.images.reset()
 
@@ -85,6 +235,7 @@ class QualityMonitor:
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
         self._colors.extend(history.colors)
+        self._update_usual()
 
     def judge(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> Verdict:
         """Figures of a registered frame, and the reason of the first check of ``CHECKS`` that it fails.
@@ -97,13 +248,13 @@ class QualityMonitor:
         """
         tracking, labels = estimate.tracking, estimate.labels
         with view.timer("check"):
-            readings = view.labelled.depth > 0
-            dynamic = np.zeros_like(readings) if labels is None else labels.dynamic & readings
-            share = float(np.count_nonzero(dynamic) / max(np.count_nonzero(readings), 1))
+            level = view.labelled
+            count = 0 if labels is None else np.count_nonzero(labels.dynamic & (level.depth > 0))
+            share = count / max(level.num_readings, 1)
             seen = self.images.compare(view, estimate)
             figures = {
                 **tracking.figures,
-                **self.motion.figures(view.timestamp, tracking.T_world_camera, view.labelled),
+                **self.motion.figures(view.timestamp, tracking.T_world_camera, level),
                 "drift_mm": 1000 * self.motion.drift(view.timestamp) if len(tracking.unobservable) else 0.0,
                 "dynamic_share": share,
                 "verified_share": (1 - share) * tracking.inlier_share,
@@ -124,17 +275,15 @@ class QualityMonitor:
 
     def limits(self, mode: str, *, crowded: bool = False) -> Limits:
         """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
-        usual = (np.nan, np.nan, np.nan)
-        if len(self._residuals) >= MIN_HISTORY:
-            usual = 1000 * _median(self._residuals), _median(self._shares), _median(self._colors)
-        config = self.config
-        return Limits(config.tracker, config.sensor, config.dynamics.max_share, mode, crowded, *usual)
+        config, (residual, overlap, color) = self.config, self._usual
+        share = config.dynamics.max_share
+        return Limits(config.tracker, config.sensor, share, mode, crowded, 1000 * residual, overlap, color)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
         if len(self._residuals) < MIN_HISTORY:
             return 1.0, 1.0
-        residual, color = (_median(q) for q in (self._residuals, self._colors))
+        residual, _, color = self._usual
         return tracking.residual / max(residual, 1e-6), tracking.color_residual / max(color, SMALL_COLOR_RESIDUAL)
 
     def is_unusual(self, tracking: TrackingResult) -> bool:
@@ -148,13 +297,15 @@ class QualityMonitor:
         self._shares.append(tracking.inlier_share)
         if np.isfinite(tracking.color_residual):
             self._colors.append(tracking.color_residual)
+        self._update_usual()
         self.recovering = False
+
+    def _update_usual(self) -> None:
+        if len(self._residuals) >= MIN_HISTORY:
+            median = statistics.median
+            colors = median(self._colors) if self._colors else np.nan
+            self._usual = median(self._residuals), median(self._shares), colors
 
     def lose(self) -> None:
         """Judge strictly until a frame is accepted again."""
         self.recovering = True
-
-
-def _median(values: deque[float]) -> float:
-    """Median of a few values, NaN of none."""
-    return statistics.median(values) if values else np.nan

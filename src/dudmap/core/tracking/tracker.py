@@ -1,5 +1,6 @@
 """Direct registration of a frame to the distances and intensities of the map (thesis section 4.4, algorithm 2)."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,8 +13,7 @@ from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
 from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
-from dudmap.core.frames.exposure import chained, exposed
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
@@ -121,6 +121,7 @@ class Tracker:
         self.config = config
         self.sensor = sensor
         self.filter_px = filter_px
+        self._sigma = sensor.sigma(1.0)
 
     def align(
         self,
@@ -137,7 +138,7 @@ class Tracker:
         found = self.minimize(volume, levels, T_init, static_weights, first_level, exposure, color_weight)
         T = found.T_world_camera.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return self._judge(replace(found, T_world_camera=T))
+        return self._judge(found, T)
 
     def minimize(
         self,
@@ -162,35 +163,35 @@ class Tracker:
         """
         volume.look_at(T_init)
         T, iterations, system, settled, seen = T_init, 0, None, True, None
-        lit, weights = levels[-1], np.ones_like(levels[-1].depth)
-        for index, level in enumerate(levels):
-            limit = self.config.iterations[first_level + index]
+        lit, weights = levels[-1], None
+        limits, parameters = self.config.iterations[first_level:], self.parameters(volume.band, color_weight)
+        for index, (level, limit) in enumerate(zip(levels, limits, strict=False)):
             if limit == 0:
                 continue
-            weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
+            weights = np.ones(level.depth.shape, np.float32) if static_weights is None else static_weights[index]
             lit, system = exposed(level, exposure), None
             if self.config.exposure and index == 0 and first_level == 0:
-                system = self.linearize(volume, lit, T, weights, color_weight)
+                system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
                 change = fit_exposure(lit.intensity, system.residuals[1], weights)
                 iterations += 1
                 if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
                     lit, system = exposed(level, exposure), None
-            finest = first_level + index == len(self.config.iterations) - 1
-            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, COMPLETE), color_weight)
+            rules = self._rules(limit, finest=index == len(limits) - 1)
+            found = self._descend(volume, lit, T, weights, system, rules, parameters)
             if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
-                at_end = found.T_world_camera, weights, found.equations
-                seen = self._observability(volume, lit, *at_end, color_weight)
+                seen = self._observability(volume, lit, found.T_world_camera, weights, found.equations, parameters)
                 if not seen.is_complete:  # its steps went where noise led them
                     iterations += found.iterations
-                    system = self.linearize(volume, lit, T, weights, color_weight)
-                    seen = self._observability(volume, lit, T, weights, system, color_weight)
-                    rules = self._rules(limit, finest, seen)
-                    found = self._descend(volume, lit, T, weights, system, rules, color_weight)
+                    system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
+                    seen = self._observability(volume, lit, T, weights, system, parameters)
+                    rules = rules._replace(basis=np.ascontiguousarray(seen.observable))
+                    found = self._descend(volume, lit, T, weights, system, rules, parameters)
             T, system, settled = found.T_world_camera, found.equations, found.settled
             iterations += found.iterations
-        if system is None:  # all levels are skipped: the initial pose is judged
-            system = self.linearize(volume, lit, T, weights, color_weight)
+        if system is None or weights is None:  # all levels are skipped: the initial pose is judged
+            weights = np.ones(lit.depth.shape, np.float32)
+            system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
         return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
 
     def nearest(
@@ -208,9 +209,9 @@ class Tracker:
             T_world_camera: (4, 4).
             weights: (h, w) float32 static weights in [0, 1]; None weighs every pixel 1.
         """
-        weights = np.ones_like(level.depth) if weights is None else weights
-        rules = self._rules(NEAREST_STEPS, finest=True, seen=COMPLETE)
-        return self._descend(volume, level, T_world_camera, weights, None, rules, None).T_world_camera
+        weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
+        rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
+        return self._descend(volume, level, T_world_camera, weights, None, rules, parameters).T_world_camera
 
     def _observability(
         self,
@@ -219,18 +220,17 @@ class Tracker:
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
         system: NormalEquations,
-        color_weight: float | None,
+        parameters: RegistrationParameters,
     ) -> Observability:
         """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
         least, R = self.config.min_information, T_world_camera[:3, :3]
         if least == 0:
             return COMPLETE
-        parameters = self.parameters(volume.band, color_weight)
         noise = gradient_noise(
             level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, self.filter_px,
-            parameters,
+            parameters, system.H, least,
         )  # fmt: skip
-        if noise is None or noise.is_exceeded(system.H, least):
+        if noise is None:
             return COMPLETE
         distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
         seen = noise.observability(distances.H, system.H, R, least)
@@ -240,8 +240,8 @@ class Tracker:
         step, shown = volume.voxel_size, []
         for twist in seen.unobservable @ np.kron(np.eye(2), R).T:
             forth, back = (
-                self.linearize(volume, level, se3.retract(T_world_camera, way * twist), weights, color_weight).residuals
-                for way in (step, -step)
+                self._descend(volume, level, T, weights, None, NO_STEP, parameters).equations.residuals
+                for T in (se3.retract(T_world_camera, way * twist) for way in (step, -step))
             )
             shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
         return seen.with_shown(np.array(shown), R)
@@ -254,22 +254,22 @@ class Tracker:
         weights: NDArray[np.float32],
         system: NormalEquations | None,
         rules: DescentRules,
-        color_weight: float | None,
+        parameters: RegistrationParameters,
     ) -> Descent:
         """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
         return volume.backend.register(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
-            self.parameters(volume.band, color_weight),
+            parameters,
         )  # fmt: skip
 
-    def _rules(self, limit: int, finest: bool, seen: Observability) -> DescentRules:
-        """Rules of the steps of a level, which move only along the directions that are ``seen``.
+    def _rules(self, limit: int, *, finest: bool) -> DescentRules:
+        """Rules of the steps of a level along all directions.
 
         A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
         and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
         decide which are, and where the registration ends.
         """
-        config, basis = self.config, seen.observable
+        config, basis = self.config, COMPLETE.observable
         if finest:
             damping = min(config.damping, FINEST_DAMPING)
             return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
@@ -292,23 +292,24 @@ class Tracker:
             weights: (h, w) float32 static weights in [0, 1].
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
-        return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, color_weight).equations
+        parameters = self.parameters(volume.band, color_weight)
+        return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
 
     def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
         """Parameters of the cost in a map with this truncation band; ``color_weight`` None: as configured."""
-        config, sensor = self.config, self.sensor
+        config = self.config
         return RegistrationParameters(
             band=band,
             huber=config.huber,
             tukey=config.tukey if config.robust == "tukey" else 0.0,
             color_weight=config.color_weight if color_weight is None else color_weight,
             color_huber=config.color_huber,
-            sigma_at_one_metre=sensor.sigma(1.0),
+            sigma_at_one_metre=self._sigma,
             noise_weighting=float(config.noise_weighting),
         )
 
-    def _judge(self, found: Minimum) -> TrackingResult:
-        """Result of a registration with the first check it fails.
+    def _judge(self, found: Minimum, T_world_camera: NDArray[np.float64]) -> TrackingResult:
+        """Result of a registration that has ended at a pose (4, 4), with the first check it fails.
 
         The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
         the registration does not weigh by it, and intensities after the best gain and offset even if the registration
@@ -317,9 +318,9 @@ class Tracker:
         config, system, level, weights = self.config, found.equations, found.level, found.weights
         share = system.weight / max(system.readings, 1.0)
         chi_square = system.chi_square if config.noise_weighting else self._chi_square(system, level, weights)
-        residual = float(np.sqrt(chi_square / max(system.weight, 1e-9)))
-        scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
-        eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
+        residual = math.sqrt(chi_square / max(system.weight, 1e-9))
+        scale = 1 / np.sqrt(np.maximum(system.H.diagonal(), 1e-30))
+        eigenvalues = np.linalg.eigvalsh(system.H * (scale[:, None] * scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
         differences = system.residuals[1]
         if not config.exposure:
@@ -329,11 +330,11 @@ class Tracker:
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
         result = TrackingResult(
-            found.T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
+            T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
             color_residual, found.settled, found.seen.unobservable, system.weight,
         )  # fmt: skip
         reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor))
-        return replace(result, converged=not reason, reason=reason)
+        return replace(result, converged=False, reason=reason) if reason else result
 
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation

@@ -18,7 +18,6 @@ from numba.core.dispatcher import Dispatcher
 from dudmap.config import Config
 from dudmap.core import slam as slam_module
 from dudmap.core.backends import threads
-from dudmap.core.backends.cpu import teams
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.slam import Slam
 from dudmap.lab.benchmark.measure import grid
@@ -91,21 +90,14 @@ def counted(frames: int, voxel: float) -> tuple[dict[str, float], Slam]:
     slam = Slam(recording.camera, Config().override([f"volume.voxel_size={voxel}"]))
     pixels: Counter[str] = Counter()
     tracker: Any = slam.tracker
-    linearize, descend = tracker.linearize, tracker._descend
-
-    def count(level: Any, iterations: int) -> None:  # noqa: ANN401
-        pixels.update(linearised=iterations * level.depth.size, iterations=iterations)
-
-    def linearizing(volume: Any, level: Any, *rest: Any, **named: Any) -> Any:  # noqa: ANN401
-        count(level, 1)
-        return linearize(volume, level, *rest, **named)
+    descend = tracker._descend
 
     def descending(volume: Any, level: Any, *rest: Any) -> Any:  # noqa: ANN401
         found = descend(volume, level, *rest)
-        count(level, found.iterations)
+        pixels.update(linearised=found.iterations * level.depth.size, iterations=found.iterations)
         return found
 
-    tracker.linearize, tracker._descend = linearizing, descending
+    tracker._descend = descending
     rows = []
     for index in range(frames):
         frame, fused = recording[index], slam.volume.num_integrated
@@ -196,7 +188,7 @@ def _counted(function: Callable[[Any], object], argument: object) -> dict[str, i
     ]  # an isinstance would ask dead proxies
     # formulas are inlined where kernels call them, and Python calls them uncompiled
     kernels = {found.py_func.__code__ for found in compiled if not found.targetoptions.get("forceinline")}
-    sharing = {teams.run_team.__code__, threads.run_bands.__code__}
+    sharing = threads.also_in_other_threads.__code__
     launches = barriers = calls = 0
     files: set[str] = set()
 
@@ -207,7 +199,7 @@ def _counted(function: Callable[[Any], object], argument: object) -> dict[str, i
             launches += 1
         elif event in ("call", "c_call"):
             calls += 1
-            barriers += event == "call" and code in sharing
+            barriers += event == "call" and code is sharing
             if code.co_filename.startswith(CORE):
                 files.add(code.co_filename)
 

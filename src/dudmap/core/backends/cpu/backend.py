@@ -45,6 +45,7 @@ class CpuBackend:
 
     def __init__(self) -> None:
         self._pixels = np.empty((0, 2), dtype=np.int32)
+        self._descents: dict[tuple[int, int], tuple[NDArray, ...]] = {}  # by bands and steps, see ``register``
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 
@@ -69,7 +70,11 @@ class CpuBackend:
             free_after, frame_number, stamps, p, depth, *tiles, weights, found, counts,
             np.empty(BANDS, dtype=np.float32),
         )  # fmt: skip
-        return TouchedBlocks(np.unique(_concatenated(found, counts)), depth, weights, tiles)
+        cells = _concatenated(found, counts)
+        cells.sort()
+        once = np.ones(len(cells), np.bool_)  # two bands may both find a cell
+        once[1:] = cells[1:] != cells[:-1]
+        return TouchedBlocks(cells[once], depth, weights, tiles)
 
     def fuse(
         self,
@@ -150,17 +155,19 @@ class CpuBackend:
         height, width = depth.shape
         rows = -(-PIXELS_PER_BAND // width)
         num_bands, limit = -(-height // rows), rules.limit
-        known = np.empty(registration.NUM_SUMS)
+        if (num_bands, limit) not in self._descents:
+            poses, buffers = np.empty((limit + 1, 3, 4), dtype=np.float32), np.empty(limit + 1, dtype=np.int64)
+            sums = np.empty(registration.NUM_SUMS), np.empty((2, num_bands, registration.NUM_SUMS))
+            self._descents[num_bands, limit] = poses, buffers, *sums
+        poses, buffers, known, sums = self._descents[num_bands, limit]
         if first is not None:
             known[registration.SYMMETRIC], known[21:27], known[registration.COST] = first.H, first.b, first.cost
         residuals = np.empty((2, 2, height, width), dtype=np.float32)
         T, sums, buffer, count, settled = run_team(
             registration.descend, num_bands, rows, depth, intensity, weights, intrinsics, on_host(grid.window),
             grid.shape, grid.origin, on_host(grid.geometry).reshape(-1), grid.voxel_size, grid.sdf_unit,
-            single(parameters), np.ascontiguousarray(T_world_camera), first is not None, known,
-            rules._replace(basis=np.ascontiguousarray(rules.basis)),
-            np.empty((limit + 1, 3, 4), dtype=np.float32), np.empty(limit + 1, dtype=np.int64), residuals,
-            np.empty((2, num_bands, registration.NUM_SUMS)),
+            single(parameters), np.ascontiguousarray(T_world_camera), first is not None, known, rules, poses, buffers,
+            residuals, sums,
         )  # fmt: skip
         equations = first if first is not None and buffer < 0 else normal_equations(sums, residuals[buffer])
         return Descent(T, equations, count, settled)
@@ -175,13 +182,12 @@ class CpuBackend:
         free_after: int,
     ) -> MapSample:
         """See ``Backend.sample``."""
-        grid = grid.on_host()
-        shape, geometry, sdf_unit = depth.shape, grid.geometry.reshape(-1), np.float32(grid.sdf_unit)
+        shape, window, geometry = depth.shape, on_host(grid.window), on_host(grid.geometry).reshape(-1)
         out = MapSample(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
         rows = max(8, -(-shape[0] // 8))
         run_team(
-            sampling.sample, -(-shape[0] // rows), rows, depth, intensity, intrinsics, T_grid_camera, grid.window,
-            grid.shape, geometry, sdf_unit, grid.free_count, free_after, *out,
+            sampling.sample, -(-shape[0] // rows), rows, depth, intensity, intrinsics, T_grid_camera, window,
+            grid.shape, geometry, np.float32(grid.sdf_unit), grid.free_count, free_after, *out,
         )  # fmt: skip
         return out
 

@@ -3,14 +3,11 @@
 The formulas stand first: arithmetic on numbers or images.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.labeling import fit_mixture, grow_regions, mean_field, opened
-from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar
 
@@ -212,49 +209,3 @@ def moving_pixels(
         for u in range(w):
             n = regions[v, u]
             dynamic[v, u] = n > 0 and area[n] >= rules.min_area and seeded[n] >= rules.seeded_share * area[n]
-
-
-def free_space(
-    depth: NDArray[np.float32],
-    intensity: NDArray[np.float32],
-    intrinsics: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    targets: Sequence[ReprojectionTarget],
-    side: int,
-) -> NDArray[np.bool_]:
-    """Pixels (h, w) bool that at least half as many older frames have seen through as have a reading there, opened.
-
-    Args:
-        depth, intensity: (h, w) float32; depth in metres, 0 = none.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
-        noise: (h, w) float32, largest depth difference of two readings of one point, metres.
-        targets: The older frames.
-        side: Of the square that the mask is opened with, pixels, odd.
-    """
-    import cv2
-
-    num_free, num_surface = (np.zeros(depth.shape, dtype=np.float32) for _ in range(2))
-    for gap, _, _ in reproject(depth, intensity, intrinsics, targets):
-        num_free += gap > noise
-        num_surface += np.abs(gap) <= noise
-    free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
-    return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
-
-
-def seen_marked(
-    depth: NDArray[np.float32],
-    intensity: NDArray[np.float32],
-    intrinsics: NDArray[np.float32],
-    target: ReprojectionTarget,
-    max_gap: float,
-) -> NDArray[np.bool_]:
-    """Pixels (h, w) bool whose points a marked reading of an older frame shows, within ``max_gap`` metres.
-
-    Args:
-        depth, intensity: (h, w) float32; depth in metres, 0 = none.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
-        target: The older frame.
-        max_gap: Metres.
-    """
-    ((gap, _, marks),) = reproject(depth, intensity, intrinsics, [target])
-    return (marks > 0) & (np.abs(gap) < max_gap)

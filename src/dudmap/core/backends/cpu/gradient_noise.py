@@ -110,9 +110,12 @@ def isotropic(moments, R, share, regular, out):
 
 @kernel
 def noise_information(
-    stride, depth, residuals, weights, intrinsics, parameters, numbers, R, of_intensity, regular, sums, out
+    stride, depth, residuals, weights, intrinsics, parameters, numbers, R, of_intensity, regular, H, least, sums, out
 ):  # fmt: skip
     """Sums of ``noise_sums``, and the information (2, 6, 6) that the noise of distances and of intensities adds to H.
+
+    Returns whether H has more than ``least`` times the information of the noise on every direction: whether their
+    difference is positive definite.
 
     Args:
         stride, depth, residuals, weights, intrinsics, parameters, sums: As for ``noise_sums``.
@@ -120,6 +123,8 @@ def noise_information(
         R: (3, 3) float64, camera to world.
         of_intensity: Variance of a component of the gradient of intensities.
         regular: As for ``isotropic``.
+        H: (6, 6) normal equations of both terms, world axes.
+        least: Factor of the noise.
         out: (2, 6, 6) float64 out.
     """
     filter_px, scale_px, voxel_size, interpolated, steepest = numbers
@@ -130,3 +135,13 @@ def noise_information(
     for term in range(2):
         share = stride * stride * (1.0 if term == 0 else of_intensity)
         isotropic(sums[3 + NUM_MOMENTS * term : 3 + NUM_MOMENTS * (term + 1)], R, share, regular, out[term])
+    L = np.empty((6, 6))  # Cholesky factor of the difference, while there is one
+    for j in range(6):
+        for i in range(j, 6):
+            value = H[i, j] - least * (out[0, i, j] + out[1, i, j])
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            if i == j and not value > 0:
+                return False
+            L[i, j] = np.sqrt(value) if i == j else value / L[j, j]
+    return True

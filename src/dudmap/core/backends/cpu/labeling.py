@@ -6,7 +6,8 @@ The scalar formulas stand first, each in a function of its own; the loops over h
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, run_team, take, wait_for_all
+from dudmap.core.backends.threads import kernel, scalar
 
 f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
@@ -240,12 +241,25 @@ def upsample_labels(
         (H, W) bool.
     """
     out = np.empty(depth.shape, dtype=np.uint8)
-    marks = low.astype(np.uint8)
-    run_bands(
-        lambda start, stop: upsample_rows(start, stop, marks, low_depth, depth, stride, out),
-        bands(depth.shape[0], UPSAMPLING_BAND),
-    )
+    num_bands = -(-depth.shape[0] // UPSAMPLING_BAND)
+    run_team(upsample, num_bands, low.view(np.uint8), low_depth, depth, stride, out)
     return out.view(np.bool_)
+
+
+@kernel
+def upsample(leads, team, low, low_depth, depth, stride, out):
+    """Loop of ``upsample_labels`` for a team of threads (``teams.py``); ``low`` and ``out`` are uint8."""
+    height = depth.shape[0]
+    num_bands = -(-height // UPSAMPLING_BAND)
+    band, _ = first_band(leads, team, 0, num_bands)
+    while band != NO_BAND:
+        start = band * UPSAMPLING_BAND
+        upsample_rows(start, min(start + UPSAMPLING_BAND, height), low, low_depth, depth, stride, out)
+        done(team)
+        band, _ = take(team, num_bands)
+    if leads:
+        wait_for_all(team, num_bands)
+        finish(team)
 
 
 @scalar
@@ -278,7 +292,7 @@ def opened(mask, half):
     return out
 
 
-@kernel
+@scalar
 def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
     """Rows ``row_start`` to ``row_stop`` of ``upsample_labels``; ``low`` and ``out`` are uint8."""
     h, w = low.shape

@@ -1,12 +1,12 @@
 """Reprojection of an image into older ones of the same camera: what they have at its points."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.threads import bands, kernel, run_bands
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, run_team, take, wait_for_all
+from dudmap.core.backends.threads import kernel, scalar
 
 NEAREST = np.float32(0.05)
 """Points nearer to the camera plane than this, or behind it, are not projected, metres."""
@@ -14,29 +14,14 @@ LEAST_WEIGHT = np.float32(0.25)
 """Least sum of the bilinear weights of the pixels with a reading: a quarter, the weight of each at equal distance."""
 
 
-class ReprojectionTarget(NamedTuple):
-    """An older frame that an image is compared with.
-
-    Attributes:
-        T_target_camera: (4, 4), camera of the image to that of the older frame.
-        depth, intensity: (h, w) float32; depth in metres, 0 = none.
-        marks: (h, w) uint8.
-    """
-
-    T_target_camera: NDArray[np.float64]
-    depth: NDArray[np.float32]
-    intensity: NDArray[np.float32]
-    marks: NDArray[np.uint8]
-
-
 class Reprojection(NamedTuple):
-    """Difference of an image to an older frame, at the pixels of the image.
+    """Differences of an image to n older frames, at the pixels of the image.
 
     Attributes:
-        gap: (h, w) float32, metres: older reading minus depth of this image's point in the older camera, the smallest
-            in magnitude among the four readings around its projection; NaN where there is none.
-        difference: (h, w) float32, older minus this intensity, NaN likewise.
-        marks: (h, w) uint8, mark of that reading, 0 where the point projects outside of the older frame.
+        gap: (n, h, w) float32, metres: older reading minus depth of this image's point in the older camera, the
+            smallest in magnitude among the four readings around its projection; NaN where there is none.
+        difference: (n, h, w) float32, older minus this intensity, NaN likewise.
+        marks: (n, h, w) uint8, mark of that reading, 0 where the point projects outside of the older frame.
     """
 
     gap: NDArray[np.float32]
@@ -48,31 +33,48 @@ def reproject(
     depth: NDArray[np.float32],
     intensity: NDArray[np.float32],
     intrinsics: NDArray[np.float32],
-    targets: Sequence[ReprojectionTarget],
-) -> list[Reprojection]:
-    """Differences of an image to older frames of the same camera, one for each.
+    Ts_older_camera: NDArray[np.float64],
+    older: NDArray[np.float32],
+    marks: NDArray[np.uint8],
+) -> Reprojection:
+    """Differences of an image to n older frames of the same camera.
 
     Args:
         depth, intensity: (h, w) float32; depth in metres, 0 = none.
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        targets: The older frames.
+        Ts_older_camera: (n, 4, 4), camera of the image to those of the older frames.
+        older: (n, 2, h, w) float32, their depth and intensity.
+        marks: (n, h, w) uint8, of their pixels.
     """
-
-    def reproject_into(n: int, _: int) -> Reprojection:
-        target, shape = targets[n], depth.shape
-        out = Reprojection(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-        T = target.T_target_camera[:3].astype(np.float32)
-        reproject_difference(depth, intensity, intrinsics, T, target.depth, target.intensity, target.marks, *out)
-        return out
-
-    return [reproject_into(0, 1)] if len(targets) == 1 else run_bands(reproject_into, bands(len(targets), 1))
+    shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
+    gap, difference = np.empty((2, *shape), np.float32)
+    out = Reprojection(gap, difference, np.empty(shape, np.uint8))
+    run_team(reproject_all, shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
+    return out
 
 
 @kernel
+def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_marks, gap, difference, marks):
+    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes one older frame at a time."""
+    num_bands = len(older)
+    band, _ = first_band(leads, team, 0, num_bands)
+    while band != NO_BAND:
+        reproject_difference(
+            depth, intensity, intrinsics, Ts[band], older[band, 0], older[band, 1], old_marks[band], gap[band],
+            difference[band], marks[band],
+        )  # fmt: skip
+        done(team)
+        band, _ = take(team, num_bands)
+    if leads:
+        wait_for_all(team, num_bands)
+        finish(team)
+
+
+@scalar
 def reproject_difference(
     depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):  # fmt: skip
-    """Loop of ``reproject``: ``T`` is (3, 4) float32, the last three arguments are written."""
+    """Differences to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]

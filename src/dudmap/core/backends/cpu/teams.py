@@ -137,8 +137,10 @@ def run_team(function, num_bands, *arguments):
     """
     team = np.zeros(16, dtype=np.int64)
     team[TICKET] = num_bands  # nothing to take before the first step
-    if num_bands > 1 and num_threads() > 1:
-        also_in_other_threads(lambda: function(False, team, *arguments), min(num_threads(), num_bands) - 1)
+    threads = num_threads()
+    threads = threads if threads < num_bands else num_bands
+    if threads > 1:
+        also_in_other_threads(lambda: function(False, team, *arguments), threads - 1)
     try:
         return function(True, team, *arguments)
     finally:
