@@ -156,7 +156,9 @@ def bias(
     found = {}
     for name, opened in ({recording.name: partial(open_sequence, recording)} if recording else sources).items():
         pulls = measure_pulls(opened(), config, stride)
-        found[name] = [{"term": pull.term, "mean": pull.mean, "spread": pull.spread} for pull in pulls]
+        found[name] = [
+            {"term": term, "mean": pull.mean(axis=0), "spread": pull.std(axis=0)} for term, pull in pulls.items()
+        ]
         say(f"{name}:\n\n{bias_table(pulls)}", err=as_json)
     if as_json:
         answer({"corrections_mm_deg": found}, "", as_json=True)
