@@ -65,16 +65,9 @@ def poster(
     center: Vector, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
 ) -> Primitive:
     """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
-    w, h = size
-    material = Material(
-        "poster",
-        (0.5 / w, 0.5 / h),
-        ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25),
-        variation=0.05,
-        faces=False,
-    )
-    extent = (depth, w, h) if side else (w, depth, h)
-    return box(center, extent, material)
+    (w, h), middle = size, ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25)
+    material = Material("poster", (0.5 / w, 0.5 / h), middle, variation=0.05, faces=False)
+    return box(center, (depth, w, h) if side else (w, depth, h), material)
 
 
 def shelf(center: tuple[float, float], width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
