@@ -66,8 +66,6 @@ CASES = [
     ("study", "optuna", ["study", "tune", "design.toml"]),
     ("study", "pandas", ["study", "thesis", "--published"]),
     ("gpu", "warp", ["run", "desk", "--device", "warp-cpu"]),
-    ("fleet", "faiss", ["merge", "run", "run", "run"]),
-    ("fleet", "gtsam", ["merge", "run", "run", "run"]),
     ("cluster", "ray", ["study", "thesis", "--cluster", "auto"]),
 ]
 

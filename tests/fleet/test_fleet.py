@@ -18,6 +18,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
@@ -62,11 +63,19 @@ def fuse(runs, out, limit, workers=1, bits=9):
     for name in ("map", "tiles", ".work"):
         shutil.rmtree(out / name, ignore_errors=True)
         (out / name).mkdir(parents=True)
-    like = MapHeader.read(runs[0].folder / MAP_FILE, blocks=False)
+    like = MapHeader.read(runs[0].folder / MAP_FILE)
     with pytest.MonkeyPatch.context() as patch, Workers(workers) as crew:
         patch.setattr(fusion, "CELL_BITS", bits)
         ranges = planned_ranges(runs, crew, limit)
         return list(crew.map(partial(fuse_range, like, out, out / ".work"), ranges))
+
+
+def blocks_of(volume):
+    """All blocks of a map."""
+    blocks, n = volume.blocks, volume.blocks.num_entries
+    has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
+    voxels = blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots]
+    return FusedRange(morton.encode(blocks.coords[:n]), has_voxels, *voxels)
 
 
 def content(blocks):
@@ -82,9 +91,9 @@ def content(blocks):
 @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_order_and_any_ranges_give_the_voxels_of_a_fusion_at_once(walls, tmp_path, order, limit):
     runs, volumes = walls
-    expected = content(FusedRange.of(fuse_maps(volumes, POSES)))
+    expected = content(blocks_of(fuse_maps(volumes, POSES)))
     results = fuse([runs[n] for n in order], tmp_path, limit)
-    parts = [FusedRange.of(TsdfVolume.load(tmp_path / entry["file"])) for entry, _ in results]
+    parts = [blocks_of(TsdfVolume.load(tmp_path / entry["file"])) for entry, _ in results]
     for part, (entry, _) in zip(parts, results, strict=True):
         assert ((part.codes >= entry["codes"][0]) & (part.codes < entry["codes"][1])).all()
     for a, b in zip(content(joined(parts)), expected, strict=True):
@@ -99,7 +108,7 @@ def test_two_processes_give_the_same_files(walls, tmp_path):
     assert len(names) > 4
     for name in names:
         if name.suffix == ".npz":
-            a, b = (FusedRange.of(TsdfVolume.load(tmp_path / w / name)) for w in "12")
+            a, b = (blocks_of(TsdfVolume.load(tmp_path / w / name)) for w in "12")
             for left, right in zip(content(a), content(b), strict=True):
                 np.testing.assert_array_equal(left, right)
         else:

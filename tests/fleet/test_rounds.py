@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from dudmap.core.geometry import se3
 from dudmap.fleet import registration
 from dudmap.fleet.agreement import Agreement
 from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair
-from dudmap.fleet.registration import RegisteredPair, predicted_overlap, registered_runs
+from dudmap.fleet.registration import predicted_overlap, registered_runs
 from dudmap.fleet.sdf_alignment import SdfAlignment
 from dudmap.fleet.workers import Workers
 
@@ -41,7 +40,7 @@ class Oracle:
 
     def __call__(self, runs, pairs, workers, guesses):
         self.asked.append(list(pairs))
-        return [RegisteredPair(a, b, self.decided(a, b, guesses.get((a, b)))) for a, b in pairs]
+        return {(a, b): self.decided(a, b, guesses.get((a, b))) for a, b in pairs}
 
     def decided(self, a, b, guess):
         T = se3.inverse(TRUE[a]) @ TRUE[b]
@@ -75,7 +74,6 @@ def similarity():
 
 
 def test_groups_ask_more_runs_and_a_ring_is_closed_by_its_geometry(monkeypatch):
-    pytest.importorskip("gtsam")
     oracle = Oracle()
     pairs, graph = register(monkeypatch, oracle, similarity())
     assert (5, 6) not in oracle.asked[0]
@@ -85,7 +83,7 @@ def test_groups_ask_more_runs_and_a_ring_is_closed_by_its_geometry(monkeypatch):
     assert len(graph.kept) == RUNS
     for run, T in enumerate(graph.Ts):
         np.testing.assert_allclose(T, se3.inverse(TRUE[0]) @ TRUE[run], atol=1e-6)
-    assert len(pairs) == len({(one.a, one.b) for one in pairs}) == sum(len(asked) for asked in oracle.asked)
+    assert len(pairs) == sum(len(asked) for asked in oracle.asked)
 
 
 def test_a_false_join_is_given_up_because_the_runs_it_brings_together_disagree(monkeypatch):

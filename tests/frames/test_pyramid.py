@@ -27,4 +27,4 @@ def test_the_majority_is_one_of_the_readings():
     moving[:, :12] = True
     assert not is_majority_dynamic(moving, view)
     view.depth[:, 20:] = 0
-    assert is_majority_dynamic(moving, view)
+    assert is_majority_dynamic(moving, Level(view.camera, view.depth, view.intensity))

@@ -10,20 +10,26 @@ from dudmap.core.backends.device import make_backend
 wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
-from dudmap.core.backends.warp import ahead
-
+MODULES = [f"dudmap.core.backends.warp.kernels.{name}" for name in ("fusion", "surface", "rows")]
 DOUBLE = {"images", "surface"}
 """Modules with sums in float64, or intensities."""
 
 
+def compiled(folder, modules, architectures, *, ptx=True):
+    """The files with the kernels of modules, one per module and architecture."""
+    for name in modules:
+        import_module(name)
+        wp.compile_aot_module(name, arch=architectures, module_dir=str(folder), use_ptx=ptx)
+    return sorted(folder.rglob("*.ptx" if ptx else "*.cubin"))
+
+
 @pytest.fixture(scope="module")
 def listings(tmp_path_factory):
-    files = ahead.compile_kernels(tmp_path_factory.mktemp("ptx"), (80, 90))
-    return {path.name: path.read_text() for path in files}
+    return {path.name: path.read_text() for path in compiled(tmp_path_factory.mktemp("ptx"), MODULES, [80, 90])}
 
 
 @pytest.mark.parametrize("architecture", [80, 90])
-@pytest.mark.parametrize("module", ahead.MODULES)
+@pytest.mark.parametrize("module", MODULES)
 def test_every_kernel_is_in_the_ptx(listings, module, architecture):
     kernels = [value for value in vars(import_module(module)).values() if isinstance(value, wp.Kernel)]
     own = [kernel for kernel in kernels if kernel.module.name == module]
@@ -37,7 +43,6 @@ def test_every_kernel_is_in_the_ptx(listings, module, architecture):
         assert ".f64" not in text[text.index(".entry") :]
 
 
-def test_one_module_becomes_machine_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(ahead, "MODULES", ahead.MODULES[-1:])
-    (file,) = ahead.compile_kernels(tmp_path, (90,), ptx=False)
+def test_one_module_becomes_machine_code(tmp_path):
+    (file,) = compiled(tmp_path, MODULES[-1:], [90], ptx=False)
     assert file.read_bytes()[:4] == b"\x7fELF"

@@ -28,7 +28,6 @@ def world():
 
 
 def test_poses_are_found_in_spite_of_false_joins(world):
-    pytest.importorskip("gtsam")
     Ts, rng = world
     near = [(k, k + step) for step in (1, 2) for k in range(RUNS - step)]
     false = [Join(a, b, se3.exp(rng.uniform(-1, 1, 6) * 3)) for a, b in ((3, 17), (4, 18), (5, 9), (20, 22))]
@@ -61,7 +60,6 @@ def test_a_tree_is_kept_and_runs_without_joins_stay_alone(world):
 
 
 def test_runs_of_one_place_are_proposed():
-    pytest.importorskip("faiss")
     from dudmap.fleet.registration import most_similar, similarity
 
     rng = np.random.default_rng(0)
@@ -121,7 +119,6 @@ def test_the_error_of_a_join_is_drift_at_the_middle_of_the_common_surface(world)
 
 
 def test_the_error_of_a_ring_goes_where_a_relative_pose_is_uncertain():
-    pytest.importorskip("gtsam")
     sure, unsure = np.diag(np.full(6, 1e-6)), np.diag([1e-2, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])
     slip = se3.exp(np.array([0.02, 0, 0, 0, 0, 0]))
     joins = [

@@ -22,7 +22,7 @@ def merge(
 
     Two runs become a run folder: map.npz, keyframes.npz, mesh.ply, config.toml, merge.json and the trajectories of both
     in the world frame of the first. More runs become a world: map/ (parts of the map), tileset.json and tiles/ (3D
-    Tiles), world.json and the trajectories; it needs dudmap[fleet].
+    Tiles), world.json and the trajectories.
     """
     if len(runs) == 2 and not world:
         from dudmap.fleet.merge import merge_runs

@@ -335,10 +335,8 @@ class Slam(SlamResults):
         if self.atlas.history is None or view.blind:
             return T_world_camera, False
         with view.timer("loops"):
-            query = LoopQuery(
-                view.observation, view.pyramid.tracked, estimate.tracking, dynamic_mask, estimate.labels,
-                estimate.unverified_mask,
-            )  # fmt: skip
+            levels, unverified = view.pyramid.tracked, estimate.unverified_mask
+            query = LoopQuery(view.observation, levels, estimate.tracking, dynamic_mask, estimate.labels, unverified)
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False

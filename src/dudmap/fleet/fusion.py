@@ -196,11 +196,8 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
 
 
 def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
-    """Fuse a range, write its map file and the tiles of its cells, and for the tiles' parents their meshes into
-    ``work``.
-
-    The parameters of the result are those of ``like``. Returns the entry of the range in world.json, and the tiles.
-    """
+    """Fuse a range with the parameters of ``like``, write its map file, the tiles of its cells and, into ``work``,
+    their meshes for inner tiles; the entry of the range in world.json, and the tiles."""
     empty_map = like.volume()
     low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS
     reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in cells.runs]

@@ -58,14 +58,6 @@ class FusedRange:
             self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
         )
 
-    @classmethod
-    def of(cls, volume: TsdfVolume) -> "FusedRange":
-        """All blocks of a map."""
-        blocks, n = volume.blocks, volume.blocks.num_entries
-        has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
-        codes = morton.encode(blocks.coords[:n])
-        return cls(codes, has_voxels, blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots])
-
     def volume(self, like: TsdfVolume) -> TsdfVolume:
         """The blocks as a map with the camera and the parameters of another."""
         out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
@@ -245,37 +237,22 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
-    """Blocks of the result that a map can contribute to.
-
-    Attributes:
-        near: (n,) int64 Morton codes, ascending, of blocks that its voxels reach into.
-        empty: (m,) int64 the same of its blocks without voxels; a block can be in both.
-    """
+    """Blocks of the result that a map can contribute to, as ascending Morton codes: ``near`` (n,), which its voxels
+    reach into, and ``empty`` (m,), which its blocks without voxels do; a block can be in both."""
 
     near: NDArray[np.int64]
     empty: NDArray[np.int64]
 
     @classmethod
     def of(
-        cls,
-        coords: NDArray[np.integer],
-        has_voxels: NDArray[np.bool_],
-        T_world_map: NDArray[np.float64],
-        block_size: float,
+        cls, coords: NDArray[np.integer], has_voxels: NDArray[np.bool_], T: NDArray[np.float64], block_size: float
     ) -> "ReachedBlocks":
         """Where the points ``PROBES`` of blocks (n, 3) of a map lie when it stands at a pose (4, 4)."""
         codes = morton.encode(coords)[:, None]
-        if not np.array_equal(T_world_map, np.eye(4)):
+        if not np.array_equal(T, np.eye(4)):
             points = coords[:, None].astype(np.float64) + PROBES / BLOCK
-            moved = points @ T_world_map[:3, :3].T + T_world_map[:3, 3] / block_size
-            codes = morton.encode(np.floor(moved).astype(np.int64))
+            codes = morton.encode(np.floor(points @ T[:3, :3].T + T[:3, 3] / block_size).astype(np.int64))
         return cls(np.unique(codes[has_voxels]), np.unique(codes[~has_voxels]))
-
-    @classmethod
-    def of_volume(cls, volume: TsdfVolume, T_world_volume: NDArray[np.float64]) -> "ReachedBlocks":
-        """The same of all blocks of a map."""
-        blocks, n = volume.blocks, volume.blocks.num_entries
-        return cls.of(blocks.coords[:n], blocks.slot_of[:n] >= 0, T_world_volume, volume.block_size)
 
     def within(self, low: int, high: int) -> "ReachedBlocks":
         """Those with codes from ``low`` to ``high - 1``."""
@@ -321,7 +298,10 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
     A map whose pose is the identity enters voxel by voxel, others by trilinear interpolation. The sums are exact: on
     the same grid any order gives the same voxels.
     """
-    reached = [ReachedBlocks.of_volume(*one) for one in zip(volumes, Ts_world_volume, strict=True)]
+    reached = [
+        ReachedBlocks.of(one.coords[:n], one.slot_of[:n] >= 0, T, volumes[0].block_size)
+        for one, n, T in ((v.blocks, v.blocks.num_entries, T) for v, T in zip(volumes, Ts_world_volume, strict=True))
+    ]
     near = np.unique(np.concatenate([one.near for one in reached]))
     borders = [0, *near[RANGE_BLOCKS::RANGE_BLOCKS].tolist(), np.iinfo(np.int64).max]
     parts = []

@@ -38,13 +38,8 @@ degrees: that of a relocalised frame (``relocalization.max_distance``)."""
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A relative pose that some pairs of keyframes agree on.
-
-    Attributes:
-        T_a_b: (4, 4) world of b to world of a.
-        num_keyframes: Keyframes of b that were recognised at this relative pose.
-        num_inliers: Feature matches of all pairs of keyframes that agree.
-    """
+    """World of b to world of a (4, 4), on which some pairs of keyframes agree; numbers of the keyframes of b that were
+    recognised at it, and of the feature matches of all pairs that agree."""
 
     T_a_b: NDArray[np.float64]
     num_keyframes: int
@@ -52,10 +47,7 @@ class Hypothesis:
 
 
 def relative_poses(
-    a: Sequence[Keyframe],
-    b: Sequence[Keyframe],
-    camera: Camera,
-    sensor: SensorConfig,
+    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
 ) -> list[Hypothesis]:
     """Relative poses of two maps from their keyframes, best first; empty if no place of b is known in a.
 
@@ -170,27 +162,18 @@ def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
 
 
 def decided(
-    a: MapSurface,
-    b: MapSurface,
-    found: Sequence[Hypothesis],
-    many: bool = False,
-    changed: bool = False,
+    a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False, changed: bool = False
 ) -> MapPair:
-    """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
-    is taken. ``many``: The maps are two of many, most of which do not show one place."""
-    first = MapPair(None, "")
+    """The first of some relative poses (at least one) that passes all checks after its refinement, else why the first
+    of them does not. ``many``: The maps are two of many, most of which do not show one place."""
+    first: MapPair | None = None
     for hypothesis in found:
         pair = _checked(a, b, hypothesis, many, changed)
         if pair.T_a_b is not None:
             return pair
-        first = first if first.reason else pair
+        first = first or pair
+    assert first is not None
     return first
-
-
-def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
-    """Fuse two maps into one in the world of a, with the keyframes of both."""
-    moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
-    return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
 def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, changed: bool) -> MapPair:
@@ -208,3 +191,9 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, c
     checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
     reason = checked.rejection_reason(many, changed)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)
+
+
+def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
+    """Fuse two maps into one in the world of a, with the keyframes of both."""
+    moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
+    return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)

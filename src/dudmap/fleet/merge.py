@@ -20,7 +20,6 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DatasetError, DudmapError, MapError
-from dudmap.extras import need
 from dudmap.fleet.fusion import (
     MAP_FOLDER,
     TILE_FOLDER,
@@ -34,7 +33,7 @@ from dudmap.fleet.fusion import (
 from dudmap.fleet.map_fusion import MAX_COUNT, VOXELS, FusedRange
 from dudmap.fleet.map_merging import compare_maps, merged_map
 from dudmap.fleet.map_samples import sample_map
-from dudmap.fleet.registration import RegisteredPair, registered_runs
+from dudmap.fleet.registration import Pairs, registered_runs
 from dudmap.fleet.run_graph import RunGraph
 from dudmap.fleet.workers import MapHeader, Workers, check_runs
 from dudmap.input_files import damaged, read_bytes, read_json
@@ -54,13 +53,9 @@ WRITTEN = {
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
     """Join the maps of two run folders into a new run folder, in the world frame of the first.
 
-    The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
-    runs in the common world frame (trajectory.txt, trajectory-2.txt, ...), merge.json: the runs, the relative pose
-    and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is
-    written if the maps are not to be joined.
-
-    Returns:
-        Content of merge.json.
+    Its files are those of a run: map, keyframes, mesh, config.toml of the first run, metrics.json; beside them the
+    trajectories of both runs (trajectory.txt, trajectory-2.txt, ...) and merge.json, whose content is returned. Nothing
+    is written if the maps are not to be joined.
 
     Raises:
         MapError: The maps are not to be joined; the message says why.
@@ -126,41 +121,30 @@ class FleetReport:
     Attributes:
         out: Folder of the largest world; others lie in it as part-2, part-3, ...
         tree: Content of its world.json.
-        pairs: What was found about each pair that was compared.
-        graph: Poses of the runs.
         sentences: What the user should know: runs that were not joined, joins that contradict others.
     """
 
     out: Path
     tree: dict[str, Any]
-    pairs: list[RegisteredPair]
-    graph: RunGraph
     sentences: list[str]
 
 
 def merge_fleet(
     runs: Sequence[str | Path], out: str | Path, *, workers: int = 1, note: Callable[[str], None] = lambda _: None
 ) -> FleetReport:
-    """Join the maps of any number of runs.
+    """Join the maps of any number of runs, at least two.
 
     The folder receives world.json (runs with their poses, ranges, pairs), map/<code>.npz (one map file per range,
     which ``TsdfVolume.load`` reads), tileset.json and tiles/ (3D Tiles 1.1), and trajectory.txt, trajectory-2.txt, ...
-    of all runs in the world of the first. Runs that do not overlap the largest group become worlds of their own in
-    part-2, part-3, ... if at least two of them are joined.
-
-    Args:
-        runs: Run folders, at least two.
-        out: New folder, or one that holds a world, which is replaced.
-        workers: Processes.
-        note: Told what is being done, a sentence at a time.
+    of all runs in the world of the first. It is new, or holds a world, which is replaced. Runs that do not overlap the
+    largest group become worlds of their own in part-2, part-3, ... if at least two of them are joined. ``workers`` is
+    the number of processes; ``note`` is told what is being done.
 
     Raises:
-        MissingExtraError: A library is not installed.
         ConfigError: A run is named twice, or the voxels differ in size.
         MapError: A run folder is incomplete, or no two runs can be joined.
         DudmapError: ``out`` cannot be used.
     """
-    need("fleet", "the merging of more than two runs", ("faiss", "gtsam"))
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)
     _check_out(out)
@@ -177,7 +161,7 @@ def merge_fleet(
             note(f"{len(part)} runs are fused")
             folder = out if number == 1 else out / f"part-{number}"
             world = _write_world(folder, part, folders, graph, like, crew)
-            world |= {"pairs": [_pair_entry(one, folders, graph) for one in pairs if one.a in part and one.b in part]}
+            world |= {"pairs": [_pair_entry(one, pairs, folders, graph) for one in pairs if set(one) <= set(part)]}
             world |= {"not_joined": [str(folders[run]) for run in range(len(folders)) if run not in part]}
             if number == 1:
                 tree = world
@@ -187,7 +171,7 @@ def merge_fleet(
         tree |= {"compared_pairs": len(pairs), "workers": workers, "cpu_s": round(crew.cpu_s, 1)} | times
         tree["peak_rss_mb"] = sorted(crew.peak_rss_mb.values(), reverse=True)
         write_text(out / WORLD_FILE, json.dumps(tree, indent=1) + "\n")
-    return FleetReport(out, tree, pairs, graph, _sentences(graph, folders))
+    return FleetReport(out, tree, _sentences(graph, folders))
 
 
 def _write_world(
@@ -246,16 +230,16 @@ def _load_kernels(like: MapHeader) -> None:
     volume.extract_chunks(np.zeros(1, np.int32), np.zeros(1, np.int64))
 
 
-def _pair_entry(one: RegisteredPair, folders: Sequence[Path], graph: RunGraph) -> dict[str, Any]:
+def _pair_entry(runs: tuple[int, int], pairs: Pairs, folders: Sequence[Path], graph: RunGraph) -> dict[str, Any]:
     """What world.json says about a pair that was compared."""
-    rejected = any((join.a, join.b) == (one.a, one.b) for join in graph.rejected)
-    out = {"runs": [str(folders[one.a]), str(folders[one.b])]} | one.pair.tree()
+    out = {"runs": [str(folders[run]) for run in runs]} | pairs[runs].tree()
+    rejected = runs in [(join.a, join.b) for join in graph.rejected]
     return out | ({"reason": "other joins contradict it"} if rejected else {})
 
 
-def _why_not(pairs: Sequence[RegisteredPair]) -> str:
+def _why_not(pairs: Pairs) -> str:
     """The most frequent reason."""
-    reasons = [one.pair.reason for one in pairs] or ["no places look alike"]
+    reasons = [pair.reason for pair in pairs.values()] or ["no places look alike"]
     return max(reasons, key=reasons.count)
 
 

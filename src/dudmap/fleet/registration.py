@@ -9,13 +9,13 @@ towards equal variance, which lowers the weight of what many places have in comm
 (whitening, Jegou and Chum 2012). All are compared with all: 10,000 keyframes of 1,000 short runs in seconds.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.linalg import eigh
 from scipy.sparse import csr_array
 
 from dudmap.core.geometry import se3
@@ -23,7 +23,6 @@ from dudmap.core.geometry.alignment import agree
 from dudmap.core.map import morton
 from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.saved_map import MAP_FILE
-from dudmap.extras import extra
 from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair, decided, relative_poses
 from dudmap.fleet.map_samples import transformed
 from dudmap.fleet.run_graph import Join, RunGraph, drift_covariance, solve
@@ -59,17 +58,10 @@ SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
 
 
 def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Visual words (WORDS, 128) of features (n, 128); the same for the same features.
-
-    Raises:
-        MissingExtraError: faiss is not installed.
-    """
-    kmeans = _faiss().Kmeans(
-        features.shape[1], min(WORDS, len(features)), niter=20, seed=1, min_points_per_centroid=1,
-        max_points_per_centroid=TRAINING,
-    )  # fmt: skip
-    kmeans.train(np.ascontiguousarray(features, np.float32))
-    return kmeans.centroids
+    """Visual words (WORDS, 128) of features (n, 128); the same for the same features."""
+    some = features[:: max(1, len(features) // TRAINING)].astype(np.float64)
+    words, _ = kmeans2(some, min(WORDS, len(some)), iter=20, minit="++", seed=1)
+    return words.astype(np.float32)
 
 
 def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -115,41 +107,33 @@ def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, i
 def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), scaled, unit length."""
     count, size = descriptors.shape
-    pca = _faiss().PCAMatrix(size, max(1, min(COMPONENTS, count // 2, size)), -WHITENING)
-    pca.epsilon = LEAST_VARIANCE
-    pca.train(np.ascontiguousarray(descriptors))
-    out = pca.apply(np.ascontiguousarray(descriptors))
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+    centred = (descriptors - descriptors.mean(axis=0)).astype(np.float64)
+    wide = count < size  # of the two products, whose eigenvalues are the same, the smaller one
+    product = centred @ centred.T if wide else centred.T @ centred
+    kept = max(1, min(COMPONENTS, count // 2, size))
+    squares, axes = eigh(product, subset_by_index=[len(product) - kept, len(product) - 1])
+    squares = np.maximum(squares, 0)
+    out = axes * np.sqrt(squares) if wide else centred @ axes
+    out *= (squares / count + LEAST_VARIANCE) ** -WHITENING
+    return (out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)).astype(np.float32)
 
 
-def _faiss() -> Any:  # noqa: ANN401
-    with extra("fleet", "the merging of more than two runs"):
-        import faiss
-    return faiss
+Pairs = dict[tuple[int, int], MapPair]
+"""What was found about pairs (a, b) of runs, a < b."""
 
 
-@dataclass(frozen=True, eq=False)
-class RegisteredPair:
-    """What was found about two runs; see ``MapPair``."""
-
-    a: int
-    b: int
-    pair: MapPair
-
-    @property
-    def join(self) -> Join | None:
-        """The accepted relative pose, if there is one."""
-        T, alignment, agreement = self.pair.T_a_b, self.pair.alignment, self.pair.agreement
-        if T is None or alignment is None or agreement is None:
-            return None
-        return Join(self.a, self.b, T, drift_covariance(T, alignment.center, agreement.overlap))
+def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
+    """The accepted relative pose of two runs, if there is one."""
+    T, alignment, agreement = pair.T_a_b, pair.alignment, pair.agreement
+    if T is None or alignment is None or agreement is None:
+        return None
+    return Join(*runs, T, drift_covariance(T, alignment.center, agreement.overlap))
 
 
 def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
     """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, which are all to be compared.
 
     Raises:
-        MissingExtraError: faiss is not installed.
         MapError: A keyframe file is damaged.
     """
     n = len(runs)
@@ -160,26 +144,19 @@ def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
     return similarity(list(workers.map(_described, [(path, words) for path in runs])))
 
 
-def register_pairs(
-    runs: Sequence[Path],
-    pairs: Sequence[tuple[int, int]],
-    workers: Workers,
-    guesses: Mapping[tuple[int, int], NDArray[np.float64]],
-) -> list[RegisteredPair]:
-    """Relative pose of each pair (a, b) of runs, or why they are not to be joined.
-
-    ``guesses`` are relative poses ``T_a_b`` (4, 4) of some pairs, which are tried before those of the features.
-    """
+def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], workers: Workers, guesses: Guesses) -> Pairs:
+    """Relative pose of each pair of runs, or why they are not to be joined; ``guesses`` are tried before the features.
+    Pairs with the same first run are one job, which reads that run once."""
     groups: dict[int, list[int]] = {}
     for a, b in pairs:
         groups.setdefault(a, []).append(b)
     jobs = [(runs[a], [(runs[b], guesses.get((a, b))) for b in others]) for a, others in groups.items()]
     found = workers.map(_compare, jobs)
-    return [
-        RegisteredPair(a, b, pair)
+    return {
+        (a, b): pair
         for (a, others), results in zip(groups.items(), found, strict=True)
         for b, pair in zip(others, results, strict=True)
-    ]
+    }
 
 
 def _sample(job: tuple[Path, int]) -> NDArray[np.float32]:
@@ -198,7 +175,7 @@ def _described(job: tuple[Path, NDArray[np.float32]]) -> NDArray[np.float32]:
 def _compare(job: tuple[Path, list[tuple[Path, NDArray[np.float64] | None]]]) -> list[MapPair]:
     """Decisions on a run and others."""
     a, others = job
-    header = MapHeader.read(a / MAP_FILE, blocks=False)
+    header = MapHeader.read(a / MAP_FILE)
     return [_compare_two(a, b, guess, header) for b, guess in others]
 
 
@@ -215,19 +192,13 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
     return decided(surface_of(a), surface_of(b), found, many=True)
 
 
-Pairs = dict[tuple[int, int], RegisteredPair]
-
-
-def registered_runs(
-    runs: Sequence[Path], workers: Workers, note: Callable[[str], None]
-) -> tuple[list[RegisteredPair], RunGraph]:
+def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str], None]) -> tuple[Pairs, RunGraph]:
     """Relative poses of pairs of runs, and the poses of all.
 
     The first round compares each run with the most similar others. Each further round compares runs that overlap at the
     poses found so far, from these poses, and runs of the smaller groups with the next similar runs of other groups.
 
     Raises:
-        MissingExtraError: faiss or GTSAM is not installed.
         MapError: A file is damaged.
     """
     n = len(runs)
@@ -241,20 +212,19 @@ def registered_runs(
         if not wanted:
             break
         note(f"round {number + 1}: {len(wanted)} of {n * (n - 1) // 2} pairs of runs are compared")
-        for one in register_pairs(runs, wanted, workers, guesses):
-            found[one.a, one.b] = one
+        found |= register_pairs(runs, wanted, workers, guesses)
         graph = _graph(n, found, guesses)
         near = _brought_together(graph, blocks, found, guesses)
         guesses |= {(a, b): se3.inverse(graph.Ts[a]) @ graph.Ts[b] for a, b in near}
         wanted = sorted({*near, *_more_partners(graph, similar, found)})
-    return list(found.values()), graph
+    return found, graph
 
 
 def _graph(count: int, found: Pairs, guesses: Guesses) -> RunGraph:
     """Poses of the runs from all joins, without those that pairs brought together by them deny."""
-    joins = [join for one in found.values() if (join := one.join) is not None]
+    joins = [join for runs, pair in found.items() if (join := join_of(runs, pair)) is not None]
     graph = solve(count, joins)
-    denied = [pair for pair, guess in guesses.items() if found[pair].pair.contradicted and _is_at(graph, pair, guess)]
+    denied = [pair for pair, guess in guesses.items() if found[pair].contradicted and _is_at(graph, pair, guess)]
     return solve(count, joins, denied) if denied else graph
 
 
@@ -272,7 +242,7 @@ def _brought_together(
     for part in graph.components:
         shares[np.ix_(part, part)] = predicted_overlap([transformed(graph.Ts[run], blocks[run]) for run in part], CELL)
     shares[shares < MIN_PREDICTED] = 0
-    known = [pair for pair, one in found.items() if one.pair.T_a_b is not None]
+    known = [runs for runs, pair in found.items() if pair.T_a_b is not None]
     for a, b in [*known, *(pair for pair, guess in guesses.items() if _is_at(graph, pair, guess))]:
         shares[a, b] = shares[b, a] = 0
     return most_similar(shares, PARTNERS)

@@ -1,15 +1,13 @@
-"""Poses of many runs from relative poses of pairs: rejection by cycles, and a pose graph with robust weights (GTSAM).
+"""Poses of many runs from relative poses of pairs: rejection by cycles, and a pose graph with robust weights.
 
 Relative poses around a cycle must compose to the identity. Where a cycle does not close, the relative poses in it that
 no other cycle confirms are given up, all of them if it cannot be told which one is wrong: a false join costs more than
-a missed one. What is left is optimised by graduated non-convexity with a truncated quadratic cost (Yang et
-al. 2020), which gives up those that still contradict the others, and once more without these.
+a missed one. What is left is optimised with a Huber kernel.
 """
 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +15,19 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from dudmap.core.geometry import se3
-from dudmap.extras import extra
+from dudmap.core.places.pose_graph import Edge, optimize
 
 Pair = tuple[int, int]
 
-SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
-"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, deg), per axis: drift
+SIGMA_DISTANCE, SIGMA_ANGLE = 0.01, np.radians(0.2)
+"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, rad), per axis: drift
 within the runs. The surfaces themselves determine it more exactly."""
 HALF = 0.5
 """Overlap for which these hold. Joins of rendered runs with more than half of the smaller map in common are off by
 4.4 mm (root mean square), with 35 to 50 % by 4.9, with 25 to 35 % by 11.8, and with less by 17 mm."""
 CHI_SQUARE = 22.46
-"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, and
-of a relative pose, in standard deviations."""
+"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, in
+standard deviations."""
 HUBER = 1.345
 """Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
 
@@ -91,7 +89,7 @@ def drift_covariance(
 
 
 def _usual_covariance() -> NDArray[np.float64]:
-    return np.diag(np.repeat([SIGMA_DISTANCE**2, np.radians(SIGMA_ANGLE_DEG) ** 2], 3))
+    return np.diag(np.repeat([SIGMA_DISTANCE**2, SIGMA_ANGLE**2], 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +122,9 @@ Cycle = list[tuple[Join, int]]
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """Poses of runs.
-
-    Attributes:
-        components: Runs that are joined with each other, ascending; the largest component first.
-        Ts: (n, 4, 4) world of each run to that of the first run of its component.
-        kept: Joins that were used.
-        rejected: Joins that contradict others.
-    """
+    """Poses of runs: the runs that are joined with each other, ascending, the largest component first; the world of
+    each run to that of the first run of its component (n, 4, 4); the joins that were used, and those that contradict
+    others."""
 
     components: list[list[int]]
     Ts: NDArray[np.float64]
@@ -141,36 +134,23 @@ class RunGraph:
 
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
     """Poses of ``count`` runs from relative poses of pairs; ``denied`` pairs disagree where these put them
-    (``supported``).
-
-    Raises:
-        MissingExtraError: GTSAM is not installed.
-    """
+    (``supported``)."""
     kept = consistent(supported(joins, denied))
-    Ts = np.tile(np.eye(4), (count, 1, 1))
-    for nodes in components(count, kept):
-        inside = [join for join in kept if join.a in nodes]
-        if len(inside) >= len(nodes):  # with fewer there is no cycle: the tree is the answer
-            lost = _outliers(nodes, inside)
-            kept = [join for join in kept if join not in lost]
-    parts = components(count, kept)
+    parts, Ts = components(count, kept), np.tile(np.eye(4), (count, 1, 1))
     for nodes in parts:
         inside = [join for join in kept if join.a in nodes]
         for node, T in _chained(nodes[0], inside).items():
             Ts[node] = T
-        if len(inside) >= len(nodes):
-            Ts[nodes] = _optimised(nodes, inside, Ts)
+        if len(inside) >= len(nodes):  # with fewer there is no cycle: the tree is the answer
+            edges = [Edge(nodes.index(j.a), nodes.index(j.b), j.T_a_b, SIGMA_DISTANCE, SIGMA_ANGLE) for j in inside]
+            Ts[nodes] = optimize(Ts[nodes], edges, np.stack([join.covariance for join in inside]), HUBER)
     return RunGraph(parts, Ts, kept, [join for join in joins if join not in kept])
 
 
 def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
     """Connected runs, ascending; the largest component first, then by the first run."""
-    parts, seen = [], set()
-    for start in range(count):
-        if start not in seen:
-            nodes = sorted(_chained(start, joins))
-            seen.update(nodes)
-            parts.append(nodes)
+    number = _labels(np.array([(join.a, join.b) for join in joins], int).reshape(-1, 2), count)
+    parts = [np.flatnonzero(number == n).tolist() for n in range(number.max(initial=-1) + 1)]
     return sorted(parts, key=lambda nodes: (-len(nodes), nodes[0]))
 
 
@@ -275,49 +255,4 @@ def _chained(start: int, joins: Sequence[Join]) -> dict[int, NDArray[np.float64]
             if other not in out:
                 out[other] = out[node] @ join.motion(node)
                 queue.append(other)
-    return out
-
-
-def _gtsam() -> Any:  # noqa: ANN401
-    with extra("fleet", "the merging of more than two runs"):
-        import gtsam
-    return gtsam
-
-
-def _problem(nodes: Sequence[int], joins: Sequence[Join], Ts: dict[int, NDArray[np.float64]], robust: bool) -> tuple:
-    """Factor graph and initial values; twists of GTSAM are (omega, v)."""
-    gtsam = _gtsam()
-    order = np.array([3, 4, 5, 0, 1, 2])
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for join in joins:
-        noise = gtsam.noiseModel.Gaussian.Covariance(join.covariance[np.ix_(order, order)])
-        if robust:
-            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), noise)
-        graph.add(gtsam.BetweenFactorPose3(join.a, join.b, gtsam.Pose3(join.T_a_b), noise))
-    for node in nodes:
-        values.insert(node, gtsam.Pose3(Ts[node]))
-    fixed = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-6))
-    graph.add(gtsam.PriorFactorPose3(nodes[0], gtsam.Pose3(np.eye(4)), fixed))
-    return gtsam, graph, values
-
-
-def _outliers(nodes: Sequence[int], joins: Sequence[Join]) -> list[Join]:
-    """Joins of connected runs that graduated non-convexity gives no weight."""
-    gtsam, graph, values = _problem(nodes, joins, _chained(nodes[0], joins), robust=False)
-    parameters = gtsam.GncLMParams()
-    parameters.setKnownInliers([len(joins)])  # the prior
-    solver = gtsam.GncLMOptimizer(graph, values, parameters)
-    solver.setInlierCostThresholds(CHI_SQUARE / 2)  # of half the squared error
-    solver.optimize()
-    return [join for join, weight in zip(joins, solver.getWeights(), strict=False) if weight < 0.5]
-
-
-def _optimised(nodes: Sequence[int], joins: Sequence[Join], Ts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (nodes, 4, 4) of connected runs by Levenberg-Marquardt steps with a Huber kernel; the first is fixed."""
-    gtsam, graph, values = _problem(nodes, joins, {node: Ts[node] for node in nodes}, robust=True)
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    out = np.stack([result.atPose3(node).matrix() for node in nodes])
-    out[0] = np.eye(4)
-    for T in out:
-        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
     return out

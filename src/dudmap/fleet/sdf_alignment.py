@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import TrackerConfig
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
@@ -16,10 +17,6 @@ from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_ma
 MAX_ITERATIONS = 40
 STOP = 1e-5
 """Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
-COLOR_WEIGHT = 0.1325
-"""Weight of the squared intensity difference (0..1) against the squared distance (m): thesis table 6.2."""
-COLOR_HUBER = 0.07
-"""Huber threshold of the intensity difference, as in the tracker."""
 SCALE = 0.5
 """Residual at which the Geman-McClure weight of a distance has fallen to a quarter, voxels: about the standard
 deviation of a surface. What only one of the maps has seen from the front lies up to a truncation distance off."""
@@ -62,10 +59,10 @@ def align_maps(
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
     It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
-    scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities Huber
-    weights.
+    scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities
+    the weights of the tracker.
     """
-    exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
+    tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
     center, scale = np.zeros(3), a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
@@ -74,7 +71,7 @@ def align_maps(
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
         weights = 1 / np.square(1 + np.square(rows.distance / scale))
         H, g = _normal_equations(rows.J_distance, rows.distance, weights)
-        lit = COLOR_WEIGHT * np.minimum(1.0, COLOR_HUBER / np.maximum(np.abs(rows.shade), 1e-12))
+        lit = tracker.color_weight * np.minimum(1.0, tracker.color_huber / np.maximum(np.abs(rows.shade), 1e-12))
         H_c, g_c = _normal_equations(rows.J_shade, rows.shade, lit)
         center = rows.points.mean(axis=0)
         stiffness = _stiffness(H + H_c, center, rows.points)

@@ -44,13 +44,8 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class MapHeader:
-    """What a map file says without its voxels.
-
-    Attributes:
-        camera, config, sensor, depth_max: Parameters of the volume.
-        coords: (n, 3) coordinates of its blocks.
-        has_voxels: (n,) bool, blocks that own voxels; the others are known to be empty.
-    """
+    """What a map file says without its voxels: the parameters of the volume, the coordinates (n, 3) of its blocks, and
+    which of them (n,) own voxels; the others are known to be empty."""
 
     camera: Camera
     config: VolumeConfig
@@ -60,19 +55,17 @@ class MapHeader:
     has_voxels: NDArray[np.bool_]
 
     @classmethod
-    def read(cls, path: Path, *, blocks: bool = True) -> "MapHeader":
-        """Read a map file, whose voxels are not decompressed, with or without which ``blocks`` there are.
+    def read(cls, path: Path) -> "MapHeader":
+        """Read a map file, whose voxels are not decompressed.
 
         Raises:
             MapError: The file is damaged or not a map of this version.
         """
         try:
             with open_arrays(path) as data:
-                coords = data["coords"] if blocks else np.zeros((0, 3), np.int32)
-                has_voxels = np.zeros(len(coords), bool)
-                if blocks:
-                    has_voxels[data["entries"]] = True
-                return cls(*read_parameters(data, path), coords, has_voxels)
+                has_voxels = np.zeros(len(data["coords"]), bool)
+                has_voxels[data["entries"]] = True
+                return cls(*read_parameters(data, path), data["coords"], has_voxels)
         except DAMAGE as error:
             raise MapError(f"{path} is not a readable map file: {error}") from error
 
@@ -103,7 +96,7 @@ def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
         damaged = [name for name in (MAP_FILE, KEYFRAME_FILE) if not zipfile.is_zipfile(path / name)]
         if damaged:
             raise MapError(f"{path / damaged[0]} is cut off or damaged; repeat the run")
-    headers = [MapHeader.read(path / MAP_FILE, blocks=False) for path in runs]
+    headers = [MapHeader.read(path / MAP_FILE) for path in runs]
     sizes = [header.config.voxel_size for header in headers]
     for path, size in zip(runs, sizes, strict=True):
         if not np.isclose(size, sizes[0]):

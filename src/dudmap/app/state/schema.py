@@ -38,7 +38,7 @@ core.geometry.association:TimedFile core.geometry.calibration:Calibration core.g
 core.geometry.lens:Lens,OtherView core.geometry.mesh:Mesh core.geometry.trajectory:Trajectory
 core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager
 core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks,BlockTree core.map.incremental_mesh:IncrementalMesh
-core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
+core.map.memory_limit:MemoryLimit
 core.map.paged_map:PagedMap
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
 core.mapper:StartFrame,Bootstrap,Mapper

@@ -1,21 +1,9 @@
 """An array in the host's memory of which a back end may keep a copy on a device."""
 
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-
-class DeviceCopy(Protocol):
-    """Copy of an array on a device."""
-
-    def host_wrote(self, rows: NDArray[np.integer] | None) -> None:
-        """Rows (n,) of the host's array, None = all, have been written."""
-        ...
-
-    def pull(self, host: NDArray) -> None:
-        """Bring the host's array up to date with what the device wrote."""
-        ...
 
 
 class Mirror:
@@ -29,12 +17,12 @@ class Mirror:
     Attributes:
         array: The array without what only the device has written.
         used: Number of rows in use, from the first on; the others are spare, and a device needs no copy of them.
-        copy: Copy on a device; None = none.
+        copy: Copy on a device (``RowCopy``); None = none.
     """
 
     def __init__(self, array: NDArray) -> None:
         self.array, self.used = array, len(array)
-        self.copy: DeviceCopy | None = None
+        self.copy: Any = None
 
     @property
     def host(self) -> NDArray:
@@ -60,7 +48,7 @@ class Mirror:
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
     """An array as it is, and a mirror's array up to date."""
-    if type(array) is not Mirror:
+    if not isinstance(array, Mirror):
         return array
     return array.array if array.copy is None else array.host
 

@@ -13,8 +13,6 @@ from dudmap.core.backends.parameters import (
     FusionParameters,
     MapSample,
     NormalEquations,
-    RaycastParameters,
-    RaycastResult,
     RegistrationParameters,
     TouchedBlocks,
     VoxelGrid,
@@ -25,8 +23,8 @@ class Backend(Protocol):
     """Operations of a compute device.
 
     A back end may reuse buffers between calls, so each map has one of its own, and calls on one must not run at the
-    same time. Results do not depend on the number of threads. Images are prepared, labels found and meshes extracted on
-    the CPU, whatever the device.
+    same time. Results do not depend on the number of threads. Images are prepared, labels found, meshes and views of
+    the map made on the CPU, whatever the device.
     """
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -42,12 +40,8 @@ class Backend(Protocol):
     ) -> TouchedBlocks:
         """Prepare an image for the fusion, and find the blocks without voxels that its truncation bands touch.
 
-        Args:
-            grid, view: The map and the image.
-            stamps: (cells,) int32, number of the frame that last found a cell; changed here.
-            free_after: Observations that make a block known free space.
-            frame_number: Number of this frame, larger than all before.
-            parameters: Of the fusion.
+        ``stamps`` (cells,) hold the numbers, which increase, of the frames that last found a cell, and are changed;
+        ``free_after`` observations make a block known free space.
         """
         ...
 
@@ -68,14 +62,12 @@ class Backend(Protocol):
         Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``.
 
         Args:
-            grid, view: The map and the image.
-            touched: What ``touch`` found for it.
+            touched: What ``touch`` found for the image.
             candidates: (n,) int32 slots that may be in view.
             fused: (slots,) uint8 frames that were fused into each slot.
             turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
             count: Number of equal frames that this one stands for.
             free_space: Which empty blocks to observe; None = none.
-            parameters: Of the fusion.
         """
         ...
 
@@ -96,7 +88,6 @@ class Backend(Protocol):
         """Levenberg-Marquardt steps from a pose on (eq. 4.43 with the weights of 4.46); see ``descent.py``.
 
         Args:
-            grid: The map.
             depth: (h, w) float32, metres, 0 = none.
             intensity: (h, w) float32 in [0, 1].
             weights: (h, w) float32 static weights in [0, 1].
@@ -104,7 +95,6 @@ class Backend(Protocol):
             T_world_camera: (4, 4) pose at which the steps begin.
             first: Normal equations there; None where they are not known yet.
             rules: Beginning and end; without steps the result are the normal equations at the pose.
-            parameters: Of the cost.
         """
         ...
 
@@ -120,19 +110,4 @@ class Backend(Protocol):
         """Signed distance, intensity difference and occupancy of the map at the points of an image; images as of
         ``register``, ``T_grid_camera`` (3, 4) float32 from the camera to the window's lattice (voxels); ``free_after``
         observations make free space."""
-        ...
-
-    def raycast(
-        self,
-        grid: VoxelGrid,
-        T_world_camera: NDArray[np.float64],
-        intrinsics: NDArray[np.float32],
-        size: tuple[int, int],
-        parameters: RaycastParameters,
-    ) -> RaycastResult:
-        """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
-
-        A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes
-        from unknown space straight to the inside, there is none.
-        """
         ...

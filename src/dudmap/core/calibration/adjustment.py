@@ -119,12 +119,8 @@ class Adjustment:
     known several times better than from one pair, and with it the translation between the cameras, which most looks
     like an error of the poses.
 
-    Args:
-        given: The calibration as given, the mean of the priors.
-        sensor: Noise of the depth readings.
-
-    Attributes:
-        levels: Halvings of the colour images, coarse to fine.
+    ``given`` is the calibration as given, the mean of the priors; ``levels`` are the halvings of the colour images,
+    coarse to fine.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
@@ -234,14 +230,8 @@ def _without_light(
     Ts: NDArray[np.float64],
     residuals: NDArray[np.float32],
 ) -> _PairSystems:
-    """Normal equations of all pairs in the parameters and the poses of the frames, from those of ``linearize_pair``.
-
-    Args:
-        H, b: (P, 21, 21) and (P, 21).
-        light: (P, 2) gains and offsets.
-        Ts: (P, 4, 4) relative poses, the first to the second camera.
-        residuals: As of ``_PairSystems``.
-    """
+    """Normal equations of all pairs in the parameters and the poses of the frames, from those (P, 21, 21), (P, 21) of
+    ``linearize_pair``, gains and offsets (P, 2), and the relative poses (P, 4, 4) of the first to the second camera."""
     known, of_light, prior = slice(0, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), CORRELATED * LIGHT_SIGMA**-2
     inverse = np.asarray(np.linalg.inv(H[:, of_light, of_light] + np.diag(prior)), np.float64)
     light_step = _times(inverse, b[:, of_light] + prior * (light - [1.0, 0.0]))

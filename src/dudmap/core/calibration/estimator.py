@@ -97,10 +97,7 @@ class CalibrationEstimator:
     pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
     for pairs counted twice).
 
-    Args:
-        given: The calibration as given.
-        sensor: Noise of the depth readings.
-        workers: Threads; 2 do both halves of the time at once.
+    ``given`` is the calibration as given; 2 ``workers`` (threads) do both halves of the time at once.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
@@ -109,15 +106,12 @@ class CalibrationEstimator:
         self.adjustment = Adjustment(given, sensor)
 
     def estimate(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
-        """Calibration that explains pairs of frames, as far as they prove it.
+        """Calibration that explains pairs of frames, which are in the order of time, as far as they prove it.
 
         Groups of parameters leave the given values one after the other, of those that prove themselves that with the
         most evidence first: their estimate from either half of the time predicts the pairs of the other half better.
         What merely absorbs errors of another kind, such as a bent depth image, does so differently from place to place
         and fails.
-
-        Args:
-            keyframes: In the order of time.
         """
         middle = len(keyframes) // 2
         within = [select_pairs(part, PAIRS // 2) for part in (keyframes[:middle], keyframes[middle:])]

@@ -77,15 +77,8 @@ def keyframe(
     velocity: NDArray[np.float64],
     dynamic_mask: NDArray[np.bool_] | None,
 ) -> ColorKeyframe:
-    """Keyframe of a preprocessed frame.
-
-    Args:
-        observation: The frame.
-        color_camera: Camera of the colour images as recorded.
-        T_world_camera: (4, 4) pose.
-        velocity: (6,) twist of the camera per second, its own axes.
-        dynamic_mask: (H, W) bool, pixels that move; None for none.
-    """
+    """Keyframe of a preprocessed frame at a pose (4, 4) with a velocity (6,), twist per second in camera axes, without
+    the pixels (H, W) that move; ``color_camera`` is that of the colour images as recorded."""
     import cv2
 
     level = halvings_to(GEOMETRY_WIDTH, observation.camera)
@@ -130,15 +123,8 @@ def central_velocity(
 
 
 class KeyframeCollector:
-    """Collects keyframes evenly over the time since tracking began.
-
-    Args:
-        color_camera: Camera of the colour images as recorded.
-        max_gap: Largest time between the two neighbours of a keyframe, seconds, if less than ``MAX_GAP``.
-
-    Attributes:
-        keyframes: In the order of time.
-    """
+    """Collects ``keyframes``, in the order of time, evenly over the time since tracking began. ``max_gap`` is the
+    largest time between the two neighbours of a keyframe, seconds, if less than ``MAX_GAP``."""
 
     def __init__(self, color_camera: Camera, max_gap: float = MAX_GAP) -> None:
         self.color_camera = color_camera
@@ -151,13 +137,8 @@ class KeyframeCollector:
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
     ) -> None:
-        """Take note of a tracked frame; the one before may become a keyframe, since its velocity is now known.
-
-        Args:
-            observation: The frame.
-            T_world_camera: (4, 4) pose.
-            dynamic_mask: (H, W) bool, pixels that move.
-        """
+        """Take note of a tracked frame, its pose (4, 4) and the pixels (H, W) that move; the one before may become a
+        keyframe, since its velocity is now known."""
         now = observation.timestamp
         if self._pending is not None:
             middle, T, mask = self._pending

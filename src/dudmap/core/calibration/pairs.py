@@ -28,11 +28,7 @@ class Pair:
 
 
 class PairSet:
-    """Pairs of F frames, whose images and points are stacked for the kernel.
-
-    Args:
-        pairs: The pairs.
-        stride: Every so many points of a frame are used.
+    """Pairs of F frames, whose images and points (every ``stride``-th) are stacked for the kernel.
 
     Attributes:
         numbers: (P, 2) int64, the first and the second frame of every pair, in the order of time.

@@ -32,13 +32,8 @@ class SelfCalibration:
     Each estimate starts from the calibration as given and takes all keyframes of the current submap, whose colours are
     kept as they were recorded, so that it does not matter with which calibration they were tracked.
 
-    Args:
-        given: The calibration as given.
-        sensor: Noise of the depth readings.
-        live: The result is used as soon as it is there, and not after a fixed number of frames.
-
-    Attributes:
-        estimate: The last one that was finished; None before.
+    ``live``: The result is used as soon as it is there, and not after a fixed number of frames. ``estimate`` is the
+    last one that was finished; None before.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig, *, live: bool = False) -> None:
@@ -65,14 +60,8 @@ class SelfCalibration:
         dynamic_mask: NDArray[np.bool_],
         submap: int,
     ) -> None:
-        """Take note of a tracked frame, and begin an estimation if it is time.
-
-        Args:
-            observation: The frame.
-            T_world_camera: (4, 4) pose in the world of the submap.
-            dynamic_mask: (H, W) bool, pixels that move.
-            submap: Number of the submap.
-        """
+        """Take note of a tracked frame at a pose (4, 4) in the world of a submap, of which the pixels ``dynamic_mask``
+        (H, W) move, and begin an estimation if it is time."""
         self._frames += 1
         if not self._attempts:
             return

@@ -160,7 +160,7 @@ class DynamicDetector:
         config, depth = self.config, level.depth
         noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
-        sigma, tolerance, probability = np.empty((3, *depth.shape), np.float32)
+        sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
         histogram = np.zeros(BINS, np.int64)
         unknown, (prior, static, moves) = weigh_readings(
             depth, sample.distance, sample.occupancy, noise, RULES, CENTERS, sigma, tolerance, histogram
@@ -171,7 +171,7 @@ class DynamicDetector:
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = Mixture((1 - prior, prior), (static, moves))
         offset, slope = mixture.coefficients
-        dynamic, seeds = np.empty((2, *depth.shape), np.bool_)
+        dynamic, seeds = (np.empty(depth.shape, np.bool_) for _ in range(2))
         rules = RegionRules(
             MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, SEEDED_SHARE,
             config.free_space, config.regions,

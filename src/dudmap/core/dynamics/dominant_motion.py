@@ -15,7 +15,7 @@ from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
-from dudmap.core.frames.optical_flow import consistent_with_static, track_forward_backward
+from dudmap.core.frames.optical_flow import consistent_with_static, lengths, track_forward_backward
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry.camera import Camera
 
@@ -235,7 +235,7 @@ def dominant_motion(
         return None
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected)
     predicted = reproject(T, points, camera)
-    error = _lengths(predicted - targets)
+    error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
     inlier, areas = error < threshold, points[:, 2] ** 2
     if np.count_nonzero(candidate & inlier) < FEWEST:
@@ -244,7 +244,7 @@ def dominant_motion(
     near = error < MOVES_SIGMAS * threshold
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
-    limit = least + MOVES_SHARE * _lengths(targets - pixels)
+    limit = least + MOVES_SHARE * lengths(targets - pixels)
     moves = error > limit
     kept = ~moves
     moves &= (error <= intervals * limit) & (_depth_change(T, points, targets, fine_after) <= intervals * limit)
@@ -333,13 +333,9 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     return static[corners.segmentation.labels]
 
 
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths (n,) of vectors (n, 2)."""
-    squares = vectors * vectors
-    return np.sqrt(squares[:, 0] + squares[:, 1])
-
-
-def _pixels_of_level(pixels: NDArray[np.number], level: Level, other: Level) -> NDArray[np.int64]:
+def _pixels_of_level(
+    pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level
+) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)

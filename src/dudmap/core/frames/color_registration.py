@@ -28,10 +28,8 @@ def color_projection(calibration: Calibration, twist: NDArray[np.float64], offse
     The motion T exp(-tau xi) X is expanded to the second order in tau: with a = v + omega x X it is
     T X - tau R a + tau^2 / 2 R (omega x a). At 3 rad/s and 30 ms the third order is below 0.1 pixels.
 
-    Args:
-        calibration: Geometry and timing.
-        twist: (6,) motion of the depth camera per second, its own axes.
-        offset: Time stamp of the colour image minus that of the depth image, s.
+    ``twist`` (6,) is the motion of the depth camera per second, its own axes, ``offset`` the time stamp of the colour
+    image minus that of the depth image, s.
     """
     T, R, W = calibration.T_color_depth, calibration.T_color_depth[:3, :3], hat(twist[3:])
     speed = np.column_stack([W, twist[:3]])
@@ -72,11 +70,7 @@ def register_color(
 
     Occlusion is not resolved: a surface that only the depth camera sees has the colour of what hides it.
 
-    Args:
-        color: (h, w[, 3]) uint8 or float32 as the colour camera recorded it.
-        depth: (H, W) float32, metres, 0 = none.
-        camera: Of the depth image, without distortion.
-        projection: Of ``color_projection``.
+    ``color`` (h, w[, 3]) is as the colour camera recorded it, ``depth`` (H, W) without distortion, metres, 0 = none.
     """
     import cv2
 

@@ -43,7 +43,7 @@ class Observation:
     @cached_property
     def num_readings(self) -> int:
         """Number of pixels with a depth."""
-        return np.count_nonzero(self.readings)
+        return int(np.count_nonzero(self.readings))
 
     @property
     def as_recorded(self) -> Frame:
@@ -63,7 +63,7 @@ class Level:
     @cached_property
     def num_readings(self) -> int:
         """Number of pixels with a depth."""
-        return np.count_nonzero(self.depth)
+        return int(np.count_nonzero(self.depth))
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:

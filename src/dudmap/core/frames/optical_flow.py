@@ -1,10 +1,13 @@
 """Corners and their sparse optical flow between two images (Lucas and Kanade 1981)."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.observation import Level
 
+Number = TypeVar("Number", np.float32, np.float64)
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
 SIMILAR = 1.5
@@ -25,6 +28,12 @@ def grey(level: Level) -> NDArray[np.uint8]:
 def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
     """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
+
+
+def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
+    """Lengths (n,) of vectors (n, 2)."""
+    squares = vectors * vectors
+    return np.sqrt(squares[:, 0] + squares[:, 1])
 
 
 def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -58,14 +67,8 @@ def lucas_kanade(
     window: int,
     halvings: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """Pyramidal Lucas-Kanade flow.
-
-    Args:
-        first, second: (h, w) uint8 images.
-        pixels: (n, 2) positions u, v in the first image.
-        guess: (n, 2) positions in the second image that the search starts from.
-        window: Edge of the matched window, pixels.
-        halvings: Halved copies of the images that are searched before the images themselves; 0 searches these alone.
+    """Pyramidal Lucas-Kanade flow of pixels (n, 2) u, v of the first image (h, w), searched from a guess (n, 2) with a
+    window of so many pixels, in copies of the images halved up to ``halvings`` times before the images themselves.
 
     Returns:
         Positions (n, 2) in the second image, arbitrary where not found; whether each was found (n,); mean absolute
@@ -109,7 +112,7 @@ def track_forward_backward(
     positions, found, difference = lucas_kanade(first, second, pixels, expected, window, 3)
     back, found_back, _ = lucas_kanade(second, first, positions, pixels, window, 0)
     good = found & found_back
-    error = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1)
+    error = lengths(back[good] - pixels[good].astype(np.float32))
     good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
     return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64), good
 
@@ -127,15 +130,11 @@ def consistent_with_static(
     The coarse levels of the search see more than the window and may follow a nearer surface, and textures repeat.
     Therefore the search is repeated from the position of a static point, at full resolution alone.
 
-    Args:
-        first, second: (h, w) uint8 images.
-        pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) positions in the second if the points are static.
-        allowed: (n,) largest distance of a match from there, pixels.
-        difference: (n,) mean differences of the grey values of the windows of the matches found elsewhere.
+    ``expected`` (n, 2) are these positions, ``allowed`` (n,) the largest distances of a match from there, pixels, and
+    ``difference`` (n,) those of ``lucas_kanade`` for the matches found elsewhere.
     """
     guess = expected.astype(np.float32)
     positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)
-    near = np.linalg.norm((positions - guess)[static], axis=1) < allowed[static]
+    near = lengths((positions - guess)[static]) < allowed[static]
     static[static] = near & (other[static] <= SIMILAR * difference[static])
     return static

@@ -27,16 +27,12 @@ class Preprocessor:
     """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
     The bilateral filter is separable (columns, then rows), which the exact one is not. Measured on 640x480 readings of
-    two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm
-    on a desk at 1 m; error against the temporal mean of a fixed camera's static pixels, over squared depth: median
-    1.52 against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
+    two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm on
+    a desk at 1 m; error against the temporal mean of a fixed camera's static pixels, over squared depth: median 1.52
+    against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
 
-    Args:
-        camera: Camera of the depth images, and of the colour images without ``calibration``.
-        config: Limits and filter parameters.
-        calibration: Of the colour camera; None for colour that is registered to depth. Colours that were not taken
-            together with the depth are left as they were recorded, scaled to the size of the depth image, to those who
-            know the motion.
+    The camera is that of the depth images, and of the colour images without a ``calibration``. Colours that were not
+    taken together with the depth are left as they were recorded, scaled to the size of the depth image.
     """
 
     def __init__(

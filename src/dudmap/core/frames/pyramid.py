@@ -18,12 +18,8 @@ HALVING_BAND = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Image pyramid of an observation; each level is the camera's image halved several times.
-
-    Attributes:
-        tracked: Levels of the registration, coarse to fine.
-        labelled: Level of the dynamic labels.
-    """
+    """Image pyramid of an observation, each level the camera's image halved several times: those of the registration,
+    coarse to fine, and that of the dynamic labels."""
 
     tracked: list[Level]
     labelled: Level

@@ -35,12 +35,8 @@ Repeats = Literal["", "frame", "depth", "color"]
 
 
 class Rejection(NamedTuple):
-    """Why a frame is not used.
-
-    Attributes:
-        kind: Key under which it is counted: ``duplicate``, ``order``, ``burst``, ``clock`` or ``unit``.
-        reason: Sentence.
-    """
+    """Why a frame is not used: the key under which it is counted (``duplicate``, ``order``, ``burst``, ``clock`` or
+    ``unit``), and a sentence."""
 
     kind: str
     reason: str
@@ -57,13 +53,8 @@ class StreamCheck:
     unit that changes multiplies all depths by one factor from one image to the next, faster than the fastest camera
     explains; frames are then rejected until the factor is taken back.
 
-    Args:
-        max_speed: Largest speed of the camera, m/s.
-
-    Attributes:
-        clock_offset: What is added to the stamps of the stream since its clock was set back, seconds.
-        repeats: What the last frame judged repeats of the frame before: the whole ``frame``, its ``depth`` or its
-            ``color`` alone; empty for nothing.
+    ``max_speed`` is the largest speed of the camera, m/s; ``clock_offset`` what is added to the stamps of the stream
+    since its clock was set back, s; ``repeats`` what the last frame judged repeats of the frame before.
     """
 
     def __init__(self, max_speed: float) -> None:
@@ -89,7 +80,8 @@ class StreamCheck:
 
         A frame that is used because the clock was found to be set changes ``clock_offset``: it is to be restamped.
         """
-        self.repeats = self._compare_with_last(observation)
+        before, self._before = self._before, (observation.depth, observation.as_recorded.color)
+        self.repeats = "" if before is None else repeated(before, self._before)
         return self._wrong_stamp(observation.timestamp) or self._changed_unit(observation)
 
     # -- stamps --------------------------------------------------------------------------------------------------------
@@ -137,11 +129,6 @@ class StreamCheck:
         return statistics.median(self._intervals) if self._intervals else 0.0
 
     # -- images --------------------------------------------------------------------------------------------------------
-
-    def _compare_with_last(self, observation: Observation) -> Repeats:
-        """What a frame repeats of the last one that arrived."""
-        before, self._before = self._before, (observation.depth, observation.as_recorded.color)
-        return "" if before is None else repeated(before, self._before)
 
     def _changed_unit(self, observation: Observation) -> Rejection | None:
         depth, stamp = observation.depth[::STRIDE, ::STRIDE].copy(), observation.timestamp

@@ -23,11 +23,9 @@ def rigid_ransac(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Rigid motion T_a_b that the most pairs of points agree with (RANSAC); the same input gives the same answer.
 
-    Args:
-        a, b: (m, 3) the same points in two frames, metres.
-        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of an inlier, metres.
-        inlier_share: Smallest share w of inliers at which the motion is to be found, at least 0.1. It gives the number
-            of samples of three pairs, ``log(1 - p) / log(1 - w^3)`` for a success with probability p.
+    ``a`` and ``b`` (m, 3) are the same points in two frames, ``tolerance`` (m,) is the largest distance between ``a``
+    and ``T_a_b b`` of an inlier, metres. ``inlier_share`` is the smallest share w of inliers at which the motion is to
+    be found, at least 0.1; with a probability p that takes ``log(1 - p) / log(1 - w^3)`` samples of three pairs.
 
     Returns:
         T_a_b (4, 4), the least-squares fit to all inliers, and the inliers (m,) bool. If no motion was found the

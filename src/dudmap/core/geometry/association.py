@@ -113,13 +113,7 @@ def associate(
 ) -> list[tuple[int, int]]:
     """One-to-one pairs of nearest times, chosen greedily by increasing time difference.
 
-    Args:
-        first: (N,) increasing times, seconds.
-        second: (M,) increasing times, seconds.
-        largest_gap: Largest time difference of a pair, seconds.
-
-    Returns:
-        Index pairs (into first, into second), in the order of ``second``.
+    Returns indices into the increasing times (N,) and (M,), seconds, in the order of ``second``.
     """
     candidates = []
     starts = np.searchsorted(first, second - largest_gap, side="left")

@@ -13,15 +13,8 @@ much again for the pixels of one camera that lie between those of the other."""
 
 
 class Lens:
-    """Geometry of the recorded images of a camera.
-
-    Args:
-        camera: With its distortion.
-
-    Attributes:
-        camera: As given.
-        straight: The same camera without distortion, which rendered images have.
-    """
+    """Geometry of the recorded images of a camera; ``straight`` is the same camera without distortion, which rendered
+    images have."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -57,10 +50,8 @@ class Lens:
         if self.camera.distortion:
             import cv2
 
-            none = np.zeros(3)
-            uv = cv2.projectPoints(points, none, none, self.camera.K, np.array(self.camera.distortion))[0].reshape(
-                -1, 2
-            )
+            lens = np.array(self.camera.distortion)
+            uv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.camera.K, lens)[0].reshape(-1, 2)
         else:
             uv = self.camera.project(points)
         uv = np.where((z > 0)[:, None] & np.isfinite(uv), uv, -1)
@@ -68,12 +59,7 @@ class Lens:
 
 
 class OtherView:
-    """From the depth camera to a second camera.
-
-    Args:
-        depth_lens: The depth camera.
-        color_lens: The second camera.
-    """
+    """From the depth camera to a second camera."""
 
     def __init__(self, depth_lens: Lens, color_lens: Lens) -> None:
         self.depth_lens, self.color_lens = depth_lens, color_lens
@@ -81,12 +67,8 @@ class OtherView:
         self._spread = max(1, int(np.ceil(max(other.fx / one.fx, other.fy / one.fy))))
 
     def depth(self, depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (h, w), metres along the axis of the second camera, 0 where no reading falls.
-
-        Args:
-            depth: (H, W) of the depth camera, metres, 0 = no reading.
-            T_color_depth: (4, 4) points of the depth camera to the second camera, each at its own time.
-        """
+        """Depth (h, w), metres along the axis of the second camera, of a depth image (H, W); 0 where no reading falls.
+        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera, each at its own time."""
         rows, columns = np.nonzero(depth > 0)
         return self._splatted(rows, columns, depth[rows, columns], T_color_depth)
 

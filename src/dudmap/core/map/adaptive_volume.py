@@ -27,13 +27,11 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood, two_levels
 from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
-from dudmap.core.map.map_file import MapContent
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.refinement import prolonged, refine
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
-from dudmap.errors import MapError
 
 BAND = 64
 """Blocks of one band."""
@@ -52,29 +50,13 @@ def make_volume(
     return kind(camera, config, sensor, depth_max, backend, max_blocks)
 
 
-def volume_of(content: MapContent) -> TsdfVolume:
-    """The map of a map file.
-
-    Raises:
-        MapError: Its levels of smaller voxels do not fit its configuration or each other.
-    """
-    volume = make_volume(content.camera, content.config, content.sensor, content.depth_max)
-    volume.blocks = content.blocks
-    if isinstance(volume, AdaptiveVolume):
-        volume.restore_levels(content.levels)
-    elif content.levels:
-        raise MapError("the map is damaged: it has smaller voxels, but its configuration says volume.adaptive=false")
-    return volume
-
-
 class AdaptiveVolume(TsdfVolume):
     """A map whose voxels are halved where the surface is curved or finely coloured and the sensor resolves it.
 
     Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
     mesh and views read the finest. See ``docs/adaptive.md``.
 
-    Attributes:
-        levels: The finer levels, that with the larger voxels first.
+    ``levels`` are the finer levels, that with the larger voxels first.
     """
 
     levels: Sequence[FineBlocks]
@@ -131,8 +113,7 @@ class AdaptiveVolume(TsdfVolume):
     def _average_finer(
         self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
-        """Average an image into blocks of a finer level, and drop those that it shows to be empty; slots (m,) of all
-        these."""
+        """Average an image into blocks of a finer level and drop those seen to be empty; slots (m,) of all these."""
         if len(candidates) == 0:
             return candidates
         level, number = self.levels[n], self._frame_number
@@ -194,30 +175,7 @@ class AdaptiveVolume(TsdfVolume):
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
     ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
-        parameters = self._mesh_parameters(min_weight)
-        meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
-        return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
-
-    # -- files -------------------------------------------------------------------------------------------------------
-
-    def restore_levels(self, levels: list[VoxelBlocks]) -> None:
-        """Take over the finer blocks of a map file, level by level.
-
-        Raises:
-            MapError: There are more levels than the configuration has, or a block has no parent.
-        """
-        if len(levels) > len(self.levels):
-            raise MapError(
-                f"the map is damaged: it has {len(levels)} levels of smaller voxels, its configuration allows "
-                f"{len(self.levels)}"
-            )
-        for number, blocks in enumerate(levels):
-            level, parents = self.levels[number], self._coarser[number]
-            level.blocks = blocks
-            if not np.all(level.link(parents)):
-                raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
-        for level, parents in zip(self.levels, self._coarser, strict=True):
-            level.make_room(parents)
+        return extract_groups(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))
 
 
 def extract_groups(
@@ -227,21 +185,10 @@ def extract_groups(
     groups: NDArray[np.integer],
     parameters: MeshParameters,
 ) -> list[Mesh]:
-    """Meshes of groups of blocks that share no vertices.
-
-    Args:
-        blocks: Blocks of the coarsest level.
-        levels: The finer levels, at most two.
-        slots: (n,) int32, the blocks to mesh and all blocks that touch one of them; each once.
-        groups: (n,) int group of each block, counted from 0; -1 for blocks that only lend their voxels.
-        parameters: Of the extraction, for the coarsest level.
-
-    Returns:
-        The mesh of each group; no vertex occurs twice in one, or without a triangle.
-    """
+    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are those of the coarsest level."""
     number = int(groups.max(initial=-1)) + 1
     if len(slots) == 0:
-        return []
+        return [joined([])] * number
     keys, places, colors, polygons, rows = _contours(blocks, levels, slots, groups >= 0, parameters)
     corners = np.searchsorted(keys, polygons).astype(np.int32)
     vertices = np.ascontiguousarray(places[:, :3])

@@ -4,7 +4,7 @@ The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Nie
 """
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import product
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dudmap.core.map import morton
 from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
-from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, VoxelBlocks, blobs_of, records_of
+from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.scratch_store import ScratchStore
 
 REGION_BITS = 4
@@ -33,8 +33,8 @@ Region = tuple[int, int, int]
 
 
 class Away(NamedTuple):
-    """What is known of a region in the store: a number that is another for each content, and the numbers of its blocks,
-    of those among them that own voxels, and of the finer blocks inside these."""
+    """A region in the store: a number that is another for each content, and the numbers of its blocks, of those among
+    them that own voxels, and of the finer blocks inside these."""
 
     serial: int
     blocks: int
@@ -48,13 +48,9 @@ class BlockPager:
     A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are.
     Regions are written and read ahead by one background thread, in the order in which that was asked for.
 
-    Args:
-        max_blocks: Largest number of blocks with voxels in memory, of all levels. Blocks within the view stay, even if
-            they are more. Either a number, or a limit that is asked each time.
-
-    Attributes:
-        failure: Why the store could not be written the last time it was tried; empty if it could. The regions are then
-            back in memory, and nothing is lost.
+    ``max_blocks`` is the largest number of blocks with voxels in memory, of all levels, or a limit that is asked each
+    time; blocks within the view stay, even if they are more. ``failure`` says why the store could not be written the
+    last time it was tried (empty if it could): the regions are then back in memory, and nothing is lost.
     """
 
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
@@ -78,12 +74,6 @@ class BlockPager:
         self._archive: Callable[[Region], BlockRecords] | None = None
         self._middle = np.zeros(3)
         self._retry_in = 0
-
-    def new_blocks(self) -> VoxelBlocks:
-        """Empty blocks, with room for as many as will be in memory."""
-        if isinstance(self.max_blocks, int):
-            return VoxelBlocks()
-        return VoxelBlocks(self.max_blocks.capacity(VoxelBlocks()))
 
     @property
     def num_blocks(self) -> int:
@@ -126,16 +116,10 @@ class BlockPager:
         """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
 
         Regions farther away leave if there are too many blocks, and those in the direction of motion are read ahead.
-
-        Args:
-            tree: Blocks of the map; changed here. Entries are numbered anew.
-            low, high: Block coordinates.
-            frame_number: Number of frames that were integrated.
+        Entries of the blocks in memory are numbered anew.
         """
-        first, last = (
-            (low.astype(np.int64) - MARGIN) >> REGION_BITS,
-            (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS,
-        )
+        first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
+        last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
         self._settle(tree, frame_number)
         wanted = self._stored_in(first, last) if self._away else []
         self._make_room(tree, first, last, frame_number, wanted)
@@ -186,12 +170,7 @@ class BlockPager:
         self._stored.write(str(region), [blob for level in blobs_of(records) for blob in level])
 
     def _make_room(
-        self,
-        tree: BlockTree,
-        first: NDArray[np.integer],
-        last: NDArray[np.integer],
-        frame_number: int,
-        coming: Sequence[Region],
+        self, tree: BlockTree, first: NDArray[np.integer], last: NDArray[np.integer], number: int, coming: list[Region]
     ) -> None:
         """Move the regions farthest from the box to the store while there are too many blocks with those that come.
 
@@ -215,8 +194,8 @@ class BlockPager:
             leaving[n] = True
             needed -= owned[n]
         if leaving.any():
-            self._send_all_away(tree, keys, region_of, leaving, frame_number)
-            tree.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
+            self._send_all_away(tree, keys, region_of, leaving, number)
+            tree.remove(np.flatnonzero(leaving[region_of]), number + 1)
 
     def page_out(self, tree: BlockTree, frame_number: int) -> None:
         """Move all regions to the store; empty blocks must take the place of those of ``tree``."""

@@ -20,12 +20,9 @@ where 32-bit numbers are spaced by 15 micrometres. The first is that of the map.
 class BlockWindow:
     """Dense copy of the hash table, which stays the authoritative index, around the view.
 
-    Args:
-        block_size: Edge of a block, metres.
-        cells: Least number of blocks along each edge.
-
     Attributes:
-        shape: (3,) int64, blocks along each axis.
+        block_size: Edge of a block, metres.
+        shape: (3,) int64, blocks along each axis, at least the ``cells`` asked for.
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
         mirror: ``cells`` for back ends, which may hold a copy on a device.
         stamps: Like ``cells``, number of the frame whose truncation band last touched a block.

@@ -23,13 +23,8 @@ NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for 
 class FineBlocks:
     """One level of refinement. A block covers one octant of its parent, a block of the next coarser level.
 
-    Args:
-        voxel_size: Edge of a voxel of this level, metres.
-        blocks: Empty blocks to use; None makes some.
-        finer: The next finer level.
-
     Attributes:
-        voxel_size: See above.
+        voxel_size: Edge of a voxel of this level, metres.
         blocks: Blocks of this level; their coordinates are in units of their own size.
         children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
         parents: (slots,) int32 slot of the parent of each block.
@@ -98,13 +93,10 @@ class FineBlocks:
     def take_colors(
         self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
     ) -> None:
-        """Give blocks (n,) the colours and intensities that they have in another map.
+        """Give blocks (n,) the colours and intensities that they have in this level of another map.
 
-        Args:
-            slots: The blocks.
-            other: This level of the other map.
-            interpolated: (n, 512) each, voxels and colours that the coarser level has there: where the other map is not
-                refined, or has no colour, these count.
+        Where that is not refined, or has no colour, the ``interpolated`` voxels and colours (n, 512) of the coarser
+        level count.
         """
         blocks, (voxels, colors) = self.blocks, interpolated
         there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
@@ -124,11 +116,7 @@ class FineBlocks:
         return found[found >= 0]
 
     def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
-        """Find the parents of all blocks anew, by coordinates.
-
-        Returns:
-            (n,) whether each of the active slots has a parent.
-        """
+        """Find the parents of all blocks anew, by coordinates; whether each of the active slots (n,) has one."""
         self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
@@ -153,11 +141,7 @@ class FineBlocks:
 class BlockTree:
     """Blocks of the coarsest level together with the finer ones that lie in them, for ``BlockPager``.
 
-    Entries are those of the coarsest level; slots and memory count for all levels.
-
-    Args:
-        blocks: The coarsest level.
-        levels: The finer ones, that with the larger voxels first.
+    Entries are those of the coarsest level; slots and memory count for all levels, that with the larger voxels first.
     """
 
     def __init__(self, blocks: VoxelBlocks, levels: Sequence[FineBlocks]) -> None:

@@ -19,12 +19,8 @@ class IncrementalMesh:
     ``TsdfVolume.extract_mesh``, with duplicate vertices where chunks meet.
     Updates and ``integrate`` must not run at the same time.
 
-    Args:
-        volume: The map.
-
-    Attributes:
-        chunks: Mesh of every chunk that has a surface, by its coordinates: chunk (i, j, k) begins at ``4 i``, ``4 j``,
-            ``4 k`` blocks.
+    ``chunks`` are the meshes by the coordinates of their chunk, of those that have a surface: chunk (i, j, k) begins at
+    ``4 i``, ``4 j``, ``4 k`` blocks.
     """
 
     def __init__(self, volume: TsdfVolume) -> None:

@@ -3,7 +3,7 @@
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -19,19 +19,10 @@ if TYPE_CHECKING:
     from dudmap.core.map.volume import TsdfVolume
 
 FORMAT = "dudmap map 1"
+VOXELS = "geometry", "colors"
+"""Arrays of the voxels (n, 512) of a level."""
 LARGEST_DEPTH = 1000.0
 """Largest range of depth of a map file, metres; the steps of a raycast grow with it. Depth cameras reach 100 m."""
-
-
-class MapContent(NamedTuple):
-    """Content of a map file; see ``TsdfVolume``."""
-
-    camera: Camera
-    config: VolumeConfig
-    sensor: SensorConfig
-    depth_max: float
-    blocks: VoxelBlocks
-    levels: list[VoxelBlocks]
 
 
 def write_map(path: str | Path, volume: "TsdfVolume") -> None:
@@ -67,12 +58,12 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
             for name, value in small.items():
                 array = np.asanyarray(value)
                 _write_array(archive, name, array.dtype, array.shape, iter([array]))
-            for name in ("geometry", "colors"):
+            for name in VOXELS:
                 _write_array(archive, name, np.int32, shape, (getattr(part, name) for part in volume.records()))
             for n, level in enumerate(finer):
                 places = np.concatenate(level)
                 _write_array(archive, f"slot_coords{n + 1}", np.int32, places.shape, iter([places]))
-                for name in ("geometry", "colors"):
+                for name in VOXELS:
                     parts = (getattr(part.finer[n], name) for part in volume.records() if n < len(part.finer))
                     _write_array(archive, f"{name}{n + 1}", np.int32, (len(places), BLOCK**3), parts)
     except OSError as error:
@@ -90,23 +81,35 @@ def _write_array(
             member.write(np.ascontiguousarray(part).data)
 
 
-def read_map(path: str | Path) -> MapContent:
+def read_map(path: str | Path) -> "TsdfVolume":
     """Read a map that ``write_map`` wrote.
 
     Raises:
         MapError: The file is missing, damaged or not a map of this version.
     """
+    from dudmap.core.map.adaptive_volume import make_volume
+
     try:
         with open_arrays(path) as data:
-            return MapContent(
-                *read_parameters(data, path),
-                VoxelBlocks.restored(
-                    data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
-                ),
-                _read_levels(data),
-            )
+            parameters = read_parameters(data, path)
+            blocks = VoxelBlocks.restored(*(data[name] for name in ("coords", "free_count", "entries", *VOXELS)))
+            finer = _read_levels(data)
     except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error
+    volume = make_volume(*parameters)
+    volume.blocks = blocks
+    if len(finer) > len(volume.levels):
+        raise MapError(
+            f"the map is damaged: it has {len(finer)} levels of smaller voxels, its configuration allows "
+            f"{len(volume.levels)}"
+        )
+    for number, level in enumerate(volume.levels[: len(finer)]):
+        level.blocks = finer[number]
+        if not np.all(level.link(volume.all_blocks.parents[number])):  # which are those that were just read
+            raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
+    for level, parents in zip(volume.levels, volume.all_blocks.parents, strict=True):
+        level.make_room(parents)
+    return volume
 
 
 def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Camera, VolumeConfig, SensorConfig, float]:

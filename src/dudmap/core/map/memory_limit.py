@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 from dudmap.core.map.fine_blocks import BlockTree
-from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.errors import ConfigError
 
 SAFE_SHARE = 0.75
@@ -19,10 +18,8 @@ class MemoryLimit:
     """Memory limit of the process, shared by all its maps.
 
     What the program needs besides the voxels differs between cameras, configurations and platforms, so that it is
-    measured each time: the maps may have what the others leave. Which blocks are in memory changes no result.
-
-    Args:
-        limit: Largest resident memory of the process, bytes.
+    measured each time: the maps may have what is left of ``limit`` bytes of resident memory. Which blocks are in memory
+    changes no result.
 
     Raises:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.
@@ -44,10 +41,6 @@ class MemoryLimit:
             spare = SAFE_SHARE * self.limit - resident_bytes()
         # released slots are resident too; a finer block has no more than its links besides, one in a hundred
         return tree.num_slots + int(spare / tree.blocks.slot_bytes)
-
-    def capacity(self, blocks: VoxelBlocks) -> int:
-        """Number of slots to provide at the start, so that the arrays need not be copied while they grow."""
-        return int(self.limit / blocks.slot_bytes)
 
 
 def resident_bytes() -> int:

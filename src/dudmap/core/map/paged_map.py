@@ -9,6 +9,7 @@ from dudmap.config import VolumeConfig
 from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import BlockTree, FineBlocks
+from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
 
 
@@ -42,12 +43,7 @@ class PagedMap:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
-        hash table.
-
-        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
-        is the window, whose size depends on the view and the voxels, not on the map.
-        """
+        """Memory of the map as of ``VoxelBlocks.num_bytes``; the size of the window depends on the view alone."""
         return self.blocks.num_bytes
 
     @property
@@ -65,8 +61,9 @@ class PagedMap:
         return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
-        """Empty blocks, with room for as many as will be in memory."""
-        return VoxelBlocks() if self.pager is None else self.pager.new_blocks()
+        """Empty blocks; below a memory limit with room for all that fit, so that growing does not copy them."""
+        blocks, limit = VoxelBlocks(), None if self.pager is None else self.pager.max_blocks
+        return VoxelBlocks(limit.limit // blocks.slot_bytes) if isinstance(limit, MemoryLimit) else blocks
 
     def _empty(self) -> None:
         """Have no blocks and no window in memory."""
@@ -124,8 +121,7 @@ class PagedMap:
         self._frame_number = number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
-        """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one, as frame
-        ``number``."""
+        """Replace the colours of a level (0 = coarsest) within blocks (n,) of the coarsest one, as frame ``number``."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)
 

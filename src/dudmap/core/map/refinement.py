@@ -36,20 +36,10 @@ def refine(
     sensor: SensorConfig,
     coarser: FusionParameters,
 ) -> NDArray[np.int32]:
-    """Open and drop the blocks of a level in those of the coarser level that a frame was fused into.
+    """Open and drop the blocks of a level in those of the coarser level (slots (n,)) that a frame was fused into.
 
-    Args:
-        level: Blocks of this level, changed here.
-        parents: Those of the coarser one.
-        slots: (n,) int32 slots of the parents.
-        depths: (n,) depth of their centres in the view, metres.
-        number: Number of the frame.
-        config: Thresholds.
-        sensor: Noise of the readings.
-        coarser: Parameters of the coarser level.
-
-    Returns:
-        (m,) int32 slots of the parents whose children changed.
+    ``depths`` (n,) are those of the centres of these blocks in the view, metres, ``coarser`` the parameters of their
+    level. Returns the slots (m,) of the blocks whose children changed.
     """
     unit, saturated = coarser.sdf_unit / coarser.voxel_size, float(SATURATED * coarser.band.front / coarser.voxel_size)
     sigma = sensor.sigma(depths)
@@ -102,6 +92,6 @@ def prolonged(
 
 
 def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers (n,) that spread the examinations of blocks over the frames; of their place alone, so that it does not
-    matter when blocks came into memory. Along each axis all remainders by ``PERIOD`` follow each other."""
+    """Numbers (n,) that spread the examinations of blocks over the frames, by their place alone, so that it does not
+    matter when they came into memory. Along each axis all remainders by ``PERIOD`` follow each other."""
     return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import meshing
+from dudmap.core.backends.cpu import meshing, raycasting
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.fusion import reading_weights
 from dudmap.core.backends.parameters import (
@@ -95,11 +95,8 @@ class TsdfVolume(PagedMap):
         self.depth_max = depth_max
         self.backend: Backend = backend or CpuBackend()
         self.parameters = fusion_parameters(self.config, self.sensor, depth_max)
-        self.voxel_size, self.sdf_unit, self.band = (
-            self.config.voxel_size,
-            self.parameters.sdf_unit,
-            self.parameters.band,
-        )
+        self.voxel_size = self.config.voxel_size
+        self.sdf_unit, self.band = self.parameters.sdf_unit, self.parameters.band
         self.block_size = BLOCK * self.voxel_size
         self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
@@ -190,12 +187,6 @@ class TsdfVolume(PagedMap):
             window.set_free(empty, blocks, count)
         return slots, touched
 
-    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
-        """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
-        if self.config.weighting == "constant":
-            return np.ones(depth.shape, dtype=np.uint8)
-        return reading_weights(depth, camera.intrinsics, self.band.noise)
-
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
@@ -261,16 +252,11 @@ class TsdfVolume(PagedMap):
     def known_share(
         self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share of the information on the surface at each reading (h, w) that the map has without it.
+        """Share of the information on the surface at each reading (h, w) of a camera that the map has without it.
 
         Weights are information: the running average of readings of weight g has the variance 1 / w where w is the sum
         of their weights (eq. 4.19), and one more reading brings it to 1 / (w + g). The share is w / (w + g), n / (n +
         1) after n equal readings; 0 where the map has no surface or there is no reading.
-
-        Args:
-            depth: (h, w) float32, metres, 0 = none.
-            camera: Its camera.
-            T_world_camera: (4, 4).
         """
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
@@ -280,7 +266,8 @@ class TsdfVolume(PagedMap):
         words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        gains = self._reading_weights(depth, camera)
+        constant = self.config.weighting == "constant"
+        gains = np.ones(depth.shape) if constant else reading_weights(depth, camera.intrinsics, self.band.noise)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
@@ -298,7 +285,7 @@ class TsdfVolume(PagedMap):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return self.backend.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
+        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
@@ -340,10 +327,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        Args:
-            slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
-            chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
-            min_weight: As of ``extract_mesh``.
+        ``slots`` (n,) are the blocks to mesh and all that touch one of them, ``chunks`` (n,) the group of each, counted
+        from 0; -1 for blocks that only lend their voxels.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbours(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(
@@ -367,6 +352,4 @@ class TsdfVolume(PagedMap):
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        from dudmap.core.map.adaptive_volume import volume_of
-
-        return volume_of(read_map(path))
+        return read_map(path)

@@ -18,11 +18,8 @@ class VolumeMirror:
 
     ``update`` runs in the thread that changes the volume; between two updates any thread may read the copy.
 
-    Args:
-        volume: The volume to follow.
-
-    Attributes:
-        volume: The copy; for reading only (``extract_mesh``, ``IncrementalMesh``). Its frames count the updates.
+    ``update`` runs in the thread that changes the volume; between two updates any thread may read its copy ``volume``
+    (``extract_mesh``, ``IncrementalMesh``), whose frames count the updates.
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
@@ -38,12 +35,8 @@ class VolumeMirror:
         self._copied = [np.zeros(0, dtype=np.int32) for _ in range(levels)]  # frame up to which each slot was copied
 
     def update(self, limit: int | None = None) -> None:
-        """Take over what was integrated since the last update.
-
-        Args:
-            limit: Number of blocks of the coarsest level to copy at most, those copied longest ago first; the others
-                keep an earlier state. None copies all.
-        """
+        """Take over what was integrated since the last update; at most ``limit`` blocks of the coarsest level, those
+        copied longest ago first: the others keep an earlier state. None copies all."""
         if self._source.map_id != self.volume.map_id:  # the map was cleared
             self._start()
         source, target = self._source.blocks, self.volume.blocks

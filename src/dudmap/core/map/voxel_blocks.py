@@ -56,24 +56,18 @@ class VoxelBlocks:
     """The map's content, block by block.
 
     An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
-    than their content and grow by factors.
-
-    Args:
-        slots: Number of slots to provide at the start. Those that are not used take no memory.
+    than their content and grow by factors; ``slots`` are provided at the start, and take no memory while they are not
+    used.
 
     Attributes:
         table: Hash table of entry numbers (``core/backends/cpu/hashing.py``).
-        coords: (entries, 3) int32 block coordinates.
-        slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
-        free_count: (entries,) uint8 observations of emptiness.
-        num_entries: Number of entries.
+        coords, slot_of, free_count: Of each of the ``num_entries`` entries: (3,) int32 block coordinates, int32 slot,
+            -1 = no voxels, and uint8 observations of emptiness.
         geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
         geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
-        entry_of: (slots,) int32 entry of each slot, -1 = unused.
-        slot_coords: (slots, 3) int32 block coordinates by slot.
-        written: (slots,) int32 number of the frame that last wrote to a slot.
-        fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
-        num_slots: Number of slots in use or released.
+        entry_of, slot_coords, written, fused: Of each of the ``num_slots`` slots in use or released: int32 entry, -1 =
+            unused, (3,) int32 block coordinates, int32 number of the frame that last wrote to it, and uint8 frames that
+            were fused into it, 255 or more.
     """
 
     def __init__(self, slots: int = 1 << 10) -> None:
@@ -299,16 +293,10 @@ class VoxelBlocks:
             ValueError: The arrays do not belong together, or a block is there twice.
         """
         _check_restored(coords, free_count, entries, geometry, colors)
-        blocks, n, m = cls(), len(coords), len(entries)
-        blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
-        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int32), free_count.copy(), n
-        hashing.rebuild(blocks.table, blocks.coords, n)
-        blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
-        blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
-        blocks.written = np.zeros(m, np.int32)
-        blocks.fused = np.zeros(m, np.uint8)
-        blocks.slot_of = np.full(n, -1, dtype=np.int32)
-        blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
+        blocks = cls(len(entries))
+        blocks.table = np.full(max(1 << 14, 2 * len(coords)), hashing.EMPTY, dtype=np.int32)
+        fused = np.zeros(len(entries), np.uint8)
+        blocks.insert(BlockRecords(coords, free_count, entries, geometry, colors, fused), frame_number=0)
         return blocks
 
 

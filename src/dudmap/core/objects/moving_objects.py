@@ -34,8 +34,7 @@ class _Frame:
 class MovingObjects:
     """Tracks the objects that the labels show to move; nothing here influences the camera's pose or the map.
 
-    Args:
-        config: ``movers`` switches tracking and fusion on and off.
+    ``movers`` of the configuration switches tracking and fusion on and off.
     """
 
     def __init__(self, config: Config) -> None:

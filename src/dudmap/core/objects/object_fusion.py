@@ -54,13 +54,8 @@ RIM = 0.05
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """Object in a frame.
-
-    Attributes:
-        levels: Pyramid of the crop around the object, coarse to fine.
-        weights: Per level, (h, w) float32, 1 where a pixel shows the object, else 0.
-        color: (h, w, 3) uint8, colours of the finest level.
-    """
+    """Object in a frame: the pyramid of the crop around it, coarse to fine; per level (h, w) float32, 1 where a pixel
+    shows the object, else 0; and the colours (h, w, 3) of the finest level."""
 
     levels: list[Level]
     weights: list[NDArray[np.float32]]
@@ -81,14 +76,8 @@ class ObjectView:
 def crop_object(
     observation: Observation, mover: Mover, level: Level, exposure: tuple[float, float]
 ) -> ObjectView | None:
-    """Crop of a frame around an object, halved until at most MAX_PIXELS show it; None if the object is too small.
-
-    Args:
-        observation: The frame.
-        mover: The object.
-        level: The image that its mask belongs to.
-        exposure: Gain and offset of the frame's intensities.
-    """
+    """Crop of a frame around an object, halved until at most MAX_PIXELS show it; None if the object is too small. The
+    mask of the object belongs to ``level``; gain and offset are applied to the frame's intensities."""
     import cv2
 
     if np.count_nonzero(mover.mask) < MIN_PIXELS:
@@ -142,11 +131,7 @@ def _padded_range(indices: NDArray[np.int64], shortest: int, size: int) -> slice
 
 
 class ObjectFusion:
-    """Shape and trajectory of the moving objects of a sequence.
-
-    Args:
-        config: All parameters; those of tracker, sensor, preprocessing, volume and movers are used.
-    """
+    """Shape and trajectory of the moving objects of a sequence."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -169,11 +154,7 @@ class ObjectFusion:
         self._results: list[tuple[RigidObject, dict[float, NDArray[np.float64]]]] = []
 
     def objects(self, poses: dict[float, NDArray[np.float64]]) -> list[RigidObject]:
-        """All objects so far, by number.
-
-        Args:
-            poses: Poses T_world_camera (4, 4) by time, from which the trajectories of the objects follow.
-        """
+        """All objects so far, by number; their trajectories follow from camera poses (4, 4) by time."""
         out = []
         for result, Ts in self._results + [track.result() for track in self._tracks.values()]:
             if result.mesh is not None:
@@ -190,18 +171,10 @@ class ObjectFusion:
         T_world_camera: NDArray[np.float64],
         exposure: tuple[float, float],
     ) -> list[Mover]:
-        """Register and fuse the objects of a tracked frame.
+        """Register and fuse the objects of a tracked frame, whose masks belong to ``level``.
 
-        Args:
-            observation: The frame.
-            movers: Its moving objects.
-            level: The image that their masks belong to.
-            T_world_camera: (4, 4).
-            exposure: Gain and offset of the frame.
-
-        Returns:
-            The objects; those with a map have the velocity of its centre. That differs from the velocity of the visible
-            surface: of a rolling ball only the upper half may be in view, which is faster than the ball.
+        Those with a map have the velocity of its centre then. That differs from the velocity of the visible surface: of
+        a rolling ball only the upper half may be in view, which is faster than the ball.
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):

@@ -48,14 +48,7 @@ class RigidObject:
 
 
 class ObjectVolume(TsdfVolume):
-    """Map of an object: its window stays around the object's origin wherever the camera is.
-
-    Args:
-        camera: Any; ``camera`` is set to that of each image.
-        config: Voxel size, truncation, weights; an object's map is not carved.
-        sensor: Noise of the depth readings.
-        depth_max: Farthest reading, metres.
-    """
+    """Map of an object: its window stays around the object's origin wherever the camera is; it is not carved."""
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
         super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, extent=EXTENT)
@@ -106,11 +99,8 @@ class ObjectTrack:
     restarts: tuple[str, ...] = ()
 
     def rejection_reason(self, *, final: bool = True) -> str:
-        """Why the object is not proven to be rigid; empty if it is.
-
-        Args:
-            final: Whether no more frames will come. Before that, only evidence against a rigid object is a reason.
-        """
+        """Why the object is not proven to be rigid, empty if it is; before the end (not ``final``) only evidence
+        against a rigid object is a reason."""
         frames, contradicting = self.registrations, len(self.misfits)
         if frames >= MIN_FRAMES and contradicting > MAX_MISFITS * frames:
             return f"not rigid: {contradicting} of {frames} frames do not fit, the last: {self.misfits[-1]}"

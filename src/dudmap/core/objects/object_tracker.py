@@ -63,15 +63,8 @@ class Mover:
 
 @dataclass(frozen=True, eq=False)
 class _Measurement:
-    """Measurement of an object's motion in one frame.
-
-    Attributes:
-        time: Seconds.
-        duration: Seconds since the object was last seen.
-        displacement: (3,) metres since then, by optical flow; None if unknown.
-        positions: (2, 3) metres: centroid, and centre of the box.
-        fully_visible: Whether nothing cuts the object off.
-    """
+    """Motion of an object in one frame, and the seconds since it was last seen: displacement (3,) since then by optical
+    flow (None if unknown), positions (2, 3) of its centroid and of the centre of its box, metres."""
 
     time: float
     duration: float
@@ -107,8 +100,6 @@ class ObjectTracker:
     displacements from frame to frame without outliers, each the median over the object's pixels, matched by
     forward-backward optical flow (Lucas and Kanade 1981).
 
-    Args:
-        config: Sizes and times.
     """
 
     def __init__(self, config: MoversConfig) -> None:
@@ -120,14 +111,7 @@ class ObjectTracker:
     def update(
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]
     ) -> list[Mover]:
-        """Moving objects of a tracked frame, by number.
-
-        Args:
-            timestamp: Seconds.
-            dynamic: (h, w) bool, moving pixels.
-            level: The image they were found in.
-            T_world_camera: (4, 4).
-        """
+        """Moving objects of a tracked frame, by number; ``dynamic`` (h, w) marks the moving pixels of ``level``."""
         self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= self.config.memory]
         predicted_ids = self._predicted_ids(timestamp, level.camera, T_world_camera)
         pixels = connected_regions(dynamic, level, T_world_camera, predicted_ids)

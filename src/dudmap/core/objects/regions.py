@@ -48,8 +48,7 @@ class Region:
         indices: (k,) int, which of the ``MovingPixels``.
         area: Visible surface, square metres.
         predicted_id: Most frequent predicted number, 0 = none.
-        sample: (m, 3) float32, some of its points, metres, world frame.
-        box: Smallest and largest coordinates of the sample, three of each.
+        sample: (m, 3) float32, some of its points, metres, world frame; ``box`` are their extreme coordinates.
     """
 
     indices: NDArray[np.int64]
@@ -80,14 +79,8 @@ class Region:
 def connected_regions(
     dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64], predicted_ids: NDArray[np.int32]
 ) -> MovingPixels | None:
-    """Moving pixels by region connected in the image and in depth; None if there is no region of some size.
-
-    Args:
-        dynamic: (h, w) bool, moving pixels.
-        level: The image they were found in.
-        T_world_camera: (4, 4).
-        predicted_ids: ((h + 1) // 2, (w + 1) // 2) int32, number of the object expected in each 2x2 block, 0 = none.
-    """
+    """Moving pixels (h, w) of an image by region connected in the image and in depth; None if there is no region of
+    some size. ``predicted_ids`` are the objects expected in each 2x2 block, 0 = none."""
     moving = dynamic & (level.depth > 0)
     if not moving.any():
         return None
@@ -123,13 +116,8 @@ def connected_regions(
 
 
 def split_between(pixels: MovingPixels, indices: NDArray[np.int64], ids: Collection[int]) -> list[NDArray[np.int64]]:
-    """Pixels (k,) of a region by object: each goes to that of the nearest pixel predicted to show one of them.
-
-    Args:
-        pixels: All moving pixels.
-        indices: (k,) the region's.
-        ids: Numbers of the objects that share it; each is predicted in some of its pixels.
-    """
+    """Pixels (k,) of a region by object: each goes to that of the nearest pixel predicted to show one of them. Each of
+    the objects ``ids`` is predicted in some pixels of the region."""
     import cv2
 
     predicted = pixels.predicted_id[indices]

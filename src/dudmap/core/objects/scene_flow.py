@@ -21,14 +21,8 @@ REFERENCE_WIDTH = 160
 
 @dataclass(frozen=True, eq=False)
 class InstanceFrame:
-    """Moving pixels of a frame with the object that each belongs to.
-
-    Attributes:
-        timestamp: Seconds.
-        grey: (h, w) uint8.
-        ids: (h, w) int32, number of the object in each pixel, 0 = none.
-        points: (h, w, 3) float32, metres, world frame, 0 where nothing moves.
-    """
+    """Moving pixels of a frame: grey image (h, w), number of the object (h, w) in each pixel, 0 = none, and point (h,
+    w, 3) float32, metres, world frame, 0 where nothing moves."""
 
     timestamp: float
     grey: NDArray[np.uint8]
@@ -39,16 +33,9 @@ class InstanceFrame:
 def displacements(
     last: InstanceFrame, now: InstanceFrame, known: Collection[int], max_jump: float
 ) -> dict[int, NDArray[np.float64]]:
-    """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow.
-
-    Args:
-        last, now: Two frames, of one size.
-        known: Numbers of the objects that are in both.
-        max_jump: Longer displacements of a pixel are mismatches, metres.
-
-    Returns:
-        Metres, world frame, by number; only objects with enough matched pixels.
-    """
+    """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame,
+    by number, of those ``known`` objects in both frames with enough matched pixels. Displacements of a pixel longer
+    than ``max_jump`` metres are mismatches."""
     import cv2
 
     ids = now.ids.astype(np.float32)
@@ -89,13 +76,7 @@ def displacements(
 def _interpolated(
     points: NDArray[np.float32], ids: NDArray[np.int32], pixels: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Bilinearly interpolated points (n, 3) at positions (n, 2) u, v; NaN where the four pixels show several objects.
-
-    Args:
-        points: (h, w, 3) metres.
-        ids: (h, w) object in each pixel.
-        pixels: (n, 2).
-    """
+    """Bilinearly interpolated points (n, 3) at pixels (n, 2); NaN where the four pixels show several objects."""
     h, w = points.shape[:2]
     u0 = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, w - 2)
     v0 = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, h - 2)

@@ -43,13 +43,9 @@ class TimedPose:
 class Atlas:
     """The submaps and everything whose pose changes when a submap is corrected or joined with another.
 
-    Args:
-        make_volume: Creates an empty map.
-        keyframes: Keyframes of all submaps.
-        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
-        number: Number of the first submap.
-
     Attributes:
+        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
+        keyframes: Of all submaps.
         volumes: Maps by the numbers of their submaps; while one is rebuilt, its provisional map.
         rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
         current: Number of the submap that is tracked.
@@ -85,14 +81,10 @@ class Atlas:
         *,
         keep_frames: bool,
     ) -> "Atlas":
-        """An atlas with one empty map.
+        """An atlas with one empty map, for frames of a camera without lens distortion.
 
-        Args:
-            config: All parameters.
-            camera: Of the frames, without lens distortion.
-            make_volume: Makes an empty map.
-            prior: Of the first pass over the same recording, whose keyframes are used; frames are not kept then.
-            keep_frames: Whether frames are kept for corrections, where the configuration needs them.
+        Frames are kept for corrections with ``keep_frames``, where the configuration needs them, and where no ``prior``
+        map of a first pass over the same recording, whose keyframes are used, replaces them.
         """
         if prior is not None:
             return cls(make_volume, prior.keyframes, None, prior.submap)
@@ -100,13 +92,8 @@ class Atlas:
         return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
     def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
-        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera.
-
-        Args:
-            saved: The map.
-            camera: The camera.
-            max_blocks: As of ``TsdfVolume``.
-        """
+        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera;
+        ``max_blocks`` as of ``TsdfVolume``."""
         self.saved = self.current
         self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend, max_blocks)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
@@ -126,12 +113,8 @@ class Atlas:
     ) -> None:
         """Fuse the static pixels of a frame into the current map, and keep the frame for later corrections.
 
-        Args:
-            frame: Depth and registered colour.
-            static_mask: (H, W) bool.
-            T_world_camera: (4, 4).
-            exposure: Gain and offset to the colours of the map.
-            recorded: The frame with its colour as it was recorded, which is kept; None for the same.
+        ``exposure`` are gain and offset to the colours of the map; what is kept is ``recorded``, the frame with its
+        colour as it was recorded (None for the same).
         """
         color = exposed_color(frame.color, exposure)
         self.volume.integrate(Frame(frame.timestamp, frame.depth, color), T_world_camera, static_mask)
@@ -141,10 +124,8 @@ class Atlas:
     def recolor(self, *, gradually: bool = False) -> None:
         """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
 
-        A saved map keeps its colours: not all its frames are stored.
-
-        Args:
-            gradually: Paint the current map over the frames to come, so that none of them has to wait.
+        A saved map keeps its colours: not all its frames are stored. ``gradually`` paints the current map over the
+        frames to come, so that none of them has to wait.
         """
         assert self.history is not None
         self.complete()
@@ -274,15 +255,12 @@ class Atlas:
         )
 
     def nodes(self, submap: int) -> list[int]:
-        """Numbers of the stored frames of a submap, in order of time, also of those whose images were removed: the
-        nodes of its pose graph."""
-        if self.history is None:
-            return []
-        return [n for n, number in enumerate(self.history.submaps) if number == submap]
+        """Numbers of the stored frames of a submap, see ``FrameStore.in_submap``."""
+        return [] if self.history is None else self.history.in_submap(submap)
 
     def kept_nodes(self, submap: int) -> list[int]:
         """Those of them whose images are kept."""
-        return [] if self.history is None else [n for n in self.history.kept if self.history.submaps[n] == submap]
+        return [] if self.history is None else self.history.kept_of(submap)
 
     def correct(
         self,
@@ -295,14 +273,9 @@ class Atlas:
 
         Trajectory and keyframes receive the correction interpolated in time between the stored frames.
 
-        Args:
-            nodes: Numbers of all stored frames of the submap, in order of time.
-            Ts_new: (n, 4, 4) their new poses.
-            volume: The map built from them, or from some of them.
-            fused: Numbers of the latter; the map is used until another one, of all, is complete. None = all.
-
-        Returns:
-            (4, 4) motion of the newest stored frame.
+        ``volume`` was built from all stored frames ``nodes`` of the submap at their new poses (n, 4, 4), or from
+        ``fused`` alone; it is used then until another one, of all, is complete. Returns the motion (4, 4) of the newest
+        stored frame.
         """
         assert self.history is not None
         stamps = np.array([self.history.timestamps[n] for n in nodes])
@@ -355,13 +328,8 @@ class Atlas:
         self.switch_to(target)
 
     def _fuse_gradually(self, target: int, fused_nodes: list[int]) -> None:
-        """Add the stored frames of a submap that its map lacks over the frames to come.
-
-        Args:
-            target: Number of the submap.
-            fused_nodes: Numbers of the stored frames that its map, or the one that replaces it, holds or is to hold
-                first.
-        """
+        """Add the stored frames of a submap that its map lacks over the frames to come; it holds ``fused_nodes``, or is
+        to hold them first."""
         assert self.history is not None
         running = self.rebuildings.pop(target, None)
         if running is None:

@@ -39,11 +39,8 @@ class ImageFeatures:
 
 
 class SiftExtractor:
-    """Extracts SIFT features; the detector is created on first use. Not for concurrent calls.
-
-    Args:
-        max_features: Number of strongest features that are kept (OpenCV may return a few more of equal strength).
-    """
+    """Extracts the strongest SIFT features; OpenCV may return a few more of equal strength. Not for concurrent
+    calls."""
 
     def __init__(self, max_features: int) -> None:
         self.max_features = max_features
@@ -71,14 +68,9 @@ def match_descriptors(
 ) -> NDArray[np.int64]:
     """Pairs (m, 2) of rows: each row of ``a`` with its nearest neighbour in ``b``, if it passes the ratio test.
 
-    The distances of all pairs are computed: with some hundred features this is faster than building a search tree,
-    and exact.
-
-    Args:
-        a: (n, d) descriptors.
-        b: (k, d) descriptors; with k < 2 the ratio test cannot be made and nothing matches.
-        ratio: Largest quotient of the nearest and the second nearest distance.
-        mutual: Keep only pairs that are also the nearest neighbours from ``b`` to ``a``.
+    The distances of all pairs are computed: with some hundred features this is faster than building a search tree, and
+    exact. With fewer than two rows in ``b`` the ratio test cannot be made and nothing matches. ``mutual`` keeps only
+    pairs that are also the nearest neighbours from ``b`` to ``a``.
     """
     if len(a) == 0 or len(b) < 2:
         return np.empty((0, 2), dtype=np.int64)

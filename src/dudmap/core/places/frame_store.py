@@ -33,8 +33,7 @@ class StoredFrame:
     """A frame as it was fused.
 
     Attributes:
-        frame: Depth in steps of ``DEPTH_UNIT``, and colour (JPEG) with the exposure of the map, registered to the depth
-            with the calibration now in use.
+        frame: Depth, and colour with the exposure of the map, registered with the calibration now in use.
         static: (H, W) bool, pixels that were fused.
         T_world_camera: (4, 4).
         count: Number of fused frames that it represents.
@@ -49,28 +48,19 @@ class StoredFrame:
 class FrameStore:
     """A selection of the fused frames in a temporary file, which the operating system removes.
 
-    A frame is stored if the camera has moved or turned since the last stored frame, or if a number of frames were
-    fused since; other frames increase the count of the stored frame before them. Frames are encoded (16-bit PNG and
-    JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about 1.5 kB per stored frame. Frames are
-    numbered in the order of time; those whose images were removed keep their number and their pose. Not for concurrent
-    calls.
-
-    Args:
-        camera: Camera of the frames.
-        distance: Distance from the last stored frame from which on a frame is stored, metres.
-        angle_deg: Angle to the last stored frame from which on a frame is stored, degrees.
-        gap: Largest count of a stored frame; 1 stores every frame.
-        registered: Registers the colour of a frame that was stored as it was recorded; None for colours that are
-            registered as they are.
+    A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
+    frame, or if ``gap`` frames were fused since; other frames increase the count of the stored frame before them.
+    Frames are encoded (16-bit PNG and JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about
+    1.5 kB per stored frame. Frames are numbered in the order of time; those whose images were removed keep their number
+    and their pose. Not for concurrent calls.
 
     Attributes:
-        timestamps: Of the stored frames, seconds.
-        Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
+        registered: Registers the colour of a frame that was stored as it was recorded; None for registered colours.
+        timestamps, Ts_world_camera: Times (s) and poses (4, 4); these are updated when the map is corrected.
         counts: Number of fused frames that each represents; 0 for those whose images were removed.
         cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
         submaps: Numbers of their submaps; -1 for frames that are as if they had never been.
-        archived: Returns a frame, by its number, that is not in the file of this store, but in the database of a
-            continued run.
+        archived: Returns a frame, by its number, that is in the database of a continued run.
     """
 
     def __init__(
@@ -115,17 +105,9 @@ class FrameStore:
         submap: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> bool:
-        """Store a fused frame, or increase the count of the last stored one.
+        """Store a fused frame, with its colour as it was recorded, or increase the count of the last stored one.
 
-        Args:
-            frame: Depth as it was fused, and colour as it was recorded; the arrays must not change afterwards.
-            static: (H, W) bool, pixels that were fused. The others are stored too.
-            T_world_camera: (4, 4).
-            submap: Number of the submap it was fused into.
-            exposure: Gain and offset to the colours of the map.
-
-        Returns:
-            Whether the frame was stored.
+        Returns whether it was stored. Pixels that were not fused are stored too; the arrays must not change afterwards.
 
         Raises:
             MapError: The temporary file cannot be written.
@@ -152,12 +134,19 @@ class FrameStore:
         """Numbers of the frames whose images were not removed."""
         return [number for number, count in enumerate(self.counts) if count]
 
+    def in_submap(self, submap: int) -> list[int]:
+        """Numbers of the frames of a submap, in order of time: the nodes of its pose graph."""
+        return [number for number, other in enumerate(self.submaps) if other == submap]
+
+    def kept_of(self, submap: int) -> list[int]:
+        """Those of them whose images were not removed."""
+        return [number for number in self.in_submap(submap) if self.counts[number]]
+
     def remove_submap(self, submap: int) -> None:
         """Remove the frames of a submap as if they had never been."""
-        for number, other in enumerate(self.submaps):
-            if other == submap:
-                self.remove_images(number)
-                self.submaps[number] = -1
+        for number in self.in_submap(submap):
+            self.remove_images(number)
+            self.submaps[number] = -1
 
     def remove_images(self, number: int) -> None:
         """Remove the images of a frame; its pose stays."""
@@ -209,13 +198,8 @@ class FrameStore:
         numbers: Sequence[int] | None = None,
         Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
     ) -> None:
-        """Fuse stored frames into a map, each with the weight of the frames it represents.
-
-        Args:
-            volume: The map, usually an empty one.
-            numbers: Numbers of the frames, in the order of fusion; None = all that are kept.
-            Ts_world_camera: Poses (4, 4); None = the stored ones.
-        """
+        """Fuse stored frames (None = all that are kept) into a map, in the given order, at poses (4, 4) (None = the
+        stored ones), each with the weight of the frames it represents."""
         for i, number in enumerate(self.kept if numbers is None else numbers):
             stored = self[number]
             T = stored.T_world_camera if Ts_world_camera is None else Ts_world_camera[i]

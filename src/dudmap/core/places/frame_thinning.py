@@ -28,9 +28,6 @@ class FrameThinning:
     average of a voxel can hold: what is seen behind somebody who stays there is kept. LOCAL_FRAMES of them must have
     been kept before any keyframe nearby was last seen: a return to its place is compared with what was kept until then.
 
-    Args:
-        config: Used are ``volume`` and ``similarity.threshold``.
-        atlas: The submaps; nothing is removed without a frame store.
     """
 
     def __init__(self, config: Config, atlas: Atlas) -> None:
@@ -41,8 +38,7 @@ class FrameThinning:
         self._stored = 0  # number of frames stored until the last call
 
     def thin(self) -> None:
-        """Test the frames with the view of the newest one if that was stored since the last call; call it with every
-        frame."""
+        """Test the frames with the view of the newest one if that is new; call it with every frame."""
         history = self.atlas.history
         if history is None or self.atlas.rebuildings or self.atlas.repainting or len(history) == self._stored:
             return

@@ -32,14 +32,10 @@ MAX_BACKOFF = 4
 
 @dataclass(frozen=True, eq=False)
 class LoopSearch:
-    """A frame that is being compared with keyframes in the background.
+    """A frame, tracked in a submap, that is being compared with keyframes in the background.
 
-    Attributes:
-        query: The frame.
-        submap: Number of the submap it was tracked in.
-        returned: Whether keyframes nearby have not been seen for ``loops.min_age``, so that a match is expected.
-        matches: The result, pending.
-        due: Number of the frame at which the result is evaluated.
+    ``returned``: Keyframes nearby have not been seen for ``loops.min_age``, so that a match is expected. ``due``:
+    Number of the frame at which the matches are evaluated.
     """
 
     query: LoopQuery
@@ -58,14 +54,7 @@ class LoopCloser:
 
     Features are matched in one background thread. The result is evaluated ``CHECK_INTERVAL`` frames later whether or
     not it is ready earlier, so that the same recording always gives the same result.
-
-    Args:
-        config: All parameters.
-        atlas: Submaps, keyframes and stored frames.
-        tracker: Registers frames.
-
-    Attributes:
-        closed: Number of corrections and joins made.
+    ``closed`` is the number of corrections and joins made.
     """
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
@@ -87,12 +76,8 @@ class LoopCloser:
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.
 
-        Args:
-            query: The frame.
-            monitor: Judges registrations by the residuals of recent frames.
-
-        Returns:
-            (4, 4) motion of the camera's pose by a correction of the atlas, None if nothing was corrected.
+        Returns the motion (4, 4) of the camera's pose by a correction of the atlas, None if nothing was corrected.
+        ``monitor`` judges registrations by the residuals of recent frames.
         """
         self._frame += 1
         self.thinning.thin()
@@ -107,8 +92,8 @@ class LoopCloser:
         new_keyframe, self._newest_keyframe = newest != self._newest_keyframe, newest
         if not new_keyframe and self._frame % CHECK_INTERVAL:
             return None
-        now = query.observation.timestamp
-        near = self._near(query.tracking.T_world_camera)
+        now, T = query.observation.timestamp, query.tracking.T_world_camera
+        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
         returned = any(self._is_old(keyframe, now) for keyframe in near)
         candidates = [keyframe for keyframe in keyframes if self._is_candidate(keyframe, now)]
         wanted = new_keyframe or returned or self._pending is not None or len(self.atlas.volumes) > 1
@@ -136,10 +121,6 @@ class LoopCloser:
             self.atlas.keyframes.settle()
             return newest.features
         return self.atlas.keyframes.extract(query.observation, query.dynamic_mask)
-
-    def _near(self, T_world_camera: NDArray[np.float64]) -> list[Keyframe]:
-        """Keyframes of the current submap whose place is seen from a pose."""
-        return self.atlas.keyframes.near(T_world_camera, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
 
     def _is_old(self, keyframe: Keyframe, now: float) -> bool:
         return now - keyframe.last_seen > self.config.loops.min_age
@@ -198,7 +179,8 @@ class LoopCloser:
         edge = self.corrector.measured_edge(place.keyframe, T, T)
         if edge is not None:
             self.corrector.edges.append(edge)
-        _mark_seen(self._near(T), query.observation.timestamp)
+        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
+        _mark_seen(near, query.observation.timestamp)
 
     def _correct(self, place: PlaceMatch, query: LoopQuery, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Correct the current submap by a verified place; returns the motion of the newest pose."""

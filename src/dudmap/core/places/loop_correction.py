@@ -30,11 +30,7 @@ by 2 cm and 1 degree or by 5 cm gave more than 2 times.
 class LoopCorrector:
     """Distributes the drift measured by loop closures over the stored frames of the current submap.
 
-    Args:
-        atlas: The submaps; its frame store must exist.
-
-    Attributes:
-        edges: Motions measured by the loop closures so far, between numbers of stored frames.
+    ``edges`` are the motions measured by the loop closures so far, between numbers of stored frames.
     """
 
     def __init__(self, atlas: Atlas) -> None:
@@ -44,16 +40,9 @@ class LoopCorrector:
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Motion to the newest stored frame from the one nearest in time to a keyframe.
-
-        Args:
-            keyframe: Keyframe of the current submap that was recognised.
-            T_tracked: (4, 4) tracked pose of the frame that recognised it.
-            T_measured: (4, 4) pose of that frame relative to the map at the time of the keyframe.
-
-        Returns:
-            None if both are the same stored frame.
-        """
+        """Motion to the newest stored frame from the one nearest in time to a recognised keyframe of the current
+        submap, given the tracked pose (4, 4) of the frame that recognised it and its pose relative to the map at the
+        time of the keyframe; None if both are the same stored frame."""
         history = self.atlas.history
         assert history is not None
         nodes = self.atlas.nodes(self.atlas.current)
@@ -70,10 +59,8 @@ class LoopCorrector:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
 
         The correction is applied to the atlas, and the edge stored, only if the poses are finite and the stored frames
-        of the new pass around the loop fit a map of those of the old pass about as well as a map of their own.
-
-        Returns:
-            (4, 4) motion of the newest pose, None if the correction was rejected.
+        of the new pass around the loop fit a map of those of the old pass about as well as a map of their own. Returns
+        the motion (4, 4) of the newest pose, None if the correction was rejected.
         """
         history = self.atlas.history
         assert history is not None
@@ -110,8 +97,6 @@ class LoopCorrector:
     ) -> tuple[float, float]:
         """Mean distance (m) and mean intensity difference (0..1) of some of the stored frames ``nodes`` with poses (n,
         4, 4) to a map, infinite where they see none of it.
-
-        Gain and offset of each frame are fitted, since the exposure drifts, too.
         """
         import cv2
 
@@ -145,9 +130,8 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
 
 
 def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) -> tuple[list[int], list[int]]:
-    """Numbers, among those ``kept`` (k,), of poses of a path (n, 4, 4) that view what pose ``b``, where a loop ends,
-    views: those before and those after the way from ``a`` to ``b`` has led farthest from there, about as many of each.
-    """
+    """Of the ``kept`` poses (k,) of a path (n, 4, 4), the indices of those with the view of pose ``b``, where a loop
+    ends: those before and those after the farthest point of the way from ``a`` to ``b``, about as many of each."""
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
     new = after[nearest_views(Ts[after], Ts[b], max(AT_ONCE // 2, AT_ONCE - len(before)))]

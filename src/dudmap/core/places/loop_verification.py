@@ -57,13 +57,7 @@ class LoopQuery:
 
 
 class LoopVerifier:
-    """Decides whether a frame shows a recognised place.
-
-    Args:
-        config: All parameters; used are ``loops`` and ``relocalization``.
-        atlas: Submaps, poses and stored frames; read only.
-        tracker: Registers frames.
-    """
+    """Decides whether a frame shows a recognised place; the atlas is read only."""
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
         self.config = config
@@ -71,12 +65,8 @@ class LoopVerifier:
         self.tracker = tracker
 
     def is_plausible(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether the path since a place was last seen is long enough for the drift that the match implies.
-
-        Args:
-            place: Match in the current submap.
-            T_world_camera: (4, 4) tracked pose of the frame.
-        """
+        """Whether the path since a place of the current submap was last seen is long enough for the drift that the
+        match implies, given the tracked pose (4, 4) of the frame."""
         since = [pose.T_world_camera for pose in self._poses_since(place)]
         path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
         limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
@@ -84,13 +74,8 @@ class LoopVerifier:
         return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
 
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place.
-
-        A place in a saved map, whose frames are not stored, is verified against that map.
-
-        Returns:
-            None unless features, distances and intensities agree.
-        """
+        """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place (or in the
+        saved map that the place belongs to); None unless features, distances and intensities agree."""
         limits = self.config.relocalization
         local = self._local_map(place)
         if local is None:
@@ -115,11 +100,6 @@ class LoopVerifier:
         would then move the camera away from where it belongs. The older pass is what was stored before the way since
         the place was last seen has led farthest from here; where it does not show what the frame sees, nothing speaks
         against the correction.
-
-        Args:
-            place: Match in the current submap.
-            newest: The newest frame.
-            T_corrected_tracked: (4, 4) the correction.
         """
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked

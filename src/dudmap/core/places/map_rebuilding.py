@@ -15,10 +15,10 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
 AT_ONCE = 24
-"""Stored frames that are fused at once, those nearest to the present view: a map of no more is rebuilt at once."""
+"""A map of at most this many stored frames is rebuilt at once, of a larger one those nearest to the present view."""
 PER_FRAME = 2
 """Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
-one is stored meanwhile, and those that are near come to an end, so that the rebuilding does."""
+one is stored with a frame, so that the rebuilding ends."""
 SHOWN = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
@@ -31,15 +31,10 @@ SPACING = 0.3
 
 
 class MapRebuilding:
-    """A new map of a submap, not complete yet.
+    """A new map of a submap, not complete yet; it also gets all frames from now on.
 
-    Args:
-        history: The stored frames.
-        submap: Number of the submap.
-        volume: The new map, as far as it is fused.
-        fused: Numbers of the stored frames of the submap that it holds.
-        shown: Numbers of those that the provisional map holds, or does not need beside them; it also gets all frames
-            from now on.
+    ``fused`` are the numbers of the stored frames of the submap that it holds, ``shown`` those that the provisional map
+    holds, or does not need beside them.
     """
 
     def __init__(
@@ -54,12 +49,7 @@ class MapRebuilding:
     @property
     def missing(self) -> list[int]:
         """Numbers of the stored frames that the new map lacks, in order of time."""
-        return [n for n in self._kept if n not in self._fused]
-
-    @property
-    def _kept(self) -> list[int]:
-        """Numbers of the stored frames of the submap whose images are kept."""
-        return [n for n in self.history.kept if self.history.submaps[n] == self.submap]
+        return [n for n in self.history.kept_of(self.submap) if n not in self._fused]
 
     def fuse(self, count: int | None = None) -> bool:
         """Fuse the next stored frames, None = all, into the new map; returns whether it is complete now."""
@@ -80,8 +70,10 @@ class MapRebuilding:
     def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> int:
         """Add those stored frames to the provisional map, at most ``count``, that see what a camera sees; returns how
         many."""
-        unknown = np.array([n for n in self._kept if n < self._start and n not in self._shown], int)
-        points, here = _points_seen(self.history, unknown), _looked_at(T_world_camera)
+        unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self._start and n not in self._shown])
+        unknown = unknown.astype(int)
+        points = _looked_at(np.reshape([self.history.Ts_world_camera[n] for n in unknown], (-1, 4, 4)))
+        here = _looked_at(T_world_camera)
         added: list[int] = []
         while len(unknown) and len(added) < count:
             distances = np.linalg.norm(points - here, axis=1)
@@ -104,12 +96,6 @@ def nearest_views(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], 
 def view_distances(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances (n,) of what poses (n, 4, 4) look at from what a camera looks at, metres."""
     return np.linalg.norm(_looked_at(Ts) - _looked_at(T_world_camera), axis=-1)
-
-
-def _points_seen(history: FrameStore, numbers: Sequence[int] | NDArray[np.int64]) -> NDArray[np.float64]:
-    """Points (n, 3) that stored frames look at."""
-    Ts = [history.Ts_world_camera[n] for n in numbers]
-    return _looked_at(np.reshape(Ts, (-1, 4, 4)))
 
 
 def _looked_at(Ts_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:

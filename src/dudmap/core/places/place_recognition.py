@@ -90,11 +90,6 @@ class KeyframeDatabase:
 
     The features of a new keyframe are extracted in another thread, and are there after ``settle``. Not for concurrent
     calls of ``extract``.
-
-    Args:
-        config: Distances, limits and thresholds.
-        camera: Camera of the observations.
-        sensor: Noise model of the depth readings.
     """
 
     def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:
@@ -146,15 +141,6 @@ class KeyframeDatabase:
 
         A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. One that turns out
         to have fewer than ``relocalization.min_inliers`` features is removed when it is settled.
-
-        Args:
-            observation: The frame.
-            T_world_camera: (4, 4).
-            dynamic_mask: (H, W) bool, pixels that are left out; None = none.
-            submap: Number of the submap it belongs to.
-
-        Returns:
-            Whether the frame was added.
         """
         self.settle()
         self._frames_since_last += 1
@@ -181,15 +167,8 @@ class KeyframeDatabase:
             self._remove_most_redundant()
 
     def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
-        """Keyframes that a frame with these features may show, with the frame's pose.
-
-        Args:
-            features: Features of the frame.
-            among: Keyframes to compare with; None = all.
-
-        Returns:
-            Matches with distinct poses, those with more inliers first.
-        """
+        """Keyframes (``among`` these, None = all) that a frame with these features may show, with the frame's pose; the
+        poses are distinct, those with more inliers first."""
         among = self.keyframes if among is None else among
         if len(features) < self.config.min_inliers or not among:
             return []

@@ -31,19 +31,23 @@ class Edge:
     sigma_angle: float
 
 
-def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np.float64]:
+def optimize(
+    Ts_world: NDArray[np.float64],
+    edges: Sequence[Edge],
+    covariances: NDArray[np.float64] | None = None,
+    huber: float = np.inf,
+) -> NDArray[np.float64]:
     """Minimize the sum over all edges of ``|e|^2`` with ``e = log(T_a_b^-1 T_a^-1 T_b)``, weighted by the variances.
+
+    ``covariances`` (E, 6, 6) of ``e`` take the place of the variances of the edges; ``huber`` is the threshold of the
+    Huber kernel in standard deviations.
 
     Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. The sparse normal equations
     are solved by SciPy (SuperLU). The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
     series of the inverse right Jacobian; the derivative by ``xi_a`` is that times ``-Ad(T_b^-1 T_a)``.
 
-    Args:
-        Ts_world: (N, 4, 4) initial poses.
-        edges: Measured motions; they must connect all poses.
-
-    Returns:
-        (N, 4, 4) optimized poses; not finite if the normal equations are singular.
+    The edges must connect all initial poses (N, 4, 4). Returns the optimized ones; they are not finite if the normal
+    equations are singular.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -55,7 +59,9 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
     a, b = np.array([(edge.a, edge.b) for edge in edges]).T
     Ts_b_a = se3.inverse(np.stack([edge.T_a_b for edge in edges]))
     sigmas = np.array([(edge.sigma_distance, edge.sigma_angle) for edge in edges])
-    weights = np.repeat(sigmas**-2.0, 3, axis=1)  # (E, 6)
+    information = np.eye(6) * np.repeat(sigmas**-2.0, 3, axis=1)[:, None]  # (E, 6, 6)
+    if covariances is not None:
+        information = np.linalg.inv(covariances)
     pairs = np.stack([np.stack([a, a]), np.stack([a, b]), np.stack([b, a]), np.stack([b, b])])  # (4, 2, E)
     entries = (6 * pairs[:, :, :, None, None] + np.indices((6, 6))[:, None]).transpose(1, 0, 2, 3, 4).reshape(2, -1)
     for _ in range(MAX_ITERATIONS):
@@ -63,7 +69,9 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
         errors = se3.log_all(Ts_b_a @ se3.inverse(motions))
         J_b = np.eye(6) + 0.5 * se3.small_adjoint(errors)
         J_a = -J_b @ se3.adjoint(motions)
-        weighted = {"a": np.swapaxes(J_a, 1, 2) * weights[:, None], "b": np.swapaxes(J_b, 1, 2) * weights[:, None]}
+        lengths = np.sqrt(np.einsum("ei,eij,ej->e", errors, information, errors))
+        weights = information * np.minimum(1, huber / np.maximum(lengths, 1e-9))[:, None, None]
+        weighted = {"a": np.swapaxes(J_a, 1, 2) @ weights, "b": np.swapaxes(J_b, 1, 2) @ weights}
         gradient = np.zeros((n, 6))
         np.add.at(gradient, a, np.einsum("eij,ej->ei", weighted["a"], errors))
         np.add.at(gradient, b, np.einsum("eij,ej->ei", weighted["b"], errors))

@@ -74,13 +74,9 @@ class SimilarityTest:
 
 @dataclass(eq=False)
 class _Place:
-    """What was fused from one place.
-
-    Attributes:
-        T_world_camera: (4, 4) pose of the first frame fused from there.
-        depth: (h, w) float32, metres, the static reading of each pixel that was fused last; 0 = none.
-        to_carve: (h, w) int, in how many more frames each pixel is to be fused because something has gone from there.
-    """
+    """What was fused from one place: pose (4, 4) of the first frame fused from there, depth (h, w) float32 (m) of the
+    static reading of each pixel that was fused last, 0 = none, and in how many more frames each pixel (h, w) is to be
+    fused because something has gone from there."""
 
     T_world_camera: NDArray[np.float64]
     depth: NDArray[np.float32]
@@ -92,9 +88,6 @@ class RedundantViews:
 
     A view is only redundant at the place of the last fused frames: from elsewhere the same surface is seen at another
     angle, with other systematic errors, which the average is to contain as well.
-
-    Args:
-        config: All parameters; used are ``similarity``, ``sensor`` and ``volume.free_after``.
     """
 
     def __init__(self, config: Config) -> None:

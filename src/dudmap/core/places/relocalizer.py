@@ -24,12 +24,8 @@ Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
 
 @dataclass(frozen=True, eq=False)
 class Relocalization:
-    """Verified pose of a frame after tracking was lost.
-
-    Attributes:
-        estimate: Pose and labels of the frame in the map of ``submap``.
-        submap: Number of the submap that the frame was recognised in. It may differ from the current one.
-    """
+    """Verified pose and labels of a frame after tracking was lost, in the map of the submap that it was recognised in,
+    which may differ from the current one."""
 
     estimate: PoseEstimate
     submap: int
@@ -42,10 +38,6 @@ class Relocalizer:
     against the map of the candidate's submap. The atlas is read only: switching it to the submap in which the frame
     was found, and starting a new submap, are left to the caller.
 
-    Args:
-        config: All parameters; used are ``relocalization`` and ``submaps``.
-        atlas: Submaps and keyframes.
-        prior_map: Map of a first pass. If given, candidates are verified against it instead of the submap's own map.
     """
 
     def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
@@ -73,12 +65,8 @@ class Relocalizer:
         return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
 
     def lost(self, timestamp: float, *, crowded: bool = False) -> None:
-        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized.
-
-        Args:
-            timestamp: Seconds.
-            crowded: Whether most of the view moved in the last tracked frame.
-        """
+        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized; ``crowded``: most of the view
+        moved in the last tracked frame."""
         if self._lost_since is None:
             self._lost_since, self._crowded = timestamp, crowded
 
@@ -90,20 +78,12 @@ class Relocalizer:
     def recover(
         self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
     ) -> Relocalization | None:
-        """Pose of a lost frame, verified by the registration against the map.
+        """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
 
         Candidates in the current submap are tried first, those with more matching features before others. The first
         is taken whose registration converges, is accepted, has at least ``relocalization.min_on_map`` of the frame's
         readings static and on the map, and stays within ``relocalization.max_distance`` and ``max_angle_deg`` of the
-        pose given by the features.
-
-        Args:
-            view: The lost frame; its timer receives the time of feature matching as stage ``recognise``.
-            register: Registers and labels this frame against a map.
-            accept: Whether the residuals of a registration are plausible.
-
-        Returns:
-            None if relocalization is switched off or no candidate passes.
+        pose given by the features. The view's timer receives the time of feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:

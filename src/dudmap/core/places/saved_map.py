@@ -23,14 +23,8 @@ KIND, VERSION = "dudmap keyframes", 1
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """The main map of a run, in the world frame of that run.
-
-    Attributes:
-        volume: The map.
-        keyframes: Its keyframes; all have the submap number 0.
-        registrations: Residuals of the last registrations to it, by which the first ones of the next run are judged.
-        folder: Run folder that it was read from.
-    """
+    """The main map of a run, in the world frame of that run: volume, keyframes of the submap 0, residuals of the last
+    registrations, by which the first ones of the next run are judged, and the folder that it was read from."""
 
     volume: TsdfVolume
     keyframes: list[Keyframe]
@@ -39,12 +33,7 @@ class SavedMap:
 
     @classmethod
     def load(cls, folder: str | Path, voxel_size: float | None = None) -> "SavedMap":
-        """Read the map of a run folder.
-
-        Args:
-            folder: The run folder.
-            voxel_size: That of the next run, metres; None accepts any.
-
+        """Read the map of a run folder, whose voxels must have a size (m), unless it is None.
         Raises:
             MapError: A file is missing, damaged or of a newer version, or there are no keyframes.
             ConfigError: The map has another voxel size.
@@ -165,15 +154,9 @@ def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class PriorMap:
-    """The map of a whole recording, which a second pass registers and labels its frames with.
-
-    Attributes:
-        volume: The map of the largest submap.
-        submap: Number of that submap.
-        Ts_world_camera: Poses (4, 4) of the frames tracked in it, by timestamp.
-        keyframes: Keyframes of all submaps.
-        detector: Holds the remembered frames of the first seconds.
-    """
+    """The map of a whole recording, which a second pass registers and labels its frames with: that of the largest
+    submap, the poses (4, 4) of its frames by timestamp, the keyframes of all submaps, and the detector, which holds
+    the remembered frames of the first seconds."""
 
     volume: TsdfVolume
     submap: int

@@ -261,7 +261,7 @@ class QualityMonitor:
                 "image_shift_px": seen.shift,
                 "confirmed_share": seen.share,
             }
-            crowded = share > 0.5
+            crowded = bool(share > 0.5)
             evidence = {
                 "last frame": lambda: not crowded and seen.is_same_view,
                 "corners": partial(self.images.supported, view, estimate, seen, image_pose),

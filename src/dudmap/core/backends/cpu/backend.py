@@ -6,12 +6,7 @@ Bands do not depend on the number of threads, and sums are added in their order 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu import (
-    fusion,
-    raycasting,
-    registration,
-    sampling,
-)
+from dudmap.core.backends.cpu import fusion, registration, sampling
 from dudmap.core.backends.cpu.fusion import BANDS, MAX_FOUND
 from dudmap.core.backends.cpu.registration import normal_equations
 from dudmap.core.backends.cpu.teams import run_team
@@ -40,8 +35,6 @@ _NO_VOXELS = np.empty(0, dtype=np.int32)
 
 class CpuBackend:
     """``Backend`` on the CPU."""
-
-    raycast = staticmethod(raycasting.raycast)
 
     def __init__(self) -> None:
         self._pixels = np.empty((0, 2), dtype=np.int32)

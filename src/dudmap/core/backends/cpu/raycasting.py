@@ -293,7 +293,11 @@ def raycast(
     size: tuple[int, int],
     parameters: RaycastParameters,
 ) -> RaycastResult:
-    """Depth, colour and normals of the first surface that each pixel of a camera sees; see ``Backend.raycast``."""
+    """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
+
+    A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes from
+    unknown space straight to the inside, there is none.
+    """
     grid = grid.on_host()
     shape = grid.shape
     low, high = np.float32(parameters.depth_min), np.float32(parameters.depth_max)

@@ -1,6 +1,7 @@
 """The back end for GPUs: Warp kernels for the loops over pixels and voxels of a frame.
 
-The voxels stay on the device; which blocks there are, meshes, labels and maps with several voxel sizes are the CPU's.
+The voxels stay on the device; which blocks there are, meshes, views, labels and maps with several voxel sizes
+are the CPU's.
 """
 
 # Warp's annotations name float where any type of number is meant
@@ -14,7 +15,6 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu import raycasting
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.registration import NUM_SUMS, normal_equations
 from dudmap.core.backends.descent import Descent, DescentRules, descend
@@ -26,8 +26,6 @@ from dudmap.core.backends.parameters import (
     FusionParameters,
     MapSample,
     NormalEquations,
-    RaycastParameters,
-    RaycastResult,
     RegistrationParameters,
     TouchedBlocks,
     VoxelGrid,
@@ -35,7 +33,6 @@ from dudmap.core.backends.parameters import (
 )
 from dudmap.core.backends.warp import faults
 from dudmap.core.backends.warp.kernels import fusion, surface
-from dudmap.core.backends.warp.kernels import raycasting as tracing
 from dudmap.core.backends.warp.kernels.formulas import motion_of
 from dudmap.core.backends.warp.kernels.structs import Lattice, camera_of, struct
 from dudmap.core.backends.warp.memory import down, in_warp, resident, up, wrote
@@ -47,11 +44,8 @@ PER_THREAD = 8
 
 
 class WarpBackend(CpuBackend):
-    """``Backend`` on a device of Warp; operations that are not defined here are the CPU's.
-
-    Args:
-        device: Name of the device: "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
-    """
+    """``Backend`` on a device of Warp, "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
+    Operations that are not defined here are the CPU's."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
@@ -153,36 +147,6 @@ class WarpBackend(CpuBackend):
                 free_after, *out,
             )  # fmt: skip
             return MapSample(*(down(image) for image in out))
-
-    def raycast(
-        self,
-        grid: VoxelGrid,
-        T_world_camera: NDArray[np.float64],
-        intrinsics: NDArray[np.float32],
-        size: tuple[int, int],
-        parameters: RaycastParameters,
-    ) -> RaycastResult:
-        """See ``Backend.raycast``."""
-        camera, (height, width) = camera_of(intrinsics), size
-        to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
-        tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
-        limits = float(parameters.depth_min), float(parameters.depth_max)
-        with self._using():
-            lattice, colors = self._lattice(grid), resident(grid.colors, self.device)
-            near, far = self._empty(tiles), self._empty(tiles)
-            near.fill_(float(raycasting.INFINITE))
-            far.zero_()
-            self._launch(
-                tracing.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height,
-                width, radius, *limits, near, far,
-            )  # fmt: skip
-            out = self._empty(size), self._empty((*size, 3), wp.uint8), self._empty(size, wp.vec3)
-            unit, least = grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1)
-            self._launch(
-                tracing.trace, size, lattice, colors, camera, motion_of(to_lattice), near, far, *limits, unit, least,
-                *out,
-            )  # fmt: skip
-            return RaycastResult(*(down(image) for image in out))
 
     # -- the device --------------------------------------------------------------------------------------------------
 

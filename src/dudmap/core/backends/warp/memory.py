@@ -38,12 +38,9 @@ def down(array: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
 
 
 class RowCopy:
-    """Copy of an int32 array (rows,) or (rows, width) on a device; see ``mirror.DeviceCopy``.
+    """Copy of an int32 array (rows,) or (rows, width) on a device; see ``Mirror.copy``.
 
     What a device that has failed wrote since the last ``pull`` is lost.
-
-    Args:
-        device: Name of the device.
     """
 
     def __init__(self, device: str) -> None:
@@ -71,14 +68,14 @@ class RowCopy:
         self._written.append(rows)
 
     def host_wrote(self, rows: NDArray[np.integer] | None) -> None:
-        """See ``mirror.DeviceCopy``."""
+        """Rows (n,) of the host's array, None = all, have been written."""
         if rows is None:
             self._array, self._stale, self._written = None, [], []
         elif len(rows):
             self._stale.append(np.asarray(rows))
 
     def pull(self, host: NDArray[np.int32]) -> None:
-        """See ``mirror.DeviceCopy``."""
+        """Bring the host's array up to date with what the device wrote."""
         written, self._written = self._written, []
         if not written or faults.is_lost(self.device):
             return
@@ -113,10 +110,7 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
 
 
 def wrote(array: Mirror | NDArray[np.int32], rows: NDArray[np.int32]) -> None:
-    """A kernel has written rows (n,) of the array that ``resident`` gave.
-
-    Only a mirror can follow: an array in the host's memory cannot be changed from here.
-    """
+    """A kernel has written rows (n,) of the mirror that ``resident`` gave; a plain array would not see the change."""
     if not (isinstance(array, Mirror) and isinstance(array.copy, RowCopy)):
         raise TypeError("the device writes to mirrors only; a plain array would not see the change")
     array.copy.device_wrote(rows)

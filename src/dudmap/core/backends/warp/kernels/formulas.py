@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.core.backends.cpu import raycasting, sampling
+from dudmap.core.backends.cpu import sampling
 from dudmap.core.formulas import pixel, residual, voxel
 
 wp.set_module_options({"enable_backward": False})
@@ -108,13 +108,9 @@ def _counterpart(value: object) -> object:
 
 rotate, transform = warp_function(pixel.rotate), warp_function(pixel.transform)
 ray, project = warp_function(pixel.ray), warp_function(pixel.project)
-free_depth = warp_function(pixel.free_depth)
 sdf_steps, intensity_of = warp_function(voxel.sdf_steps), warp_function(voxel.intensity_of)
-pack_reading, pack_pixel_color = warp_function(voxel.pack_reading), warp_function(voxel.pack_pixel_color)
 fuse_voxel, fuse_color = warp_function(voxel.fuse_voxel), warp_function(voxel.fuse_color)
 is_occupied = warp_function(voxel.is_occupied)
 trilinear, weigh = warp_function(residual.trilinear), warp_function(residual.weigh)
 normal_terms = warp_function(residual.normal_terms)
 corner_weight = warp_function(sampling.corner_weight)
-step_length, corner_gradient = warp_function(raycasting.step_length), warp_function(raycasting.corner_gradient)
-to_block_boundary = warp_function(raycasting.to_block_boundary)

@@ -37,13 +37,8 @@ class Camera:
 
 @wp.struct
 class Lattice:
-    """The window of blocks around the view.
-
-    Attributes:
-        cells: Slot of the voxels of each block; -1 = unknown; -2 - entry = without voxels.
-        geometry: (slots, 512) packed voxels.
-        nx, ny, nz: Blocks along each axis.
-    """
+    """The window of blocks around the view: slot of the voxels of each block (-1 = unknown; -2 - entry = without
+    voxels), (slots, 512) packed voxels, and blocks along each axis."""
 
     cells: wp.array(dtype=wp.int32)
     geometry: wp.array2d(dtype=wp.int32)
