@@ -2,12 +2,11 @@
 
 import re
 from collections.abc import Iterator
-from importlib import import_module
 from typing import Any
 
 import typer
 
-from dudmap.cli import COMMANDS
+from dudmap.cli import COMMANDS, application_of
 
 
 def command_pages() -> str:
@@ -16,7 +15,7 @@ def command_pages() -> str:
 
 
 def _sections(name: str) -> Iterator[str]:
-    command = typer.main.get_command(import_module(f"dudmap.cli.{name}").app)
+    command = typer.main.get_command(application_of(name))
     nested = getattr(command, "commands", None)
     yield from _section(f"dudmap {name}", "##", command, has_own_parameters=nested is None)
     for inner, subcommand in (nested or {}).items():

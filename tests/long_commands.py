@@ -80,7 +80,7 @@ FAKED = {
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
         {
-            "dudmap.lab.benchmark.bias.measure_pulls": lambda *_: [],
+            "dudmap.lab.benchmark.bias.measure_pulls": lambda *_: {},
             "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
         },
     ),

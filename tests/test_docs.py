@@ -7,13 +7,12 @@ import re
 import shlex
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 import typer
 
-from dudmap.cli import COMMANDS
+from dudmap.cli import COMMANDS, application_of
 from dudmap.config import Config, keys
 from dudmap.io.sequences import readers
 
@@ -84,7 +83,7 @@ def test_every_format_is_in_the_table_of_formats():
 def test_shown_commands_exist_with_their_options(line):
     words = shlex.split(line.replace("[", " ").replace("]", " ").replace("|", " "))[1:]
     assert words[0] in COMMANDS
-    command = typer.main.get_command(import_module(f"dudmap.cli.{words[0]}").app)
+    command = typer.main.get_command(application_of(words[0]))
     nested = getattr(command, "commands", {})
     if nested:
         command = nested[words[1] if len(words) > 1 and words[1] in nested else next(iter(nested))]

@@ -108,6 +108,8 @@ REQUIRED = {
     "llvmlite",
     "cv2",
     "pydantic",
+    "pydantic_core",
+    "markdown_it",
     "scipy",
     "matplotlib",
     "trimesh",
@@ -167,5 +169,6 @@ def test_every_required_library_is_a_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {re.split(r"[<>=\[ ]", text)[0].lower() for text in project["dependencies"]}
     homes = packages_distributions()
-    for module in REQUIRED - {"llvmlite", "click", "PIL"}:  # parts of numba, typer and matplotlib
+    parts = {"llvmlite", "pydantic_core", "click", "PIL"}  # of numba, pydantic, typer and matplotlib
+    for module in REQUIRED - parts:
         assert names & {home.lower().replace("_", "-") for home in homes[module]}, module

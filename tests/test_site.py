@@ -9,7 +9,7 @@ import pytest
 import typer
 
 import dudmap
-from dudmap.cli import COMMANDS
+from dudmap.cli import COMMANDS, application_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -46,11 +46,9 @@ def test_every_page_is_built(site):
 
 
 def test_every_command_with_its_options_is_on_the_site(site):
-    from importlib import import_module
-
     page = text(site, "commands")
     for name in COMMANDS:
-        command = typer.main.get_command(import_module(f"dudmap.cli.{name}").app)
+        command = typer.main.get_command(application_of(name))
         for inner in getattr(command, "commands", {"": command}).values():
             assert f"dudmap {name}" in page
             for parameter in inner.params:

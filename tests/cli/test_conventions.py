@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dudmap.cli import COMMANDS, app
+from dudmap.cli import COMMANDS, app, application_of
 from dudmap.cli.options import GROUPS, arranged
-from dudmap.cli.output import answer, plain
+from dudmap.cli.output import answer
 from exported_runs import make_run
 from long_commands import FAKED
 from run_folders import write_run
@@ -35,9 +34,7 @@ def leaves(name, command):
 ALL = {
     words: command
     for name in COMMANDS
-    for words, command in leaves(
-        name, arranged(typer.main.get_command(import_module(f"dudmap.cli.{name}").app))
-    ).items()
+    for words, command in leaves(name, arranged(typer.main.get_command(application_of(name)))).items()
 }
 
 
@@ -122,7 +119,9 @@ def test_json_of_suites(tmp_path, monkeypatch):
 
 def test_what_json_cannot_hold_is_null(capsys):
     tree = {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": Path("x") / "y", "d": (np.float32(1), np.int64(2))}
-    assert plain(tree) == {"a": None, "b": [1.0, None], "c": str(Path("x/y")), "d": [1.0, 2]}
+    answer(tree, "text", as_json=True)
+    plain = {"a": None, "b": [1.0, None], "c": str(Path("x/y")), "d": [1.0, 2]}
+    assert json.loads(capsys.readouterr().out) == plain
     answer(tree, "text", as_json=False)
     assert capsys.readouterr().out == "text\n"
 

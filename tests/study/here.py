@@ -1,4 +1,7 @@
-"""Executor of the tests."""
+"""Executor of the tests, and what a study folder says of its runs."""
+
+import json
+from pathlib import Path
 
 from dudmap.lab.study.worker import perform
 
@@ -17,3 +20,9 @@ class Here:
 
     def close(self):
         pass
+
+
+def journal(folder):
+    """All lines of the journals of a study folder in the order of time."""
+    lines = [line for path in Path(folder).glob("journal*.jsonl") for line in path.read_text().splitlines()]
+    return sorted((json.loads(line) for line in lines if line.endswith("}")), key=lambda line: line["time"])

@@ -12,8 +12,8 @@ ray = pytest.importorskip("ray")
 
 from dudmap.errors import ConfigError
 from dudmap.lab.study.conduct import conduct
-from dudmap.lab.study.worker import StudyFolder
 from study.crash_study import sleep_row, tiny_plan
+from study.here import journal
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
@@ -56,7 +56,7 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
         cluster.shutdown()
     assert killed
     assert state.done == 20
-    events = Counter(line["event"] for line in StudyFolder(tmp_path).journal())
+    events = Counter(line["event"] for line in journal(tmp_path))
     assert events["finished"] == 20
     assert 20 <= events["begun"] <= 21
     assert state.deaths <= 2

@@ -14,6 +14,7 @@ import pytest
 from dudmap.lab.study.conduct import ATTEMPTS, StudyFolder, conduct, table_of
 from dudmap.lab.study.worker import LocalExecutor
 from study.crash_study import die_always, die_once, sleep_row, tiny_plan
+from study.here import journal
 
 SCRIPT = Path(__file__).with_name("crash_study.py")
 WORKERS = 2
@@ -26,11 +27,11 @@ def start(folder, runs, kind):
 def kill_in_the_middle(folder, runs, kind, rng):
     """Kill the study, not its workers, at a random moment after the first run was begun."""
     process = start(folder, runs, kind)
-    while not StudyFolder(folder).journal() and process.poll() is None:
+    while not journal(folder) and process.poll() is None:
         time.sleep(0.01)
     done = rng.uniform(0, 0.9) * runs
     while process.poll() is None:
-        if Counter(line["event"] for line in StudyFolder(folder).journal())["finished"] >= done:
+        if Counter(line["event"] for line in journal(folder))["finished"] >= done:
             time.sleep(rng.uniform(0, 0.05))
             break
         time.sleep(0.005)
@@ -51,7 +52,7 @@ def is_running(pid):
 def check_complete(folder, runs, kills):
     store = StudyFolder(folder)
     keys = [run.key for run in tiny_plan(runs).runs()]
-    events = Counter((line["event"], line["run"]) for line in store.journal())
+    events = Counter((line["event"], line["run"]) for line in journal(folder))
     assert all(store.result(key) is not None for key in keys)
     assert sorted(path.name for path in (folder / "runs").iterdir()) == sorted(keys)  # nothing half done is left
     assert all(events["finished", key] <= 1 for key in keys)
@@ -87,19 +88,19 @@ def test_two_studies_in_one_folder_share_the_runs(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_workers_end_with_a_killed_study(tmp_path):
     process = start(tmp_path, 1000, "fake")
-    while len(StudyFolder(tmp_path).journal()) < 4:
+    while len(journal(tmp_path)) < 4:
         time.sleep(0.01)
     process.kill()
     process.wait()
-    workers = {line["pid"] for line in StudyFolder(tmp_path).journal()}
+    workers = {line["pid"] for line in journal(tmp_path)}
     deadline = time.monotonic() + 60  # on a busy machine a worker that has just begun notices late
     while any(is_running(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not [pid for pid in workers if is_running(pid)]
-    count = len(StudyFolder(tmp_path).journal())
+    count = len(journal(tmp_path))
     assert count < 1000  # they ended before the work was done
     time.sleep(0.5)
-    assert len(StudyFolder(tmp_path).journal()) == count
+    assert len(journal(tmp_path)) == count
 
 
 def test_a_dead_worker_costs_its_current_run_only(tmp_path, monkeypatch):
@@ -108,7 +109,7 @@ def test_a_dead_worker_costs_its_current_run_only(tmp_path, monkeypatch):
     state = conduct(tiny_plan(6).runs(), tmp_path / "study", executor, do=die_once)
     executor.close()
     assert (state.deaths, state.done, state.total) == (1, 6, 6)
-    events = Counter(line["event"] for line in StudyFolder(tmp_path / "study").journal())
+    events = Counter(line["event"] for line in journal(tmp_path / "study"))
     assert events == {"begun": 7, "finished": 6, "died": 1}
 
 

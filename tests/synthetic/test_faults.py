@@ -330,15 +330,15 @@ def test_cameras_have_their_noise_and_faults(name):
 def test_command_line_of_sensors(tmp_path):
     from typer.testing import CliRunner
 
-    from dudmap.cli.synth import app
+    from dudmap.cli import application_of
 
     arguments = [str(tmp_path / "out"), "--scene", "box", "--size", "64x48", "--max-frames", "2", "--quiet"]
     chosen = ["--sensor", "kinect_v2", "--fault", "color_delay=0.03", "--fault", "multipath=0"]
-    result = CliRunner().invoke(app, [*arguments, *chosen])
+    result = CliRunner().invoke(application_of("synth"), [*arguments, *chosen])
     assert result.exit_code == 0, result.output
     faults = json.loads((tmp_path / "out" / "sensor_truth.json").read_text())["faults"]
     assert (faults["color_delay"], faults["multipath"], faults["flying_pixels"]) == (0.03, 0, 0.5)
     assert json.loads((tmp_path / "out" / "scene.json").read_text())["noise"] == "kinect_v2"
-    wrong = CliRunner().invoke(app, [*arguments[:1], "--sensor", "eye"])
+    wrong = CliRunner().invoke(application_of("synth"), [*arguments[:1], "--sensor", "eye"])
     assert isinstance(wrong.exception, ConfigError)
     assert "unknown sensor 'eye'; known sensors: kinect_v1" in str(wrong.exception)

@@ -372,7 +372,7 @@ def test_frames_beyond_the_end():
 def test_command_line(tmp_path):
     from typer.testing import CliRunner
 
-    from dudmap.cli.synth import app
+    from dudmap.cli import application_of
 
     arguments = [
         str(tmp_path / "out"),
@@ -385,9 +385,9 @@ def test_command_line(tmp_path):
         "--movers",
         "ball,person",
     ]
-    result = CliRunner().invoke(app, [*arguments, "--quiet"])
+    result = CliRunner().invoke(application_of("synth"), [*arguments, "--quiet"])
     assert result.exit_code == 0, result.output
     assert len(open_sequence(tmp_path / "out")) == 2
     assert json.loads((tmp_path / "out" / "scene.json").read_text())["movers"] == ["ball", "person"]
-    wrong = CliRunner().invoke(app, [*arguments[:1], "--size", "big"])
+    wrong = CliRunner().invoke(application_of("synth"), [*arguments[:1], "--size", "big"])
     assert isinstance(wrong.exception, ConfigError)

@@ -1,8 +1,8 @@
 """The command line: ``dudmap COMMAND``.
 
-Each command is a Typer application named ``app`` in ``dudmap.cli.<command>``, which is imported when the command is
-called, so that ``dudmap --help`` is fast. Errors are printed as one sentence. Exit codes: 1 for an error, 2 for wrong
-usage, 130 for Ctrl-C.
+Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` with commands of its own
+there, which is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
+sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C.
 """
 
 import io
@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 from dudmap import __version__
-from dudmap.cli.options import arranged
+from dudmap.cli.options import arranged, grouped
 from dudmap.errors import DudmapError
 
 COMMANDS = {
@@ -41,6 +42,17 @@ COMMANDS = {
 }
 """Name and one-line help of every command, in the order of the help page."""
 
+
+def application_of(name: str) -> typer.Typer:
+    """Application of the command of a name in ``COMMANDS``."""
+    module = import_module(f"dudmap.cli.{name}")
+    if hasattr(module, "app"):
+        return module.app
+    application = typer.Typer(add_completion=False)
+    application.command()(grouped(getattr(module, name)))
+    return application
+
+
 _USAGE: type[Exception] = typer.BadParameter.__mro__[2]
 """Base of the errors of wrong usage: ClickException, of click or of Typer itself."""
 
@@ -51,8 +63,7 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
         """Replace the placeholder of the called command by the command itself."""
         if args and args[0] in COMMANDS:
-            module = import_module(f"dudmap.cli.{args[0]}")
-            self.commands[args[0]] = arranged(typer.main.get_command(module.app))
+            self.commands[args[0]] = arranged(typer.main.get_command(application_of(args[0])))
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
@@ -120,7 +131,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _dudmap(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
+        bool, Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     pass

@@ -1,16 +1,16 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
-import json
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
 from dudmap.cli.benchmark_changes import changes
-from dudmap.cli.benchmark_consistency import consistency
 from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, roofline, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
@@ -23,7 +23,7 @@ app = typer.Typer(
 
 SystemsOption = Annotated[
     str,
-    typer.Option(
+    Option(
         "--systems",
         help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of the suite ablation, the "
         "default with one part switched off at a time.",
@@ -31,20 +31,20 @@ SystemsOption = Annotated[
 ]
 
 DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Folder of the recordings; nothing is downloaded.", metavar="FOLDER")
+    Path | None, Option("--data", help="Folder of the recordings; nothing is downloaded.", metavar="FOLDER")
 ]
 
 
 def suite_command(
     context: typer.Context,
     systems: SystemsOption = "",
-    out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
+    out: Annotated[Path | None, Option(help="Default: runs/benchmark/<suite>.")] = None,
     data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     score: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=FOLDER",
             help="Score results of another system, FOLDER/<sequence>/trajectory.txt and mesh.ply; repeatable.",
         ),
@@ -61,19 +61,14 @@ def suite_command(
     wanted, others = find_systems(systems or usual), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or RUNS / name
-    text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
-    tree = json.loads((out / f"{suite.name}.json").read_text(encoding="utf-8"))
-    _answer(tree, text, out, as_json=as_json)
+    tree, text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
+    answer(tree, text, as_json=as_json, out=out)
 
 
-for _command in (changes, consistency, speed, gpu, roofline, soak):
+for _command in (changes, speed, gpu, roofline, soak):
     app.command()(_command)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
-
-
-def _answer(tree: dict[str, Any], text: str, out: Path, *, as_json: bool) -> None:
-    answer(tree | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
 
 
 def _print_outcome(row: dict[str, Any]) -> None:
@@ -83,8 +78,8 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 @app.command()
 def sensors(
-    out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
-    only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
+    out: Annotated[Path, Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
+    only: Annotated[str, Option(help="Comma-separated sensors; default: all.")] = "",
     data: DataOption = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
@@ -95,7 +90,6 @@ def sensors(
 
     The default must be within 5 % of the better of the other two columns.
     """
-    from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.color_columns import color_table, measure_columns
     from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.suites import local_entries, sensor_entries
@@ -104,16 +98,15 @@ def sensors(
     entries = sensor_entries(names, quick=quick) if data is None else local_entries(data)
     rows = measure_columns(entries, o.read_config(None, None, assignments), jobs, _print_outcome)
     text = color_table(rows)
-    save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
-    _answer({"rows": rows}, text, out, as_json=as_json)
+    answer(save(rows, text, out, "sensors"), text, as_json=as_json, out=out)
 
 
 @app.command()
 def random(
-    count: Annotated[int, typer.Option(min=1, help="Number of worlds.")] = 40,
+    number: Annotated[int, Option("--count", min=1, help="Number of worlds.")] = 40,
     seed: o.SeedOption = 0,
-    only: Annotated[str, typer.Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
-    out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = RUNS / "random",
+    only: Annotated[str, Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
+    out: Annotated[Path, Option(help="Output folder for the rows and the report.")] = RUNS / "random",
     jobs: o.JobsOption = 1,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
@@ -126,13 +119,13 @@ def random(
     from dudmap.lab.benchmark.random_worlds import measure_worlds, report
 
     try:
-        numbers = [int(number) for number in only.split(",") if number] or list(range(count))
+        numbers = [int(world) for world in only.split(",") if world] or list(range(number))
     except ValueError:
         raise ConfigError(f"cannot understand --only {only!r}; expected numbers of worlds, such as 3,17") from None
     rows = measure_worlds(seed, numbers, o.read_config(None, None, assignments), out, jobs, _print_world)
     text = report(rows, seed)
     (out / f"seed-{seed}.md").write_text(text, encoding="utf-8")
-    _answer({"rows": rows}, text, out, as_json=as_json)
+    answer({"rows": rows}, text, as_json=as_json, out=out)
 
 
 def _print_world(row: dict[str, Any]) -> None:
@@ -144,10 +137,10 @@ def _print_world(row: dict[str, Any]) -> None:
 @app.command()
 def bias(
     recording: Annotated[
-        Path | None, typer.Argument(help="Static recording with true poses; default: exact synthetic rooms.")
+        Path | None, Argument(help="Static recording with true poses; default: exact synthetic rooms.")
     ] = None,
-    stride: Annotated[int, typer.Option(min=1, help="Register every so many frames.")] = 4,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of synthetic rooms.")] = 3,
+    stride: Annotated[int, Option(min=1, help="Register every so many frames.")] = 4,
+    seeds: Annotated[int, Option(min=1, help="Number of synthetic rooms.")] = 3,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -157,29 +150,23 @@ def bias(
     from dudmap.lab.benchmark.bias import bias_table, measure_pulls
 
     config = o.read_config(None, None, assignments)
-    if recording is not None:
-        worlds = {recording.name: lambda: open_sequence(recording)}
-    else:
-        worlds = {
-            f"{scene}, seed {seed}, exact": partial(
-                synthetic.sequence, scene, movers=(), frames=120, noise="none", seed=seed
-            )
-            for scene in ("room", "corridor")
-            for seed in range(seeds)
-        }
+    worlds = [(scene, seed) for scene in ("room", "corridor") for seed in range(seeds)]
+    exact = partial(synthetic.sequence, movers=(), frames=120, noise="none")
+    sources = {f"{scene}, seed {seed}, exact": partial(exact, scene, seed=seed) for scene, seed in worlds}
     found = {}
-    for name, opened in worlds.items():
+    for name, opened in ({recording.name: partial(open_sequence, recording)} if recording else sources).items():
         pulls = measure_pulls(opened(), config, stride)
-        found[name] = [{"term": pull.term, "mean": pull.mean, "spread": pull.spread} for pull in pulls]
-        if not as_json:
-            say(f"{name}:\n\n{bias_table(pulls)}")
+        found[name] = [
+            {"term": term, "mean": pull.mean(axis=0), "spread": pull.std(axis=0)} for term, pull in pulls.items()
+        ]
+        say(f"{name}:\n\n{bias_table(pulls)}", err=as_json)
     if as_json:
         answer({"corrections_mm_deg": found}, "", as_json=True)
 
 
 @app.command("first-second")
 def first_second(
-    seeds: Annotated[int, typer.Option(min=1, help="Number of worlds of each scene.")] = 3,
+    seeds: Annotated[int, Option(min=1, help="Number of worlds of each scene.")] = 3,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -188,24 +175,20 @@ def first_second(
     from dudmap.lab.benchmark.bias import FRAMES, first_second_table, measure_first_second
 
     config = o.read_config(None, None, assignments)
-    worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
-    runs = [
-        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES + 1, noise="none", seed=seed), config)
-        for scene, seed in worlds
-    ]
-    tree = {
-        name: [run._asdict() for run in found]
-        for name, found in zip((f"{scene}, seed {seed}" for scene, seed in worlds), runs, strict=True)
+    exact = partial(synthetic.sequence, movers=(), frames=FRAMES + 1, noise="none")
+    runs = {
+        f"{scene}, seed {seed}": measure_first_second(exact(scene, seed=seed), config)
+        for scene in ("room", "corridor", "box")
+        for seed in range(seeds)
     }
-    answer(tree, first_second_table(runs), as_json=as_json)
+    tree = {name: [run._asdict() for run in found] for name, found in runs.items()}
+    answer(tree, first_second_table(list(runs.values())), as_json=as_json)
 
 
 @app.command()
 def calls(
-    recording: Annotated[
-        Path | None, typer.Argument(help="Recording; default: a synthetic room with a person.")
-    ] = None,
-    max_frames: Annotated[int, typer.Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    recording: Annotated[Path | None, Argument(help="Recording; default: a synthetic room with a person.")] = None,
+    max_frames: Annotated[int, Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -223,13 +206,13 @@ def calls(
 @app.command()
 def faults(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room with people.")
+        Path | None, Argument(help="Recording with true poses; default: a synthetic room with people.")
     ] = None,
-    max_frames: Annotated[int, typer.Option(min=20, help="Number of frames of the recording.")] = 120,
-    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    max_frames: Annotated[int, Option(min=20, help="Number of frames of the recording.")] = 120,
+    width: Annotated[int, Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
     seed: o.SeedOption = 0,
-    only: Annotated[str, typer.Option(help="Comma-separated faults; default: all.")] = "",
-    out: Annotated[Path | None, typer.Option(help="Also write the table to this file (Markdown).")] = None,
+    only: Annotated[str, Option(help="Comma-separated faults; default: all.")] = "",
+    out: Annotated[Path | None, Option(help="Also write the table to this file (Markdown).")] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -260,33 +243,26 @@ def faults(
 @app.command("wrong-input")
 def wrong_input(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic desk and room.")
+        Path | None, Argument(help="Recording with true poses; default: a synthetic desk and room.")
     ] = None,
-    max_frames: Annotated[int, typer.Option(min=4, help="Number of frames from the start.")] = 40,
-    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    max_frames: Annotated[int, Option(min=4, help="Number of frames from the start.")] = 40,
+    width: Annotated[int, Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
     as_json: o.JsonOption = False,
 ) -> None:
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
     from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.stream_faults import (
-        LARGE,
-        SPOILT,
-        default_room,
-        fails,
-        measure_wrong_input,
-        spoilt_table,
-    )  # fmt: skip
+    from dudmap.lab.benchmark import stream_faults as spoiling
 
-    config, runs = Config(), []
     if recording is not None:
-        runs += measure_wrong_input(open_sequence(recording), config, SPOILT, max_frames)
+        sources = [(open_sequence(recording), list(spoiling.SPOILT))]
     else:  # too small a scale shows at a desk, too large a one in a room
-        at_desk = [name for name in SPOILT if name != LARGE]
-        runs += measure_wrong_input(default_room(max_frames, width, 0, "desk"), config, at_desk, max_frames)
-        runs += measure_wrong_input(default_room(max_frames, width, 0), config, [LARGE], max_frames)
-    failed = [run["name"] for run in runs if fails(run)]
-    answer({"runs": runs, "failed": failed}, spoilt_table(runs), as_json=as_json)
+        at_desk = [name for name in spoiling.SPOILT if name != spoiling.LARGE]
+        desk, room = (spoiling.default_room(max_frames, width, 0, scene) for scene in ("desk", "room"))
+        sources = [(desk, at_desk), (room, [spoiling.LARGE])]
+    runs = [run for each, names in sources for run in spoiling.measure_wrong_input(each, Config(), names, max_frames)]
+    failed = [run["name"] for run in runs if spoiling.fails(run)]
+    answer({"runs": runs, "failed": failed}, spoiling.spoilt_table(runs), as_json=as_json)
     if failed:
         say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
         raise typer.Exit(1)
@@ -294,11 +270,9 @@ def wrong_input(
 
 @app.command()
 def gate(
-    figures: Annotated[Path, typer.Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
-    fixtures: Annotated[Path, typer.Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path(
-        "tests/fixtures"
-    ),
-    update: Annotated[bool, typer.Option("--update", help="Record the measured figures; margins are kept.")] = False,
+    figures: Annotated[Path, Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
+    fixtures: Annotated[Path, Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path("tests/fixtures"),
+    update: Annotated[bool, Option("--update", help="Record the measured figures; margins are kept.")] = False,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -325,7 +299,7 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
+    out: Annotated[Path, Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
@@ -335,35 +309,43 @@ def limits(
     The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements
     of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
-    from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.limits import (
-        FRAMES,
-        QUICK_FRAMES,
-        QUICK_SWEEPS,
-        SWEEPS,
-        cells_table,
-        grid_cells,
-        limits_table,
-        measure_cells,
-    )
+    from dudmap.lab.benchmark import limits as found
     from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.suites import systems as find_systems
 
-    wanted = find_systems(systems)
-    sweeps = QUICK_SWEEPS if quick else SWEEPS
-    cells = grid_cells(sweeps, QUICK_FRAMES if quick else FRAMES)
-    total, finished = len({cell.condition for cell in cells}), 0
+    wanted, sweeps = find_systems(systems), found.QUICK_SWEEPS if quick else found.SWEEPS
+    cells = found.grid_cells(sweeps, found.QUICK_FRAMES if quick else found.FRAMES)
+    total, finished = len({cell.condition for cell in cells}), count(1)
     with counted("conditions", quiet=as_json) as progress:
-
-        def done(_: object) -> None:
-            nonlocal finished
-            finished += 1
-            progress(finished, total)
-
-        rows = measure_cells(cells, wanted, out, jobs, done)
+        rows = found.measure_cells(cells, wanted, out, jobs, lambda _: progress(next(finished), total))
     text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
-    text += limits_table(rows, sweeps, list(wanted))
+    text += found.limits_table(rows, sweeps, list(wanted))
     text += "\nATE RMSE in mm and share of lost frames; bold where the system copes:\n"
-    text += cells_table(rows, sweeps, list(wanted))
-    save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
-    _answer({"rows": rows}, text, out, as_json=as_json)
+    text += found.cells_table(rows, sweeps, list(wanted))
+    answer(save(rows, text, out, "limits"), text, as_json=as_json, out=out)
+
+
+@app.command()
+def consistency(
+    recording: Annotated[Path, Argument(help="Recording.")],
+    trajectories: Annotated[
+        list[Path] | None, Argument(help="Trajectories of it in TUM text, or folders of runs.")
+    ] = None,
+    max_frames: Annotated[int | None, Option(min=2, help="Number of frames from the start.")] = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""
+    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.errors import DatasetError
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.consistency import measure_consistency
+
+    source = open_sequence(recording)
+    truth = {} if source.ground_truth is None else {"published": source.ground_truth}
+    files = [path / "trajectory.txt" if path.is_dir() else path for path in trajectories or []]
+    found = truth | {str(path): Trajectory.load(path) for path in files}
+    if not found:
+        raise DatasetError(f"{recording} comes without poses; name the trajectories to compare, such as a run's folder")
+    result = measure_consistency(source, found, max_frames=max_frames)
+    low, high = result.intervals()
+    answer(result._asdict() | {"means": result.means(), "low": low, "high": high}, result.table(), as_json=as_json)

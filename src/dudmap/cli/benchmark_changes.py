@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
@@ -12,13 +12,13 @@ from dudmap.cli.output import answer
 
 
 def changes(
-    count: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the pairs.", metavar="N")] = 0,
-    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
-    out: Annotated[Path, typer.Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
+    count: Annotated[int, Option(min=1, help="Number of pairs.")] = 20,
+    seed: Annotated[int, Option(min=0, help="Seed of the pairs.", metavar="N")] = 0,
+    min_size: Annotated[float, Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
+    out: Annotated[Path, Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
     into: Annotated[
         Path | None,
-        typer.Option(help="Put things into, and cut them out of, the second half of a real recording.", metavar="PATH"),
+        Option(help="Put things into, and cut them out of, the second half of a real recording.", metavar="PATH"),
     ] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,

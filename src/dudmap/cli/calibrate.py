@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
@@ -14,18 +14,14 @@ if TYPE_CHECKING:
     from dudmap.core.calibration.estimator import Estimate
     from dudmap.core.geometry.calibration import Calibration
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def calibrate(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,
     sequence: o.SequenceArgument,
-    out: Annotated[Path | None, typer.Option(help="Write the calibration to this TOML file.")] = None,
+    out: Annotated[Path | None, Option(help="Write the calibration to this TOML file.")] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration to start from: TOML file of an earlier one.", metavar="FILE")
+        Path | None, Option(help="Calibration to start from: TOML file of an earlier one.", metavar="FILE")
     ] = None,
     max_frames: o.MaxFramesOption = None,
     as_json: o.JsonOption = False,

@@ -3,28 +3,24 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import DatasetError
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def clean(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,
     sequence: o.SequenceArgument,
     out: Annotated[
-        Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
+        Path, Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
     ],
     run: Annotated[
         Path | None,
-        typer.Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
+        Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
     ] = None,
     passes: o.PassesOption = 2,
     max_frames: o.MaxFramesOption = None,

@@ -3,22 +3,14 @@
 import textwrap
 from typing import TYPE_CHECKING
 
-import typer
-
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from dudmap.config import Config
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-def config(
-    preset: o.PresetOption = None,
-    as_json: o.JsonOption = False,
-) -> None:
+def config(preset: o.PresetOption = None, as_json: o.JsonOption = False) -> None:
     """Print all parameters with their meanings as TOML, the format of --config."""
     found = o.read_config(None, preset, None)
     answer(found.model_dump(mode="json"), commented(found).rstrip("\n"), as_json=as_json)

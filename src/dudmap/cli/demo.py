@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.cli import options as o
@@ -20,14 +20,10 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
     from dudmap.core.result import FrameResult
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def demo(
     watching: o.WatchingOptions,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/demo.")] = None,
+    out: Annotated[Path | None, Option(help="Run folder; default: runs/demo.")] = None,
     max_frames: o.FramesOption = 120,
     assignments: o.SetOption = None,
     quiet: o.QuietOption = False,

@@ -3,20 +3,17 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer, free_folder
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def diff(
-    before: Annotated[Path, typer.Argument(help="Run folder of the first visit.", metavar="BEFORE")],
-    after: Annotated[Path, typer.Argument(help="Run folder of the second visit.", metavar="AFTER")],
-    out: Annotated[Path | None, typer.Option(help="Folder; default: runs/<BEFORE>-<AFTER>-changes.")] = None,
-    min_size: Annotated[float, typer.Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
+    before: Annotated[Path, Argument(help="Run folder of the first visit.", metavar="BEFORE")],
+    after: Annotated[Path, Argument(help="Run folder of the second visit.", metavar="AFTER")],
+    out: Annotated[Path | None, Option(help="Folder; default: runs/<BEFORE>-<AFTER>-changes.")] = None,
+    min_size: Annotated[float, Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:

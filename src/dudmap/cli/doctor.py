@@ -8,15 +8,10 @@ import typer
 from dudmap.app.terminal import plain_console, say
 from dudmap.cli import options as o
 
-app = typer.Typer(add_completion=False)
-
 MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", "red")}
 
 
-@app.command()
-def doctor(
-    as_json: o.JsonOption = False,
-) -> None:
+def doctor(as_json: o.JsonOption = False) -> None:
     """Check the installation and say what to do: versions, processor, threads, GPU, caches, extras, port of the page.
 
     Ends with 1 if something stops the program. Notes only limit a part of it.

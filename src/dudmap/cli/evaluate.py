@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text, writing
@@ -30,28 +31,26 @@ app = typer.Typer(
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
-PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots.")]
+PlotsOption = Annotated[bool, Option("--plots", help="Also write plots.")]
 FormatOption = Annotated[
-    str | None, typer.Option("--plot-format", help="Write plots as png (default), pdf or svg.", metavar="FORMAT")
+    str | None, Option("--plot-format", help="Write plots as png (default), pdf or svg.", metavar="FORMAT")
 ]
 OutOption = Annotated[
-    Path | None, typer.Option("--out", help="Output folder for figures and plots; default: the folder of the estimate.")
+    Path | None, Option("--out", help="Output folder for figures and plots; default: the folder of the estimate.")
 ]
 GapOption = Annotated[
-    float, typer.Option("--max-difference", help="Largest time difference of associated poses, s.", metavar="S")
+    float, Option("--max-difference", help="Largest time difference of associated poses, s.", metavar="S")
 ]
 
 
 @app.command()
 def trajectory(
-    estimate: Annotated[
-        Path, typer.Argument(help="Run folder, or trajectory in TUM format.", metavar="RUN|TRAJECTORY")
-    ],
+    estimate: Annotated[Path, Argument(help="Run folder, or trajectory in TUM format.", metavar="RUN|TRAJECTORY")],
     reference: Annotated[
-        Path | None, typer.Option(help="True trajectory in TUM format, or the recording.", metavar="FILE|FOLDER")
+        Path | None, Option(help="True trajectory in TUM format, or the recording.", metavar="FILE|FOLDER")
     ] = None,
     align: Annotated[
-        str, typer.Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
+        str, Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
     ] = "se3",
     max_difference: GapOption = 0.02,
     as_json: o.JsonOption = False,
@@ -95,24 +94,23 @@ def trajectory(
 
 @app.command()
 def mesh(
-    estimate: Annotated[Path, typer.Argument(help="Mesh file, or run folder with mesh.ply.", metavar="EST")],
+    estimate: Annotated[Path, Argument(help="Mesh file, or run folder with mesh.ply.", metavar="EST")],
     reference: Annotated[
-        Path, typer.Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
+        Path, Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
     ],
     register_first: Annotated[
-        bool, typer.Option("--register", help="Register the mesh to the reference first (ICP).")
+        bool, Option("--register", help="Register the mesh to the reference first (ICP).")
     ] = False,
     thresholds: Annotated[
-        str,
-        typer.Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,..."),
+        str, Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,...")
     ] = "0.01,0.02,0.05",
     ghost_distance: Annotated[
-        float, typer.Option(help="Estimated surface farther than this from the true one counts as ghost, m.")
+        float, Option(help="Estimated surface farther than this from the true one counts as ghost, m.")
     ] = 0.05,
-    samples: Annotated[int, typer.Option(help="Number of sampled points per surface.")] = 300_000,
-    points: Annotated[bool, typer.Option("--points", help="Accept point clouds, which have no area.")] = False,
+    samples: Annotated[int, Option(help="Number of sampled points per surface.")] = 300_000,
+    points: Annotated[bool, Option("--points", help="Accept point clouds, which have no area.")] = False,
     error_mesh: Annotated[
-        bool, typer.Option("--error-mesh/--no-error-mesh", help="Write mesh_error.ply, coloured by the error.")
+        bool, Option("--error-mesh/--no-error-mesh", help="Write mesh_error.ply, coloured by the error.")
     ] = True,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
@@ -124,6 +122,8 @@ def mesh(
     A run folder and a recording with groundtruth.txt are aligned at their first pose. Other surfaces must share one
     coordinate frame.
     """
+    import numpy as np
+
     from dudmap.evaluation import reconstruction
     from dudmap.evaluation.files import first_pose_alignment, load_mesh
     from dudmap.evaluation.surface import moved, register
@@ -140,28 +140,19 @@ def mesh(
     if register_first:
         registration = register(found, true, T)
         T = registration.T_reference_estimate
-        figures |= {
-            "icp_rmse_m": round(registration.rmse, 6),
-            "icp_iterations": registration.num_iterations,
-            "icp_free_directions": registration.free_directions,
-        }
-    figures["T_reference_estimate"] = None if T is None else [[round(float(x), 9) for x in row] for row in T]
+        figures |= {"icp_rmse_m": round(registration.rmse, 6), "icp_iterations": registration.num_iterations}
+        figures["icp_free_directions"] = registration.free_directions
+    figures["T_reference_estimate"] = None if T is None else np.round(T, 9).tolist()
     found = found if T is None else moved(found, T)
+    distances = o.numbers(thresholds, None, "--distances")
     result = reconstruction.compare_surfaces(
-        found,
-        true,
-        observed=observed,
-        thresholds=tuple(o.numbers(thresholds, None, "--distances")),
-        ghost_distance=ghost_distance,
-        samples=samples,
+        found, true, observed=observed, thresholds=distances, ghost_distance=ghost_distance, samples=samples,
         points=points,
-    )
-    figures |= result.figures()
-    figures["histogram"] = {
-        "edges_m": [round(float(edge), 6) for edge in result.histogram_edges],
-        "accuracy": [round(float(share), 6) for share in result.accuracy_histogram],
-        "completeness": [round(float(share), 6) for share in result.completeness_histogram],
-    }
+    )  # fmt: skip
+    columns = result.histogram_edges, result.accuracy_histogram, result.completeness_histogram
+    histogram = {name: np.round(column, 6).tolist()
+                 for name, column in zip(("edges_m", "accuracy", "completeness"), columns, strict=True)}  # fmt: skip
+    figures |= result.figures() | {"histogram": histogram}
     target = _output_folder(out, estimate if estimate.is_dir() else file.parent)
     stem = "mesh" if estimate.is_dir() else file.stem
     pictures: list[Path] = []
@@ -178,12 +169,12 @@ def mesh(
 
 @app.command()
 def masks(
-    estimate: Annotated[Path, typer.Argument(help="Run folder with masks/ (--save-masks).", metavar="RUN")],
+    estimate: Annotated[Path, Argument(help="Run folder with masks/ (--save-masks).", metavar="RUN")],
     reference: Annotated[
-        Path, typer.Argument(help="Recording's folder with mask.txt, or folder of <timestamp>.png.", metavar="REF")
+        Path, Argument(help="Recording's folder with mask.txt, or folder of <timestamp>.png.", metavar="REF")
     ],
     per_frame: Annotated[
-        bool, typer.Option("--per-frame", help="Add the figures of every frame to the JSON output.")
+        bool, Option("--per-frame", help="Add the figures of every frame to the JSON output.")
     ] = False,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,

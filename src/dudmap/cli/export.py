@@ -3,46 +3,40 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.io.exporting.exporters import EXPORTERS
 from dudmap.io.exporting.run_content import SPECK, ExportOptions
 
-app = typer.Typer(add_completion=False)
 _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS.items())
 
 
-@app.command()
 def export(
     run: o.RunArgument,
-    out: Annotated[Path, typer.Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],
+    out: Annotated[Path, Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],
     max_triangles: Annotated[
-        int | None, typer.Option(min=4, help="Decimate the mesh to so many triangles.", metavar="N")
+        int | None, Option(min=4, help="Decimate the mesh to so many triangles.", metavar="N")
     ] = None,
-    crop: Annotated[
-        str | None, typer.Option(help="Keep a box of the map, metres.", metavar="X0,Y0,Z0,X1,Y1,Z1")
-    ] = None,
+    crop: Annotated[str | None, Option(help="Keep a box of the map, metres.", metavar="X0,Y0,Z0,X1,Y1,Z1")] = None,
     drop_pieces_below: Annotated[
-        float, typer.Option(min=0, help="Leave out connected pieces with less surface; 0 keeps all.", metavar="M2")
+        float, Option(min=0, help="Leave out connected pieces with less surface; 0 keeps all.", metavar="M2")
     ] = SPECK,
     fill_holes: Annotated[
-        float | None, typer.Option(min=0, help="Close holes with a shorter border.", metavar="METRES")
+        float | None, Option(min=0, help="Close holes with a shorter border.", metavar="METRES")
     ] = None,
     up: o.UpOption = None,
-    resolution: Annotated[float, typer.Option(min=0.001, help="Cells of grids.", metavar="METRES")] = 0.05,
+    resolution: Annotated[float, Option(min=0.001, help="Cells of grids.", metavar="METRES")] = 0.05,
     heights: Annotated[
-        str, typer.Option(help="Lower and upper end of the robot above the floor.", metavar="LOW,HIGH")
+        str, Option(help="Lower and upper end of the robot above the floor.", metavar="LOW,HIGH")
     ] = "0.1,1.8",
     sequence: Annotated[
         Path | None,
-        typer.Option(
-            help="The recording of the run, for images and masks; default: the one it names.", metavar="SEQUENCE"
-        ),
+        Option(help="The recording of the run, for images and masks; default: the one it names.", metavar="SEQUENCE"),
     ] = None,
     camera: o.CameraOption = None,
-    every: Annotated[int, typer.Option(min=1, help="Every so many frames of the recording.", metavar="N")] = 1,
+    every: Annotated[int, Option(min=1, help="Every so many frames of the recording.", metavar="N")] = 1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
@@ -11,20 +11,15 @@ from dudmap.cli.output import answer
 if TYPE_CHECKING:
     from dudmap.app.pipeline.inspection import Inspection
 
-app = typer.Typer(add_completion=False)
 
 SHOWN_GAPS = 5
 """Number of gaps in the times that are printed one by one."""
 
 
-@app.command()
-@o.grouped
 def info(
     reading: o.ReadingOptions,
     sequence: o.SequenceArgument,
-    sheet: Annotated[
-        Path | None, typer.Option(help="Write a contact sheet (PNG) of twelve frames.", metavar="FILE")
-    ] = None,
+    sheet: Annotated[Path | None, Option(help="Write a contact sheet (PNG) of twelve frames.", metavar="FILE")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.

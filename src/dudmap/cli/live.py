@@ -3,25 +3,21 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.run import run_parameters
 from dudmap.cli.view import observers
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def live(
     parameters: o.ParameterOptions,
     mapped: o.MapOptions,
     watching: o.WatchingOptions,
     camera: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="CAMERA",
@@ -29,16 +25,14 @@ def live(
         ),
     ] = None,
     max_frames: o.MaxFramesOption = None,
-    record: Annotated[
-        Path | None, typer.Option(help="MCAP file for all frames that arrive.", metavar="FILE.mcap")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<camera>.")] = None,
+    record: Annotated[Path | None, Option(help="MCAP file for all frames that arrive.", metavar="FILE.mcap")] = None,
+    out: Annotated[Path | None, Option(help="Run folder; default: runs/<camera>.")] = None,
     save_masks: o.SaveMasksOption = False,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="calibration.toml of an earlier run with this camera; default: its own.", metavar="FILE"),
+        Option(help="calibration.toml of an earlier run with this camera; default: its own.", metavar="FILE"),
     ] = None,
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene while a camera moves; Ctrl-C ends and writes the results.

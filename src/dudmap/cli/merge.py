@@ -3,28 +3,18 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.output import answer, free_folder
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def merge(
-    runs: Annotated[
-        list[Path], typer.Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="New folder; default: runs/<A>-<B>, or runs/world with more runs."),
-    ] = None,
-    world: Annotated[
-        bool, typer.Option("--world", help="Write map parts and tiles also for two runs, as for more.")
-    ] = False,
-    jobs: Annotated[int, typer.Option(help="Processes, with more than two runs or --world.", metavar="N", min=1)] = 1,
+    runs: Annotated[list[Path], Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")],
+    out: Annotated[Path | None, Option(help="New folder; default: runs/<A>-<B>, or runs/world with more runs.")] = None,
+    world: Annotated[bool, Option("--world", help="Write map parts and tiles also for two runs, as for more.")] = False,
+    jobs: Annotated[int, Option(help="Processes, with more than two runs or --world.", metavar="N", min=1)] = 1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:

@@ -12,7 +12,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from dudmap.errors import ConfigError
 
@@ -78,30 +78,28 @@ def camera_names(incomplete: str) -> list[str]:
     return [name for name in CAMERAS if name.startswith(incomplete)]
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
-RunArgument = Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")]
-SequenceArgument = Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="SEQUENCE")]
+JsonOption = Annotated[bool, Option("--json", help="Print the result as one JSON object, and nothing else.")]
+QuietOption = Annotated[bool, Option("--quiet", help="No progress bar and no table.")]
+RunArgument = Annotated[Path, Argument(help="Run folder of dudmap run.", metavar="RUN")]
+SequenceArgument = Annotated[Path, Argument(help="Recording: folder, file or archive.", metavar="SEQUENCE")]
 CameraOption = Annotated[
-    str | None,
-    typer.Option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS"),
+    str | None, Option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS")
 ]
-RateOption = Annotated[float, typer.Option("--fps", min=0.1, help="Frames per second.", metavar="HZ")]
-MaxFramesOption = Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.", metavar="N")]
-FramesOption = Annotated[int, typer.Option("--max-frames", min=1, help="Number of frames.", metavar="N")]
+RateOption = Annotated[float, Option("--fps", min=0.1, help="Frames per second.", metavar="HZ")]
+MaxFramesOption = Annotated[int | None, Option(min=1, help="Stop after this many frames.", metavar="N")]
+FramesOption = Annotated[int, Option("--max-frames", min=1, help="Number of frames.", metavar="N")]
 PassesOption = Annotated[
-    int, typer.Option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="N")
+    int, Option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="N")
 ]
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all that is random.", metavar="N")]
-SizeOption = Annotated[str, typer.Option(help="Image size in pixels.", metavar="WxH")]
+SeedOption = Annotated[int, Option(min=0, help="Seed of all that is random.", metavar="N")]
+SizeOption = Annotated[str, Option(help="Image size in pixels.", metavar="WxH")]
 
 PresetOption = Annotated[
-    str | None,
-    typer.Option(help="Preset of the parameters: default or thesis.", metavar="NAME", autocompletion=preset_names),
+    str | None, Option(help="Preset of the parameters: default or thesis.", metavar="NAME", autocompletion=preset_names)
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         help="Set a parameter, e.g. tracker.huber=0.02; repeatable.",
         metavar="KEY=VALUE",
@@ -109,28 +107,24 @@ SetOption = Annotated[
     ),
 ]
 JobsOption = Annotated[
-    int, typer.Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
+    int, Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
-SaveMasksOption = Annotated[
-    bool, typer.Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")
-]
+SaveMasksOption = Annotated[bool, Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")]
 HostOption = Annotated[
-    str, typer.Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
+    str, Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
 ]
-PortOption = Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535, metavar="PORT")]
+PortOption = Annotated[int, Option(help="Port of the page.", min=1, max=65535, metavar="PORT")]
 TokenOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Secret part of the page's address; default: none on this machine, a random one with another --host.",
         metavar="TEXT",
     ),
 ]
 UpOption = Annotated[
     str | None,
-    typer.Option(
-        help="Direction against gravity in the world of the run, by default that of its floor.", metavar="X,Y,Z"
-    ),
+    Option(help="Direction against gravity in the world of the run, by default that of its floor.", metavar="X,Y,Z"),
 ]
 
 
@@ -140,23 +134,20 @@ class ReadingOptions:
 
     camera: CameraOption = None
     fps: Annotated[
-        float | None,
-        typer.Option(help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ"),
+        float | None, Option(help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ")
     ] = None
     depth_unit: Annotated[
-        float | None, typer.Option(help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES")
+        float | None, Option(help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES")
     ] = None
     color: Annotated[
-        str | None,
-        typer.Option(help="Colour images of a folder in no known layout, e.g. 'left/*.png'.", metavar="PATTERN"),
+        str | None, Option(help="Colour images of a folder in no known layout, e.g. 'left/*.png'.", metavar="PATTERN")
     ] = None
     depth: Annotated[
-        str | None,
-        typer.Option(help="Depth images of a folder in no known layout, e.g. 'range/*.png'.", metavar="PATTERN"),
+        str | None, Option(help="Depth images of a folder in no known layout, e.g. 'range/*.png'.", metavar="PATTERN")
     ] = None
     topics: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Of a bag: color=, depth=, color_info=, depth_info= and world= (the frame), separated by commas.",
             metavar="KEY=TOPIC",
         ),
@@ -175,7 +166,7 @@ class ReadingOptions:
 class ParameterOptions:
     """Options that give the parameters."""
 
-    config: Annotated[Path | None, typer.Option(help="TOML file of parameters.", metavar="FILE")] = None
+    config: Annotated[Path | None, Option(help="TOML file of parameters.", metavar="FILE")] = None
     preset: PresetOption = None
     assignments: SetOption = None
 
@@ -189,17 +180,15 @@ class WatchingOptions:
     """Options on how a run is watched and recorded."""
 
     report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
+        bool, Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
     ] = True
     rerun: Annotated[
-        Path | None, typer.Option(help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd")
+        Path | None, Option(help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd")
     ] = None
     log: Annotated[
-        Path | None, typer.Option(help="File for one JSON object per line and event of the run.", metavar="FILE")
+        Path | None, Option(help="File for one JSON object per line and event of the run.", metavar="FILE")
     ] = None
-    view: Annotated[bool, typer.Option("--view", help="Show the run in the browser while it goes on (extra view).")] = (
-        False
-    )
+    view: Annotated[bool, Option("--view", help="Show the run in the browser while it goes on (extra view).")] = False
     host: HostOption = "127.0.0.1"
     port: PortOption = 8080
     token: TokenOption = None
@@ -211,22 +200,18 @@ class MapOptions:
 
     saved: Annotated[
         Path | None,
-        typer.Option(
-            "--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"
-        ),
+        Option("--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"),
     ] = None
     localize: Annotated[
-        bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
+        bool, Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False
     max_memory: Annotated[
         str | None,
-        typer.Option(
-            help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"
-        ),
+        Option(help="Largest memory of the process, such as 1GB; the rest of the map waits on disk.", metavar="BYTES"),
     ] = None
     device: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU.", metavar="DEVICE"
         ),
     ] = None

@@ -1,10 +1,10 @@
 """What commands have in common: the answer on stdout, as text or as JSON, progress, and groups of commands."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import to_json
 from typer.core import TyperGroup
 
 from dudmap.app.terminal import say
@@ -20,27 +20,14 @@ class DefaultGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
-    """Print the result of a command to stdout: as one JSON object, as text, or not at all."""
+def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False, out: Path | None = None) -> None:
+    """Print the result of a command, and where it is written, to stdout: as one JSON object, as text, or not at all."""
+    if out is not None:
+        tree, text = {**tree, "out": out}, f"{text}\nwritten to {out}"
     if as_json:
-        say(json.dumps(plain(tree), allow_nan=False))
+        say(to_json(tree, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode())
     elif not quiet:
         say(text)
-
-
-def plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds
-    """The value as JSON knows it: arrays are lists, paths are text, numbers that are not finite are null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    return value
 
 
 def free_folder(wanted: Path) -> Path:

@@ -3,33 +3,27 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import ConfigError
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def render(
     run: o.RunArgument,
-    out: Annotated[
-        Path,
-        typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout."),
-    ],
+    out: Annotated[Path, Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout.")],
     trajectory: Annotated[
-        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
+        Path | None, Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
     ] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the whole map.")] = False,
+    orbit: Annotated[bool, Option("--orbit", help="A camera that circles about the whole map.")] = False,
     sweep: Annotated[
-        float, typer.Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
+        float, Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
     max_frames: o.FramesOption = 120,
     fps: o.RateOption = 30.0,
-    size: Annotated[str | None, typer.Option(help="Image size in pixels.", metavar="WxH")] = None,
+    size: Annotated[str | None, Option(help="Image size in pixels.", metavar="WxH")] = None,
     up: o.UpOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,

@@ -3,18 +3,15 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def report(
     run: o.RunArgument,
-    out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html in the run folder.")] = None,
+    out: Annotated[Path | None, Option(help="HTML file; default: report.html in the run folder.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
@@ -16,11 +17,7 @@ if TYPE_CHECKING:
     from dudmap.config import Config
     from dudmap.core.places.saved_map import SavedMap
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
-@o.grouped
 def run(
     reading: o.ReadingOptions,
     parameters: o.ParameterOptions,
@@ -28,42 +25,39 @@ def run(
     watching: o.WatchingOptions,
     sequence: Annotated[
         Path | None,
-        typer.Argument(
-            help="Recording: folder, file or archive; `dudmap info` says what is found.", metavar="SEQUENCE"
-        ),
+        Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.", metavar="SEQUENCE"),
     ] = None,
     masks: Annotated[
         Path | None,
-        typer.Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
+        Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
     ] = None,
     max_frames: o.MaxFramesOption = None,
-    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<recording>.")] = None,
+    out: Annotated[Path | None, Option(help="Run folder; default: runs/<recording>.")] = None,
     save_masks: o.SaveMasksOption = True,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     watch: Annotated[
-        bool,
-        typer.Option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl)."),
+        bool, Option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl).")
     ] = False,
     passes: o.PassesOption = 1,
     calibration: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while "
             "it runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
             metavar="auto|given|FILE",
         ),
     ] = "auto",
     live: Annotated[
-        bool, typer.Option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
+        bool, Option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
     ] = False,
     resume: Annotated[
         Path | None,
-        typer.Option(help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"),
+        Option(help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"),
     ] = None,
     checkpoint_every: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="Seconds from one checkpoint to the next; 0 for none. Default: as often as takes 2 % of the time.",
             min=0,
             metavar="SECONDS",

@@ -1,58 +1,56 @@
 """``dudmap synth``: render a synthetic recording with exact ground truth."""
 
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def synth(
-    out: Annotated[Path, typer.Argument(help="Output folder, in TUM layout with ground truth.")],
-    scene: Annotated[str, typer.Option(help="room, corridor, desk, yard, textureless, plane or box.")] = "room",
+    out: Annotated[Path, Argument(help="Output folder, in TUM layout with ground truth.")],
+    scene: Annotated[str, Option(help="room, corridor, desk, yard, textureless, plane or box.")] = "room",
     camera_path: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file in TUM format.",
             metavar="FILE|NAME",
         ),
     ] = None,
     movers: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="person, people, wanderer, carried_box, removed_box, ball, balloon, creeper, stopping_cart, "
             "starting_cart, door; comma-separated or repeated; none for a static scene."
         ),
     ] = None,
-    speed: Annotated[float | None, typer.Option(help="Speed of the movers.", metavar="M_PER_S")] = None,
+    speed: Annotated[float | None, Option(help="Speed of the movers.", metavar="M_PER_S")] = None,
     coverage: Annotated[
-        float | None, typer.Option(help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE")
+        float | None, Option(help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE")
     ] = None,
     start_dynamic: Annotated[
-        bool, typer.Option("--start-dynamic", help="Movers are in view from the first frame on.")
+        bool, Option("--start-dynamic", help="Movers are in view from the first frame on.")
     ] = False,
     situation: Annotated[
-        str | None,
-        typer.Option(help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away."),
+        str | None, Option(help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away.")
     ] = None,
     max_frames: o.FramesOption = 120,
     fps: o.RateOption = 30.0,
     sensor: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="A camera with its noise, faults and view: kinect_v1, kinect_v2, realsense_d435, realsense_l515 or "
             "iphone_lidar."
         ),
     ] = None,
     noise: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Noise of depth and colour: kinect (default without --sensor), realsense, d435, kinect_v2, l515, "
             "iphone, or none."
         ),
@@ -60,31 +58,29 @@ def synth(
     seed: o.SeedOption = 0,
     size: o.SizeOption = "640x480",
     motion_blur: Annotated[
-        float | None, typer.Option(help="Exposure time as a share of the frame interval, by default 0.")
+        float | None, Option(help="Exposure time as a share of the frame interval, by default 0.")
     ] = None,
-    exposure_change: Annotated[
-        float, typer.Option(help="Relative amplitude of a slow oscillation of the exposure.")
-    ] = 0.0,
+    exposure_change: Annotated[float, Option(help="Relative amplitude of a slow oscillation of the exposure.")] = 0.0,
     fault: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=VALUE",
             help="A fault of the sensor, on top of --sensor, such as color_delay=0.025; repeatable. "
             "The names are in docs/synthetic.md; an unknown one lists them.",
         ),
     ] = None,
     visits: Annotated[
-        int, typer.Option(min=1, max=2, help="2: two recordings of one place, with --changes between them.")
+        int, Option(min=1, max=2, help="2: two recordings of one place, with --changes between them.")
     ] = 1,
     changes: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="THING:KIND,...",
             help="box, ball, bin, chair or shelf :moved, :appeared or :disappeared, door:opened, poster:recoloured; or "
             "none. With --movers people these walk through the second visit.",
         ),
     ] = "none",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -115,22 +111,10 @@ def synth(
         answer(tree, f"{out}: two visits, {', '.join(kinds) or 'nothing changed'}", as_json=as_json, quiet=quiet)
         return
     sequence = synthetic.sequence(
-        scene=scene,
-        movers=_names(movers),
-        camera_path=camera_path,
-        speed=speed,
-        coverage=coverage,
-        start_dynamic=start_dynamic,
-        situation=situation,
-        seed=seed,
-        motion_blur=motion_blur,
-        exposure_change=exposure_change,
-        sensor=sensor,
-        faults=parse_faults(fault or []),
-        **options,
-    )
-    import time
-
+        scene, _names(movers), camera_path, speed=speed, coverage=coverage, start_dynamic=start_dynamic,
+        situation=situation, seed=seed, motion_blur=motion_blur, exposure_change=exposure_change, sensor=sensor,
+        faults=parse_faults(fault or []), **options,
+    )  # fmt: skip
     start, count = time.perf_counter(), len(sequence)
     with counted("rendering", quiet=quiet or as_json) as progress:
         write_folder(sequence, out, overwrite=overwrite, progress=lambda done: progress(done, count))

@@ -16,15 +16,9 @@ from dudmap.errors import DudmapError
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def view(
-    run: o.RunArgument,
-    host: o.HostOption = "127.0.0.1",
-    port: o.PortOption = 8080,
-    token: o.TokenOption = None,
+    run: o.RunArgument, host: o.HostOption = "127.0.0.1", port: o.PortOption = 8080, token: o.TokenOption = None
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
     from dudmap.app.viewing.live_view import open_run

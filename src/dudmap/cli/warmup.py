@@ -2,15 +2,10 @@
 
 import time
 
-import typer
-
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 
-app = typer.Typer(add_completion=False)
 
-
-@app.command()
 def warmup(quiet: o.QuietOption = False, as_json: o.JsonOption = False) -> None:
     """Compile all kernels in advance.
 

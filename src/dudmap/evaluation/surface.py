@@ -167,11 +167,7 @@ class SurfaceAlignment:
 
 
 def register(
-    estimate: Mesh,
-    reference: Mesh,
-    T_reference_estimate: NDArray[np.float64] | None = None,
-    *,
-    samples: int = 30_000,
+    estimate: Mesh, reference: Mesh, T_reference_estimate: NDArray[np.float64] | None = None, *, samples: int = 30_000
 ) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 

@@ -1,7 +1,8 @@
 """Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V).
 
-Trajectories that cannot be compared (no overlap in time, or fewer than three pairs) are a ``DatasetError``, arguments
-that are not acceptable a ``ConfigError``.
+Poses are camera to world, of the ``estimate`` and of the true ``reference``; they are pairs up to ``max_difference``
+seconds apart. Trajectories that cannot be compared (no overlap in time, or fewer than three pairs) are a
+``DatasetError``, arguments that are not acceptable a ``ConfigError``.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from dudmap.errors import ConfigError, DatasetError
 
 Numbers = NDArray[np.float64]
 Align = Literal["se3", "origin", "none"]
-Unit = Literal["s", "m", "frames"]
+Unit = Literal["s", "m"]
 
 FEWEST_PAIRS = 3
 SMALLEST_SPREAD = 1e-3
@@ -106,7 +107,7 @@ class AteResult(PoseErrors):
 
 @dataclass(frozen=True, eq=False)
 class RpeResult(PoseErrors):
-    """Relative pose error over a fixed interval of time, path length or frames.
+    """Relative pose error over a fixed interval of time or path length.
 
     Attributes:
         delta: Length of the interval.
@@ -126,13 +127,7 @@ class PosePairs(NamedTuple):
 
 
 def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> PosePairs:
-    """Associate the poses of two trajectories one to one, closest timestamps first.
-
-    Args:
-        estimate: Estimated poses.
-        reference: True poses.
-        max_difference: Largest difference of the timestamps of a pair, seconds.
-    """
+    """Associate the poses of two trajectories one to one, closest timestamps first."""
     for name, trajectory in (("estimated", estimate), ("reference", reference)):
         if not len(trajectory):
             raise DatasetError(f"the {name} trajectory holds no pose; nothing can be compared")
@@ -160,13 +155,10 @@ def ate(
     The errors are the norm of E_i's translation and the angle of its rotation.
 
     Args:
-        estimate: Estimated poses, camera to world.
-        reference: True poses, camera to world.
         align: ``se3``: A brings the positions closest to each other in the least-squares sense, without scale (Umeyama
             1991, as in the TUM script); where the positions do not determine its rotation it is the mean of the
             rotations that align the orientations. ``origin``: A maps the first pose onto its partner, so that the
             error of a fixed camera is its drift from the start. ``none``: A is the identity.
-        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -194,27 +186,16 @@ def rpe(
     the pose nearest to that distance. A pair is dropped if it misses ``delta`` by more than half the median time
     between two poses (at least ``max_difference``) for ``s``, or by more than a tenth for ``m``. (The script pairs
     across gaps where tracking was lost, and leaves out all pairs that end at the last pose.) Metres are counted along
-    the reference path; ``frames`` counts the poses that have a partner in the reference.
-
-    Args:
-        estimate: Estimated poses, camera to world.
-        reference: True poses, camera to world.
-        delta: The interval; a whole number for ``frames``.
-        unit: ``s``, ``m`` or ``frames``.
-        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
+    the reference path.
     """
-    if unit not in get_args(Unit):
-        raise ConfigError(f"the unit of delta is {unit!r}; expected one of {', '.join(get_args(Unit))}")
-    if not (np.isfinite(delta) and delta > 0) or (unit == "frames" and delta != int(delta)):
-        raise ConfigError(f"delta is {delta} {unit}; expected a positive number, whole for frames")
+    if unit not in get_args(Unit) or not (np.isfinite(delta) and delta > 0):
+        raise ConfigError(f"delta is {delta} {unit}; expected a positive number of {' or '.join(get_args(Unit))}")
     stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
     if unit == "s":
         position, tolerance = stamps, max(max_difference, float(np.median(np.diff(stamps))) / 2)
-    elif unit == "m":
+    else:
         steps = np.linalg.norm(np.diff(Ts_reference[:, :3, 3], axis=0), axis=1)
         position, tolerance = np.concatenate([[0.0], np.cumsum(steps)]), PATH_TOLERANCE * delta
-    else:
-        position, tolerance = np.arange(len(stamps), dtype=np.float64), 0.0
     i, j = _partners(position, delta, tolerance)
     if not len(i):
         length = position[-1] - position[0]
@@ -233,12 +214,6 @@ def trajectory_figures(
     ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
     first pose only, by which a fixed or merely rotating camera is judged; RPE per second and per metre. A relative
     error is None where the recording is too short for it; ``rpe_per_s_missing`` or ``rpe_per_m_missing`` is the reason.
-
-    Args:
-        estimate: Estimated poses, camera to world.
-        reference: True poses, camera to world.
-        align: Alignment of the ATE, see ``ate``.
-        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)

@@ -1,5 +1,9 @@
-"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map."""
+"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map.
 
+A recording without true poses is a ``DatasetError``.
+"""
+
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -25,29 +29,7 @@ DAMPING = 1e-4
 """Damping relative to the diagonal of H, which only keeps unconstrained directions from drifting."""
 
 
-class Pull(NamedTuple):
-    """Corrections of the frames' true poses by one term.
-
-    Attributes:
-        term: ``distances``, ``colour`` or ``both``.
-        corrections: (n, 6) float64, translation (mm) and rotation vector (deg), camera axes.
-    """
-
-    term: str
-    corrections: NDArray[np.float64]
-
-    @property
-    def mean(self) -> NDArray[np.float64]:
-        """Mean correction (6,)."""
-        return self.corrections.mean(axis=0)
-
-    @property
-    def spread(self) -> NDArray[np.float64]:
-        """Standard deviation (6,) of the corrections over the frames."""
-        return self.corrections.std(axis=0)
-
-
-def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[Pull]:
+def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> dict[str, NDArray[np.float64]]:
     """Fuse a static recording at its true poses, then register every ``stride``-th frame from its true pose.
 
     This shows systematic errors, which neither residuals nor the ATE of a run show separately: where images, poses and
@@ -55,8 +37,9 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[P
 
     The world frame is the first camera's, as in a run. Frames without a true pose are left out.
 
-    Raises:
-        DatasetError: The recording has no true poses for at least two frames.
+    Returns:
+        Corrections (n, 6) of the n poses by ``distances``, ``colour`` and ``both``: translation (mm) and rotation
+            vector (deg), camera axes.
     """
     truth = sequence.ground_truth
     if truth is None:
@@ -89,7 +72,7 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[P
             correction = se3.inverse(T_true) @ _registered(tracker, volume, lit, T_true, term)
             rotation = np.degrees(se3.log_rotation(correction[:3, :3]))
             found.append(np.concatenate([1000 * correction[:3, 3], rotation]))
-    return [Pull(term, np.array(found)) for term, found in corrections.items()]
+    return {term: np.array(found) for term, found in corrections.items()}
 
 
 def _registered(
@@ -114,13 +97,14 @@ def _registered(
     return T
 
 
-def bias_table(pulls: list[Pull]) -> str:
+def bias_table(pulls: Mapping[str, NDArray[np.float64]]) -> str:
     """Markdown table of the mean corrections and their spread."""
     head = ["term", "mean x, y, z (mm)", "mean rotation x, y, z (deg)", "spread (mm)", "spread (deg)"]
     rows = []
-    for pull in pulls:
-        parts = [(pull.mean[:3], 2), (pull.mean[3:], 3), (pull.spread[:3], 2), (pull.spread[3:], 3)]
-        rows.append([pull.term, *(", ".join(f"{value:+.{digits}f}" for value in cell) for cell, digits in parts)])
+    for term, corrections in pulls.items():
+        mean, spread = corrections.mean(axis=0), corrections.std(axis=0)
+        parts = [(mean[:3], 2), (mean[3:], 3), (spread[:3], 2), (spread[3:], 3)]
+        rows.append([term, *(", ".join(f"{value:+.{digits}f}" for value in cell) for cell, digits in parts)])
     return grid(head, rows, words=5)
 
 
@@ -149,9 +133,6 @@ def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAME
     """Track the first frames by distances only, as configured, and by colour almost only; of the final trajectory.
 
     Both trajectories begin with the first camera: what its noise does to the world frame is no error.
-
-    Raises:
-        DatasetError: The recording has no true poses.
     """
     truth = sequence.ground_truth
     if truth is None:

@@ -3,6 +3,8 @@
 A frame seen from the pose of another one must show the depth and the intensities measured there. Trajectories are
 compared on the same pixels of the same pairs of frames, so that what no pose explains, such as noise, movers and
 occlusion, concerns them all alike.
+
+Trajectories with too few frames of the recording in common are a ``DatasetError``.
 """
 
 from collections.abc import Mapping
@@ -113,9 +115,6 @@ def measure_consistency(
 ) -> Consistency:
     """Compare pairs of frames of a recording, as trajectories relate them; known dynamic pixels and gaps too long for
     the recording are left out.
-
-    Raises:
-        DatasetError: The trajectories have too few frames of the recording in common.
     """
     stamps = sequence.timestamps[:max_frames]
     found = (((n, _pose(each, t)) for n, t in enumerate(stamps)) for each in trajectories.values())

@@ -1,4 +1,7 @@
-"""Accuracy gate: on a small fixed set of recordings no figure may be worse than the recorded one plus a margin."""
+"""Accuracy gate: on a small fixed set of recordings no figure may be worse than the recorded one plus a margin.
+
+A file or a figure that is missing in it is a ``ConfigError``.
+"""
 
 import tomllib
 from collections.abc import Mapping
@@ -52,9 +55,6 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
 
     Returns:
         ``sequence``, ``figure``, ``recorded``, ``bound`` (worst value that passes), ``measured`` and ``passed``.
-
-    Raises:
-        ConfigError: A recording or a margin is missing in the file.
     """
     checks = []
     for row in rows:
@@ -74,11 +74,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
 
 
 def load_figures(path: Path) -> dict[str, Any]:
-    """Content of the file: ``margins`` by figure, and ``figures`` by recording and figure.
-
-    Raises:
-        ConfigError: The file is missing or malformed.
-    """
+    """Content of the file: ``margins`` by figure, and ``figures`` by recording and figure."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:

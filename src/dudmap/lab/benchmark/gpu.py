@@ -1,4 +1,7 @@
-"""Time per frame and per kernel on a GPU and on the CPU, and Open3D's dense SLAM on the same frames and machine."""
+"""Time per frame and per kernel on a GPU and on the CPU, and Open3D's dense SLAM on the same frames and machine.
+
+A program that fails is a ``DudmapError``, a list that cannot be understood a ``ConfigError``.
+"""
 
 import importlib.util
 import json
@@ -8,27 +11,27 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import obstacle, resolve
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence, open_sequence
 from dudmap.lab.benchmark.measure import Row, grid, in_own_process
-from dudmap.lab.benchmark.speed import WARM_UP
+from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import sequence as synthetic_sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-
-if TYPE_CHECKING:
-    from dudmap.io.sequences import Sequence
 
 ROUNDS = 3
 """Number of alternating runs of each system, so that a varying load affects both."""
@@ -46,11 +49,7 @@ class Comparison(NamedTuple):
 
 
 def find_open3d(python: Path | None) -> str | None:
-    """Python interpreter with open3d: the given one, else this one if it has open3d, else None.
-
-    Raises:
-        DudmapError: The given interpreter cannot import open3d.
-    """
+    """Python interpreter with open3d: the given one, else this one if it has open3d, else None."""
     if python is None:
         return sys.executable if importlib.util.find_spec("open3d") else None
     try:
@@ -69,12 +68,8 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
 
     Both receive decoded images and are timed until the pose is estimated and the frame is fused: ours with the default
     configuration including dynamic labels, theirs with the same voxel size and largest depth.
-
-    Raises:
-        DudmapError: A run failed.
     """
-    ours: list[Row] = []
-    theirs: list[Row] = []
+    ours, theirs = list[Row](), list[Row]()
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = Path(temporary)
         truth, stamps = save_frames(entry.open(), frames, folder)
@@ -88,11 +83,10 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
         poses: list[Any] = [(t, np.array(T)) for t, T in zip(stamps, row["poses"], strict=True) if T is not None]
         scored = accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",)) if truth and poses else {}
         ates.append(scored.get("ate_rmse_m"))
-    our_ate, their_ate = ates
-    return Comparison(median_ms(ours), median_ms(theirs), our_ate, their_ate, len(stamps), str(theirs[-1]["version"]))
+    return Comparison(median_ms(ours), median_ms(theirs), *ates, len(stamps), str(theirs[-1]["version"]))
 
 
-def save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
+def save_frames(sequence: Sequence, frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
     """Write the arrays that open3d_slam.py reads; returns the ground truth and the timestamps (n,)."""
     camera, count = sequence.camera, min(frames, len(sequence))
     if count < 2:
@@ -113,10 +107,6 @@ def save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajec
 
 
 def _run_ours(folder: Path) -> Row:
-    from dudmap.core.frames.frame import Frame
-    from dudmap.core.geometry.camera import Camera
-    from dudmap.core.slam import Slam
-
     camera = Camera(**json.loads((folder / "camera.json").read_text(encoding="utf-8")))
     depths, colors = (np.load(folder / f"{kind}.npy", mmap_mode="r", allow_pickle=False) for kind in ("depth", "color"))
     slam, ms, poses = Slam(camera, Config()), [], []
@@ -133,9 +123,6 @@ def run_open3d(python: str, folder: Path, voxel_size: float, device: str = "CPU:
     """Open3D's dense SLAM on the frames that ``save_frames`` wrote: version, ms per frame, poses.
 
     Voxels are in metres; ``device`` is Open3D's word, such as "CUDA:0".
-
-    Raises:
-        DudmapError: The run failed.
     """
     program = Path(__file__).with_name("open3d_slam.py").read_text(encoding="utf-8")
     arguments = [str(folder), str(voxel_size), str(Config().preprocess.depth_max), device]
@@ -159,43 +146,11 @@ KERNELS_EVERY = 4
 kernel take time."""
 
 
-@dataclass(frozen=True)
-class DeviceRun:
-    """Medians of a recording on a device; the voxel size is in metres, times are in milliseconds, sizes in MB.
-
-    Attributes:
-        mesh_ms, view_ms: Time of a mesh, which has so many triangles, and of an artificial view of the camera's
-            size.
-        device_mb: Peak memory of the device where it is known.
-        kernels: Time per frame of each kernel, by the device's events; empty on the CPU.
-        error: Why there are no figures.
-    """
-
-    what: str
-    voxel: float
-    device: str
-    frame_ms: float = float("nan")
-    stages: dict[str, float] = field(default_factory=dict)
-    mesh_ms: float = float("nan")
-    view_ms: float = float("nan")
-    triangles: int = 0
-    map_mb: float = float("nan")
-    device_mb: float = float("nan")
-    kernels: dict[str, float] = field(default_factory=dict)
-    error: str = ""
-
-
 def numbers(voxels: str, sizes: str) -> tuple[list[float], list[tuple[int, int]]]:
-    """Voxel sizes in metres, and image sizes, of comma-separated lists as the command line gives them.
-
-    Raises:
-        ConfigError: A list cannot be understood.
-    """
+    """Voxel sizes in metres, and image sizes, of comma-separated lists as the command line gives them."""
     try:
-        pairs = [size.split("x") for size in sizes.split(",") if size]
-        return [float(voxel) / 100 for voxel in voxels.split(",")], [
-            (int(width), int(height)) for width, height in pairs
-        ]
+        shapes = [(int(width), int(height)) for width, height in (size.split("x") for size in sizes.split(",") if size)]
+        return [float(voxel) / 100 for voxel in voxels.split(",")], shapes
     except ValueError:
         raise ConfigError(
             f"cannot understand --voxels {voxels!r} and --sizes {sizes!r}; expected centimetres, such as 2,1, and "
@@ -213,23 +168,47 @@ def recordings(sizes: Iterable[tuple[int, int]], frames: int, paths: Iterable[Pa
         yield f"{recording.name} {recording.camera.width}x{recording.camera.height}", recording
 
 
-def devices(wanted: str) -> list[str]:
-    """The GPU to measure, if there is one, and the CPU beside it."""
-    device = resolve(wanted)
-    return ["cpu"] if device == "cpu" else [device, "cpu"]
+def measure_devices(
+    content: Iterable[tuple[str, Sequence]],
+    voxels: list[float],
+    frames: int,
+    wanted: str,
+    python: str | None,
+    announce: Callable[[str], None],
+) -> list[Row]:
+    """Rows of recordings by name with each voxel size (m), on the GPU, if there is one, and on the CPU beside it.
+
+    A Python with Open3D also measures its dense SLAM. ``announce`` is called with what is measured next.
+    """
+    device, rows = resolve(wanted), list[Row]()
+    for name, recording in content:
+        for voxel in voxels:
+            for one in dict.fromkeys((device, "cpu")):
+                announce(f"{name}, {100 * voxel:g} cm, {one}")
+                rows.append(measure(name, recording, frames, voxel, one))
+        if python is not None:
+            announce(f"{name}, Open3D's dense SLAM")
+            other = "CPU:0" if device == "cpu" else device.upper()
+            rows += measure_open3d(python, name, recording, frames, voxels, other)
+    return rows
 
 
-def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
-    """Process the first ``frames`` frames; a device that cannot do all of it gives a row that says so."""
+def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> Row:
+    """Process the first ``frames`` frames with voxels in metres.
+
+    Returns:
+        Medians in milliseconds of a frame, of its ``stages``, on a GPU of its ``kernels``, of a mesh and its number of
+            triangles, and of a view of the camera's size; the map and the peak memory of a GPU, MB. ``error`` stands in
+            their place where the device cannot do all of it.
+    """
+    row: Row = {"what": name, "voxel": voxel, "device": device}
     try:
-        return _measured(name, recording, frames, voxel, device)
+        return row | _measured(recording, frames, voxel, device)
     except (DeviceError, MapError) as error:
-        return DeviceRun(name, voxel, device, error=str(error))
+        return row | {"error": str(error)}
 
 
-def _measured(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
-    from dudmap.core.slam import Slam
-
+def _measured(recording: Sequence, frames: int, voxel: float, device: str) -> Row:
     assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
     slam, on_gpu = Slam(recording.camera, Config().override(assignments)), device.startswith("cuda")
     times, stages, kernels = [], [], []
@@ -238,31 +217,22 @@ def _measured(name: str, recording: Sequence, frames: int, voxel: float, device:
         if on_gpu and index % KERNELS_EVERY == 0:
             kernels.append(_kernel_times(lambda frame=frame: slam.process(frame)))
             continue
-        ms, result = _timed(lambda frame=frame: slam.process(frame))
-        times.append(ms)
-        stages.append(result.timings)
+        start = time.perf_counter()
+        stages.append(slam.process(frame).timings)
+        times.append(1000 * (time.perf_counter() - start))
     pose = slam.trajectory.Ts_world_camera[-1]
-    slam.volume.extract_mesh(1)
-    mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
-    slam.volume.raycast(pose)
-    view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
-    device_mb = float("nan")
+    mesh_s, mesh = median_seconds(lambda: slam.volume.extract_mesh(1), 1)
+    view_s, _ = median_seconds(lambda: slam.volume.raycast(pose), 1)
+    warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
+    row: Row = {"frame_ms": statistics.median(times[warm]), "stages": _medians(stages[warm])}
+    row |= {"mesh_ms": 1000 * mesh_s, "view_ms": 1000 * view_s, "triangles": len(mesh.faces)}
+    row["map_mb"] = slam.volume.num_bytes / 1e6
     if on_gpu:
         import warp as wp  # pyright: ignore[reportMissingImports]
 
-        device_mb = wp.get_mempool_used_mem_high(device) / 1e6
-    warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
-    return DeviceRun(
-        name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
-        slam.volume.num_bytes / 1e6, device_mb,
-        _medians(kernels[-len(kernels) // 2 :]),  # the first frames load the kernels
-    )  # fmt: skip
-
-
-def _timed(action: Callable[[], Any]) -> tuple[float, Any]:
-    start = time.perf_counter()
-    result = action()
-    return 1000 * (time.perf_counter() - start), result
+        row["device_mb"] = wp.get_mempool_used_mem_high(device) / 1e6
+        row["kernels"] = _medians(kernels[-len(kernels) // 2 :])  # the first frames load the kernels
+    return row
 
 
 def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
@@ -286,35 +256,37 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 
 def measure_open3d(
     python: str, name: str, recording: Sequence, frames: int, voxels: Iterable[float], device: str
-) -> list[DeviceRun]:
+) -> list[Row]:
     """Time per frame of Open3D's dense SLAM with each voxel size (m), on "CUDA:0" or "CPU:0"."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="dudmap-") as folder:
         save_frames(recording, frames, Path(folder))
         for voxel in voxels:
+            rows.append({"what": name, "voxel": voxel, "device": f"Open3D, {device}"})
             try:
-                row = run_open3d(python, Path(folder), voxel, device)
-                rows.append(DeviceRun(name, voxel, f"Open3D {row['version']}, {device}", median_ms([row])))
+                found = run_open3d(python, Path(folder), voxel, device)
+                rows[-1] |= {"device": f"Open3D {found['version']}, {device}", "frame_ms": median_ms([found])}
             except DudmapError as error:
-                rows.append(DeviceRun(name, voxel, f"Open3D, {device}", error=str(error)))
+                rows[-1]["error"] = str(error)
     return rows
 
 
-def table(rows: list[DeviceRun]) -> str:
+def table(rows: list[Row]) -> str:
     """Markdown: times and memory of each run, then the kernels of those on a GPU."""
-    stages, body = list(dict.fromkeys(stage for row in rows for stage in row.stages)), []
+    stages, body = list(dict.fromkeys(stage for row in rows for stage in row.get("stages", ()))), []
     for row in rows:
-        times = [row.frame_ms, *(row.stages.get(stage, np.nan) for stage in stages), row.mesh_ms, row.view_ms]
-        cells = ["" if np.isnan(x) else f"{x:.1f}" for x in (*times, row.map_mb, row.device_mb)]
-        body.append([row.what, f"{100 * row.voxel:g}", row.device, *cells])
+        figures = {**row.get("stages", {}), **row}
+        cells = [figures.get(key) for key in ("frame_ms", *stages, "mesh_ms", "view_ms", "map_mb", "device_mb")]
+        shown = ["" if value is None else f"{value:.1f}" for value in cells]
+        body.append([row["what"], f"{100 * row['voxel']:g}", row["device"], *shown])
     head = ["recording", "voxel, cm", "device", "frame", *stages, "mesh", "view", "map, MB", "device, MB"]
     text, reason = grid(head, body), obstacle()
-    if not any(row.device.startswith("cuda") for row in rows):
+    if not any(row["device"].startswith("cuda") for row in rows):
         text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not asked for'}.\n"
     for row in rows:
-        what = f"{row.what}, {100 * row.voxel:g} cm, {row.device}"
-        text += f"\n{what}: {row.error}\n" if row.error else ""
-        if row.kernels:
-            lines = [[name, f"{ms:.3f}"] for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])]
+        what = f"{row['what']}, {100 * row['voxel']:g} cm, {row['device']}"
+        text += f"\n{what}: {row['error']}\n" if "error" in row else ""
+        if row.get("kernels"):
+            lines = [[name, f"{ms:.3f}"] for name, ms in sorted(row["kernels"].items(), key=lambda item: -item[1])]
             text += f"\n{what}: kernels per frame\n\n{grid(['kernel', 'ms'], lines)}"
     return text

@@ -1,4 +1,7 @@
-"""Measurement of a system on a recording, in a process of its own so that nothing is shared, and tables of it."""
+"""Measurement of a system on a recording, in a process of its own so that nothing is shared, and tables of it.
+
+A recording that cannot be used, and one in which nothing is tracked, is a ``DudmapError``.
+"""
 
 import csv
 import hashlib
@@ -13,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
@@ -53,11 +57,7 @@ class Job(NamedTuple):
 
 
 def measure(job: Job) -> Row:
-    """Run a system on a recording and score the result.
-
-    Raises:
-        DudmapError: The recording cannot be used, or no frame could be tracked.
-    """
+    """Run a system on a recording and score the result."""
     sequence, passes = job.entry.open(), PASSES.get(job.system, 1)
     surfaces = job.entry.surfaces(sequence) if job.out is not None else None
     frames, calibrate = job.entry.max_frames, job.calibrate
@@ -85,9 +85,6 @@ def measure_sequence(
         passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
         calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the
             recording is taken as given.
-
-    Raises:
-        DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.app.pipeline.frame_source import AHEAD
     from dudmap.app.pipeline.run import run
@@ -131,10 +128,6 @@ def score_mesh(
         whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
         seen: Part of it that the camera saw, for completeness.
         samples: Number of points sampled on each surface.
-
-    Raises:
-        DatasetError: The trajectories have fewer than three poses in common.
-        MapError: A mesh has no faces.
     """
     from dudmap.evaluation.reconstruction import compare_surfaces
     from dudmap.evaluation.surface import moved
@@ -268,10 +261,10 @@ def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
     return "\n".join(lines) + "\n"
 
 
-def markdown(rows: list[Row], columns: tuple[Column, ...] = COLUMNS) -> str:
+def markdown(rows: list[Row]) -> str:
     """Markdown table of the rows, followed by a list of the failed ones."""
     good = [row for row in rows if "error" not in row]
-    used = [column for column in columns if any(row.get(column.key) is not None for row in good)]
+    used = [column for column in COLUMNS if any(row.get(column.key) is not None for row in good)]
     header = ["sequence", "system", *(column.heading for column in used)]
     body = [
         [str(row["sequence"]), str(row["system"]), *(shown(row.get(column.key), column) for column in used)]
@@ -281,14 +274,16 @@ def markdown(rows: list[Row], columns: tuple[Column, ...] = COLUMNS) -> str:
     return grid(header, body) + ("\n" + "\n".join(failed) + "\n" if failed else "")
 
 
-def save(rows: list[Row], text: str, out: Path, name: str, more: dict[str, Any] | None = None) -> None:
-    """Write <name>.md, <name>.csv and <name>.json into a folder, in stored units."""
+def save(rows: list[Row] | None, text: str, out: Path, name: str, more: Row | None = None) -> Row:
+    """Write <name>.md, <name>.json and, of rows, <name>.csv into a folder, in stored units; returns what JSON holds."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.md").write_text(text, encoding="utf-8")
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, keys, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    content = {**(more or {}), "rows": list(rows)}
+    content: Row = {"machine": machine(), "versions": versions(), **(more or {})}
+    if rows is not None:
+        content["rows"] = rows
+        with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)), restval="")
+            writer.writeheader()
+            writer.writerows(rows)
     (out / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return content

@@ -117,7 +117,7 @@ def is_silent_failure(row: Row) -> bool:
     return ate is not None and ate > SILENT_ATE and row["lost"] < SILENT_LOST * row["frames"]
 
 
-def report(rows: list[Row], seed: int, worst: int = 10) -> str:
+def report(rows: list[Row], seed: int) -> str:
     """Markdown: the distribution of the ATE, the silent failures, and the worst worlds with their commands."""
     measured = [row for row in rows if row.get("ate_rmse_m") is not None]
     measured.sort(key=lambda row: -row["ate_rmse_m"])
@@ -134,7 +134,7 @@ def report(rows: list[Row], seed: int, worst: int = 10) -> str:
     else:
         text += "No world gave a result.\n"
     text += _listed("Silent failures (ATE > 50 mm, less than 20 % of the frames lost)", silent)
-    return text + _listed("Worst worlds", measured[:worst]) + _listed("Worlds without a result", failed)
+    return text + _listed("Worst worlds", measured[:10]) + _listed("Worlds without a result", failed)
 
 
 def _listed(title: str, rows: list[Row]) -> str:

@@ -9,18 +9,7 @@ from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
 from dudmap.evaluation.trajectory import accuracy
-from dudmap.lab.benchmark.measure import (
-    COLUMNS,
-    SCORED,
-    Job,
-    Row,
-    grid,
-    markdown,
-    measure_all,
-    save,
-    score_mesh,
-    shown,
-)
+from dudmap.lab.benchmark.measure import COLUMNS, SCORED, Job, Row, grid, markdown, measure_all, save, score_mesh, shown
 from dudmap.lab.benchmark.suites import Entry, Suite
 from dudmap.lab.data import tables
 
@@ -56,8 +45,8 @@ def run_suite(
     *,
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
-) -> str:
-    """Measure a suite, write <suite>.md, .csv and .json into ``out`` and return the Markdown.
+) -> tuple[Row, str]:
+    """Measure a suite, write <suite>.md, .csv and .json into ``out``, and return what JSON holds and the Markdown.
 
     Runs are kept in ``out``/runs/<system>/<sequence>. ``others`` are folders with results of other systems by name:
     FOLDER/<sequence>/trajectory.txt and mesh.ply.
@@ -85,19 +74,12 @@ def run_suite(
         "suite": suite.name,
         "missing": {entry.name: entry.address for entry in suite.missing},
         "published": [value._asdict() for value in printed],
-        "machine": cpu,
-        "versions": versions(),
     }
-    save(rows, text, out, suite.name, more)
-    return text
+    return save(rows, text, out, suite.name, more), text
 
 
 def named_folders(assignments: list[str]) -> dict[str, Path]:
-    """Parse ``NAME=FOLDER`` pairs.
-
-    Raises:
-        ConfigError: A pair is malformed or its folder is missing.
-    """
+    """Parse ``NAME=FOLDER`` pairs."""
     found = {}
     for assignment in assignments:
         name, equals, folder = assignment.partition("=")

@@ -73,15 +73,9 @@ def rates(threads: int) -> tuple[float, float]:
     first, second, third = (array[:8] for array in arrays[0])
     _triad(first, second, third, np.float32(2))
     _multiply_add(data[0], 1)
-    moved = (
-        3
-        * 4
-        * size
-        * threads
-        / _best_seconds(threads, lambda k: _triad(arrays[k][0], arrays[k][1], arrays[k][2], np.float32(2)))
-    )
+    seconds = _best_seconds(threads, lambda k: _triad(*arrays[k], np.float32(2)))
     computed = threads * rounds * 2048 * 64 / _best_seconds(threads, lambda k: _multiply_add(data[k], rounds))
-    return moved, computed
+    return 3 * 4 * size * threads / seconds, computed
 
 
 def counted(frames: int, voxel: float) -> tuple[dict[str, float], Slam]:
@@ -183,9 +177,8 @@ def summary(counts: list[dict[str, int]]) -> dict[str, float]:
 
 def _counted(function: Callable[[Any], object], argument: object) -> dict[str, int]:
     """The counts of one call."""
-    compiled = [
-        found for found in gc.get_objects() if issubclass(type(found), Dispatcher)
-    ]  # an isinstance would ask dead proxies
+    # an isinstance would ask dead proxies
+    compiled = [found for found in gc.get_objects() if issubclass(type(found), Dispatcher)]
     # formulas are inlined where kernels call them, and Python calls them uncompiled
     kernels = {found.py_func.__code__ for found in compiled if not found.targetoptions.get("forceinline")}
     sharing = threads.also_in_other_threads.__code__

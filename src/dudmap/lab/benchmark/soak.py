@@ -19,9 +19,9 @@ from dudmap.core.geometry import se3
 from dudmap.core.map.memory_limit import resident_bytes
 from dudmap.core.result import FrameResult
 from dudmap.core.slam import Slam
-from dudmap.lab import synthetic
+from dudmap.io.sequences import Sequence
 from dudmap.lab.benchmark.measure import Row
-from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.benchmark.suites import Entry
 
 FPS = 15.0
 """Frame rate of the recording, Hz."""
@@ -32,7 +32,7 @@ MORE = 1.1
 class Rendered:
     """Recording that notes the processor time at which a frame is rendered, which is not the system's."""
 
-    def __init__(self, recording: SyntheticSequence) -> None:
+    def __init__(self, recording: Sequence) -> None:
         self._recording, self.rendered = recording, 0.0
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401
@@ -66,11 +66,9 @@ class Tenths(RunObserver):
             self._lost += 1
         else:
             true = self._recording.ground_truth.Ts_world_camera[index]
-            T_room_world = (
-                true @ se3.inverse(result.T_world_camera) if self._T_room_world is None else self._T_room_world
-            )
-            self._T_room_world = T_room_world
-            self._errors.append(float(np.linalg.norm((T_room_world @ result.T_world_camera - true)[:3, 3])))
+            if self._T_room_world is None:
+                self._T_room_world = true @ se3.inverse(result.T_world_camera)
+            self._errors.append(float(np.linalg.norm((self._T_room_world @ result.T_world_camera - true)[:3, 3])))
         if (index + 1) % (len(self._recording) // 10) == 0:
             cpu, wall = np.median(self._times, axis=0)
             size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
@@ -91,24 +89,12 @@ def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[
         One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map,
             size of the run folder, frames lost so far, and the largest error of a pose.
     """
-    recording = Rendered(
-        synthetic.sequence(
-            movers=("people",), camera_path="orbit", frames=frames, fps=FPS, seed=seed,
-            camera=size,
-        )
-    )  # fmt: skip
+    world = {"movers": ("people",), "camera_path": "orbit", "frames": frames, "fps": FPS, "seed": seed, "camera": size}
+    recording = Rendered(Entry("room-people", parameters=world).open())
     tenths = Tenths(recording, done)
     with tempfile.TemporaryDirectory() as folder:
-        out, storing = Path(folder) / "run", Storing({"path": "soak"})
-        run(
-            cast("SyntheticSequence", recording),
-            Config(),
-            out,
-            progress=False,
-            ahead=0,
-            observers=(tenths,),
-            storing=storing,
-        )
+        out, source = Path(folder) / "run", cast("Sequence", recording)
+        run(source, Config(), out, progress=False, ahead=0, observers=(tenths,), storing=Storing({"path": "soak"}))
     return tenths.rows
 
 

@@ -1,4 +1,7 @@
-"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process."""
+"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process.
+
+A measurement that fails is a ``DudmapError``.
+"""
 
 import os
 import statistics
@@ -19,8 +22,10 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark.measure import Row, grid, in_own_process
 from dudmap.lab.benchmark.suites import Entry
+from dudmap.lab.data import tables
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
-from dudmap.lab.synthetic.scene import Light, Material, Scene, box, cylinder, look_at, pose
+from dudmap.lab.synthetic.rooms import build_scene
+from dudmap.lab.synthetic.scene import look_at
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -59,9 +64,6 @@ def speed_figures(
             it.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
-
-    Raises:
-        DudmapError: A measurement failed.
     """
     figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
@@ -169,11 +171,7 @@ def _start_times() -> list[SpeedFigure]:
 
 
 def program_seconds(arguments: list[str], times: int = 5, **variables: str) -> float:
-    """Median duration of a Python program with environment variables, seconds.
-
-    Raises:
-        DudmapError: The program fails.
-    """
+    """Median duration of a Python program with environment variables, seconds."""
     seconds = []
     for _ in range(times):
         start = time.perf_counter()
@@ -224,9 +222,9 @@ def time_frames(job: tuple[float, int]) -> Row:
     row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
     row["free_share"] = slam.volume.blocks.entry_bytes / (2 * 512 * 4)
     pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
-    seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
+    seconds, mesh = median_seconds(slam.volume.extract_mesh, 3)
     row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
-    row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
+    row["view_ms"] = 1000 * median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
     return row | _time_again(slam, sequence[frames])
 
 
@@ -242,7 +240,7 @@ def _time_again(slam: "Slam", frame: "Frame") -> Row:
     return {"again_ms": 1000 * (time.perf_counter() - start), "stale": len(stale)}
 
 
-def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
+def median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
     """Median duration after one call for warm-up, and the last result."""
     result, seconds = action(), []
     for _ in range(times):
@@ -271,7 +269,7 @@ def time_iteration(frames: int) -> Row:
     level = Level(slam.camera.scaled(halvings), depth, intensity)
     pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
     slam.volume.look_at(pose)
-    seconds, _ = _median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
+    seconds, _ = median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
     return {"iteration_ms": 1000 * seconds}
 
 
@@ -297,7 +295,7 @@ def time_walk(frames: int) -> Row:
     assert slam is not None
     row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
     row["growth"] = row["last_ms"] / row["first_ms"]
-    row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
+    row["mesh_ms"] = 1000 * median_seconds(slam.volume.extract_mesh, 1)[0]
     return row | _time_again(slam, sequence[frames])
 
 
@@ -308,57 +306,16 @@ LAP = 194
 
 60 frames of warm-up and ten periods are 2000 frames: the first and the last tenth show the same, nine periods apart.
 """
-SPACING = SPEED * LAP / FPS
-"""Distance that the camera covers in one period, metres."""
-BEYOND = 8.0
-"""Length of the passage beyond the last camera position, metres; its end is out of range."""
 
 
 def passage(frames: int) -> SyntheticSequence:
-    """Recording of ``frames`` frames in which the camera moves straight on and looks at either wall in turn.
-
-    The passage is 3 m wide and as long as the walk, with pilasters, boxes and columns along both walls.
-    """
+    """Recording of up to 2000 frames in which the camera moves straight on and looks at either wall in turn."""
     times = np.arange(frames) / FPS
-    length = SPEED * float(times[-1]) + BEYOND
-    poses = np.array([_passage_pose(t) for t in times])
-    return SyntheticSequence(
-        _passage_scene(length), [], Trajectory(times, poses), DEFAULT_CAMERA, noise="kinect", seed=0, fps=FPS
-    )
+    truth = Trajectory(times, np.array([_passage_pose(t) for t in times]))
+    scene = build_scene("passage", tables("benchmark/passage.toml"))
+    return SyntheticSequence(scene, [], truth, DEFAULT_CAMERA, noise="kinect", seed=0, fps=FPS)
 
 
 def _passage_pose(t: float) -> NDArray[np.float64]:
-    sway = np.sin(2 * np.pi * FPS / LAP * t)
-    x, y, z = 0.1 * sway, SPEED * t, 1.4 + 0.05 * sway
-    aside = 0.9 * sway
-    return look_at((x, y, z), (x + aside, y + 1.6, 1.0))
-
-
-def _passage_scene(length: float) -> Scene:
-    middle = length / 2 - 1.0
-    solids = [
-        box((0, middle, -0.1), (3.4, length + 2, 0.2), Material("checks", (0.4, 0.4))),
-        box((0, middle, 2.6), (3.4, length + 2, 0.2), Material("plaster", (0.5, 0.5))),
-        box((0, length, 1.25), (3.4, 0.2, 2.5), Material("brick", (0.6, 0.6))),
-    ]
-    for side, texture in ((-1, "wallpaper"), (1, "brick")):
-        solids.append(box((side * 1.6, middle, 1.25), (0.2, length + 2, 2.5), Material(texture, (0.5, 0.5))))
-        for number, y in enumerate(np.arange(0.8 + 0.4 * side, length, SPACING)):
-            height = 0.4 + 0.25 * (number % 3)
-            solids.append(box((side * 1.25, y, height / 2), (0.5, 0.6, height), Material("wood", (0.6, 0.6))))
-            solids.append(box((side * 1.45, y + 1.2, 1.25), (0.2, 0.3, 2.5), Material("plaster", (0.8, 0.8))))
-            if number % 3:
-                top, bottom = (side * 1.1, y + 0.7, 0.9), (side * 1.1, y + 0.7, 0.0)
-                solids.append(cylinder(bottom, top, 0.12, Material("stripes", (3, 3))))
-    return Scene(
-        name="passage",
-        primitives=solids,
-        home=look_at((0.0, 0.0, 1.4), (0.0, 2.0, 1.0)),
-        target=(0.0, 2.0, 1.0),
-        space=((-1.0, -0.5, 0.8), (1.0, length, 2.1)),
-        extent=((-1.5, -1.0, 0.0), (1.5, length, 2.5)),
-        walk_line=((-1.0, 2.0), (1.0, 2.0)),
-        rest=pose((0.4, 2.0, 0.0)),
-        hinge=pose(),
-        lights=tuple(Light((0.0, float(y), 2.4)) for y in np.arange(1.0, length, 4.0)),
-    )
+    sway, y = np.sin(2 * np.pi * FPS / LAP * t), SPEED * t
+    return look_at((0.1 * sway, y, 1.4 + 0.05 * sway), (sway, y + 1.6, 1.0))

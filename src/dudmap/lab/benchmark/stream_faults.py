@@ -1,4 +1,7 @@
-"""Input with faults: what a run makes of faults of the stream and of recordings that are spoilt in one way."""
+"""Input with faults: what a run makes of faults of the stream and of recordings that are spoilt in one way.
+
+An unknown fault, or a recording without true poses, is a ``ConfigError``.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -88,9 +91,6 @@ def measure_stream_faults(
 
     Yields:
         A run as soon as it ends, and the one without a fault, which is the first.
-
-    Raises:
-        ConfigError: A fault is unknown, or the recording has no true poses.
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
@@ -203,9 +203,6 @@ def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str
     Yields:
         ``name`` of the way, ``warnings`` (sentences of ``inspect``), number of ``frames``, of those ``tracked`` and of
         those called ``doubtful`` (uncertain or blind), and ``ate``, its RMSE in metres; None with too few poses.
-
-    Raises:
-        ConfigError: The recording has no true poses.
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")

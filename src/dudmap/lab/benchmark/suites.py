@@ -1,4 +1,7 @@
-"""Recordings of a benchmark, the suites they belong to, and the systems compared; suites.toml lists them."""
+"""Recordings of a benchmark, the suites they belong to, and the systems compared; suites.toml lists them.
+
+A name that is unknown is a ``ConfigError``, a folder without recordings a ``DatasetError``.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -39,11 +42,7 @@ class Entry:
     max_frames: int | None = None
 
     def open(self) -> "Sequence":
-        """Open the recording, or set up the synthetic one.
-
-        Raises:
-            DatasetError: The folder is missing or not a recording.
-        """
+        """Open the recording, or set up the synthetic one."""
         if self.path is not None:
             from dudmap.io.sequences import open_sequence
 
@@ -66,11 +65,7 @@ class Entry:
 
 
 def local_entries(data: Path) -> list[Entry]:
-    """Every recording in a folder, or the folder itself if it is a recording.
-
-    Raises:
-        DatasetError: No recording was found.
-    """
+    """Every recording in a folder, or the folder itself if it is a recording."""
     from dudmap.io.sequences import is_recording
 
     if not data.is_dir():
@@ -152,10 +147,6 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     Args:
         data: Folder that is searched, two levels deep; synthetic worlds need none.
         quick: Only one to three synthetic worlds, and at most 60 frames of every recording.
-
-    Raises:
-        ConfigError: There is no such suite, or it needs ``data``.
-        DatasetError: ``data`` is no folder, or for the suite ``local`` holds no recording.
     """
     find(name, SUITES, "suite")
     missing: list[Entry] = []
@@ -177,11 +168,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
 
 def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> list[Entry]:
-    """The room of suite ``sensors``, taken with every sensor or with the named ones, ``quick`` in small images.
-
-    Raises:
-        ConfigError: A name is unknown.
-    """
+    """The room of suite ``sensors``, taken with every sensor or with the named ones, ``quick`` in small images."""
     unknown = [name for name in names or [] if name not in SENSORS]
     if unknown:
         raise ConfigError(f"unknown sensor of the suite {unknown[0]!r}; known are {', '.join(SENSORS)}")
@@ -203,12 +190,7 @@ def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]
 
 
 def systems(names: str) -> dict[str, Config]:
-    """Configurations by name, of a comma-separated list of ``SYSTEMS`` and of paths of TOML files.
-
-    Raises:
-        ConfigError: The list is empty, a name is unknown, a file is not a valid configuration, or two systems have the
-            same name.
-    """
+    """Configurations by name, of a comma-separated list of ``SYSTEMS`` and of paths of TOML files."""
     found: dict[str, Config] = {}
     for name in (name.strip() for name in names.split(",") if name.strip()):
         if name not in SYSTEMS and not name.endswith(".toml"):

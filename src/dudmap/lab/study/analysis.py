@@ -1,4 +1,7 @@
-"""Analysis of the runs of a study, response by response, as a report."""
+"""Analysis of the runs of a study, response by response, as a report.
+
+A response that no run has is a ``ConfigError``.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -33,11 +36,7 @@ MOST_INTERACTION_FACTORS = 6
 
 
 def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> Table | None:
-    """Add all that is known about one response but its confirmation; return the effects of a Plackett-Burman design.
-
-    Raises:
-        ConfigError: No run has the response, or the runs do not suffice for all effects.
-    """
+    """Add all that is known about one response but its confirmation; return the effects of a Plackett-Burman design."""
     scale, factors = plan.scale(name), plan.factors
     report.heading(scale.heading)
     data = scale.usable(table)

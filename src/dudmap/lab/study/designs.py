@@ -1,4 +1,7 @@
-"""Factors of a study (configuration keys with levels or a range) and designs: which combinations are run."""
+"""Factors of a study (configuration keys with levels or a range) and designs: which combinations are run.
+
+What a design file says wrong of them is a ``ConfigError``.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -72,21 +75,12 @@ def is_number(value: object) -> bool:
 
 
 def configured(base: Config, values: Mapping[str, Value]) -> Config:
-    """Configuration ``base`` with the values of some keys.
-
-    Raises:
-        ConfigError: A key is unknown or a value invalid.
-    """
+    """Configuration ``base`` with the values of some keys."""
     return base.override([f"{key}={json.dumps(value)}" for key, value in values.items()])
 
 
 def make_factor(key: str, given: object, base: Config) -> Factor:
-    """Factor of one line of a design file: a list of levels, or a table with ``levels`` or ``range``, and ``scale``.
-
-    Raises:
-        ConfigError: The key is unknown, the table malformed, or a level is not valid beside the other keys of
-            ``base``.
-    """
+    """Factor of one line of a design file: a list of levels, or a table with ``levels`` or ``range``, and ``scale``."""
     table = {"levels": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or len({"levels", "range"} & set(table)) != 1:
         raise ConfigError(f"factor {key} is {given!r}; expected a list of levels, or range = [low, high]")
@@ -115,9 +109,6 @@ def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...
     """Factors of the table ``factors`` of a design file, whose keys are quoted or nested.
 
     ``all_numeric`` adds every numeric key (``numeric_factors``).
-
-    Raises:
-        ConfigError: There is none, or one is invalid.
     """
     from dudmap.lab.study.screening import numeric_factors
 
@@ -176,11 +167,7 @@ class DesignOptions(BaseModel):
 
 
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
-    """All points of a design, each once; those of Saltelli and Morris need every row for their indices.
-
-    Raises:
-        ConfigError: The design does not fit the factors.
-    """
+    """All points of a design, each once; those of Saltelli and Morris need every row for their indices."""
     kind = options.kind
     found: list[Point]
     if kind == "full-factorial":

@@ -1,4 +1,7 @@
-"""A study as planned: factors, design, recordings and responses of a design file, and the list of all runs."""
+"""A study as planned: factors, design, recordings and responses of a design file, and the list of all runs.
+
+What is wrong in a design file is a ``ConfigError``, a recording that it cannot use a ``DatasetError``.
+"""
 
 import hashlib
 import inspect
@@ -82,11 +85,7 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 
 def checked(kind: type[Checked], given: object, what: str) -> Checked:
-    """A table of a design file as what it must be.
-
-    Raises:
-        ConfigError: A key is unknown or a value invalid.
-    """
+    """A table of a design file as what it must be."""
     try:
         return kind.model_validate(given, strict=True)
     except ValidationError as error:
@@ -202,12 +201,7 @@ class Plan:
         return Scale(response, response in self.log)
 
     def check(self, max_runs: int = MAX_RUNS) -> None:
-        """Check everything that can be known before anything is run.
-
-        Raises:
-            DudmapError: The design has more than ``max_runs`` runs, a combination of levels is invalid, or a recording
-                is missing or lacks the truth that a response needs.
-        """
+        """Check everything that can be known before anything is run."""
         count = count_of(self.factors, self.options) * len(self.entries)
         if count > max_runs:
             raise ConfigError(f"the design has {count} runs, more than --max-runs {max_runs}")
@@ -222,11 +216,7 @@ class Plan:
 
 
 def load_plan(path: str | Path) -> Plan:
-    """Plan of a design file. Paths of recordings are relative to it.
-
-    Raises:
-        ConfigError: The file is missing, not TOML, or describes no valid study.
-    """
+    """Plan of a design file. Paths of recordings are relative to it."""
     path = Path(path)
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -269,11 +259,7 @@ def method_hash() -> str:
 
 
 def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str, int, Entry], ...]:
-    """Recordings of the tables ``sequences`` of a design file: name, replicate and entry of each.
-
-    Raises:
-        ConfigError: There is none, or one is malformed.
-    """
+    """Recordings of the tables ``sequences`` of a design file: name, replicate and entry of each."""
     if not tables:
         raise ConfigError('the design has no sequences; expected, for example, [[sequences]] path = "recordings/desk"')
     out: list[tuple[str, int, Entry]] = []

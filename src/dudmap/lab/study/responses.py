@@ -1,4 +1,7 @@
-"""Responses of a study: which figure of a run each stands for, and what a recording must have for it."""
+"""Responses of a study: which figure of a run each stands for, and what a recording must have for it.
+
+A response that no run has is a ``ConfigError``, a recording that cannot have it a ``DatasetError``.
+"""
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -79,11 +82,7 @@ class Scale(NamedTuple):
         return f"{self.plain(value):.4g} {RESPONSES[self.response].unit}".rstrip()
 
     def usable(self, table: Table) -> Table:
-        """Runs that have the response, under the column of its name.
-
-        Raises:
-            ConfigError: No run has it, or its logarithm does not exist.
-        """
+        """Runs that have the response, under the column of its name."""
         name, response = self.response, RESPONSES[self.response]
         if response.key not in table or table[response.key].isna().all():
             errors = list(table["error"].dropna()) if "error" in table else []
@@ -97,11 +96,7 @@ class Scale(NamedTuple):
 
 
 def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) -> None:
-    """Check that a recording has the truth that the responses need.
-
-    Raises:
-        DatasetError: It has not.
-    """
+    """Check that a recording has the truth that the responses need."""
     for name in names:
         needs, lacking = RESPONSES[name].needs, ""
         if needs in ("truth", "surface") and sequence.ground_truth is None:

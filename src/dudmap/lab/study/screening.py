@@ -1,4 +1,7 @@
-"""Screening of many keys: all numeric keys as factors, and the effect of each on each recording."""
+"""Screening of many keys: all numeric keys as factors, and the effect of each on each recording.
+
+A malformed table, or too few runs for all factors, is a ``ConfigError``.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from operator import attrgetter
@@ -27,9 +30,6 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
     value and bound. A whole number changes by 1 at least. Of a list of numbers all elements change together, and the
     factor has two levels. A key with the value 0 has no ratio and is left out, as are the keys ``chosen`` by the design
     file and those that its table (``ratio``, ``without``) names.
-
-    Raises:
-        ConfigError: The table is malformed.
     """
     if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
         raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
@@ -91,9 +91,6 @@ def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
     Returns:
         One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in
             standard deviations of the residual.
-
-    Raises:
-        ConfigError: The runs of a recording do not suffice for all factors.
     """
     import pandas as pd
     import statsmodels.api as sm

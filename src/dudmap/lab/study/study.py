@@ -1,4 +1,7 @@
-"""A whole study: its runs, its confirmation, its tables and its report; and chapter 6 of the thesis as studies."""
+"""A whole study: its runs, its confirmation, its tables and its report; and chapter 6 of the thesis as studies.
+
+A study that cannot be run is refused with a ``DudmapError`` before anything is run.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -36,9 +39,6 @@ def run_study(
 
     Returns:
         The outcome in words.
-
-    Raises:
-        DudmapError: The study is refused before anything is run (``Plan.check``), or no run has a response.
     """
     from dudmap.lab.study.response_surface import predict_optimum
 
@@ -200,11 +200,7 @@ PUBLISHED_CONFIRMATION = 89.0
 
 
 def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int | None = None) -> Plan:
-    """Plan of table 6.1, 6.2 or 6.3 of the thesis, on ``ROOM`` unless recordings are named.
-
-    Raises:
-        ConfigError: There is no such table.
-    """
+    """Plan of table 6.1, 6.2 or 6.3 of the thesis, on ``ROOM`` unless recordings are named."""
     some = {} if frames is None else {"frames": frames}
     return make_plan(
         {

@@ -4,6 +4,8 @@ Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). A confi
 of the training recordings, where what is worse than the median is dropped. All figures are ratios to the base
 configuration on the same recording, so that recordings count equally. The proposals depend on the seed and on earlier
 results only, and results are kept: a search that was stopped proposes the same again and finds its results.
+
+A search that cannot be judged is refused with a ``DudmapError`` before anything is run.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,12 +45,7 @@ MOST_JUDGED = 5
 
 
 def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:
-    """Check everything that can be known before anything is run.
-
-    Raises:
-        DudmapError: A response has no ratio, the second set is too small or was trained on, there are more runs than
-            ``max_runs``, or a recording lacks what a response needs.
-    """
+    """Check everything that can be known before anything is run."""
     for name in plan.responses:
         if name not in RATIOS:
             raise ConfigError(f"tune cannot use the response {name}, which can be 0; it knows {', '.join(RATIOS)}")
@@ -205,11 +202,7 @@ def run_tune(
     max_runs: int = MAX_RUNS,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> str:
-    """Search, judge, and write tune.csv, and recommended.toml if a configuration holds; return the outcome in words.
-
-    Raises:
-        DudmapError: The search is refused before anything is run (``check_tune``).
-    """
+    """Search, judge, and write tune.csv, and recommended.toml if a configuration holds; return the outcome in words."""
     import pandas as pd
 
     check_tune(plan, max_runs)

@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
+from dudmap.app.pipeline.environment import machine
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark.suites import Entry, Excerpt
 from dudmap.lab.study.plan import Run
@@ -60,11 +61,7 @@ class StudyFolder:
             (self.root / name).mkdir(parents=True, exist_ok=True)
 
     def result(self, key: str) -> dict[str, Any] | None:
-        """Result of a run, None if it has none.
-
-        Raises:
-            DudmapError: The file was changed by something else and cannot be read.
-        """
+        """Result of a run, None if it has none."""
         path = self.root / "runs" / key / "result.json"
         try:
             return json.loads(path.read_text(encoding="utf-8"))
@@ -116,12 +113,6 @@ class StudyFolder:
         with (self.root / f"journal-{host}.jsonl").open("ab", buffering=0) as file:
             file.write((json.dumps(line) + "\n").encode())
 
-    def journal(self) -> list[dict[str, Any]]:
-        """All lines of the journals in the order of time; a line cut off by a full disk is left out."""
-        lines = [line for path in self.root.glob("journal*.jsonl")
-                 for line in path.read_text(encoding="utf-8").splitlines()]  # fmt: skip
-        return sorted((json.loads(line) for line in lines if line.endswith("}")), key=lambda line: line["time"])
-
 
 Do = Callable[[Run, Path | None], dict[str, Any]]
 """Makes the row of a run, and keeps the run in a folder if given."""
@@ -166,9 +157,6 @@ def measure_run(run: Run, out: Path | None) -> dict[str, Any]:
     """Figures of one run of the system, as ``dudmap.lab.benchmark.measure`` makes them.
 
     Frames are not prepared ahead in a second thread, so that the time per frame is all the time a frame takes.
-
-    Raises:
-        DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.lab.benchmark.measure import measure_sequence
 
@@ -234,7 +222,7 @@ class LocalExecutor:
 
     def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:
         self.workers = workers
-        self.cores = threads or max(1, usable_cores() // workers)
+        self.cores = threads or max(1, machine()["cores_usable"] // workers)
         self._pids: dict[ProcessPoolExecutor, int] = {}
         self._idle: list[ProcessPoolExecutor] = []
         self._lock = threading.Lock()
@@ -273,11 +261,6 @@ class LocalExecutor:
                 os.kill(pid, signal.SIGTERM)
             except OSError:  # it ended by itself: ProcessLookupError, on Windows another one
                 continue
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def set_threads(threads: int) -> None:

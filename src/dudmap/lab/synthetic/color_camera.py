@@ -120,11 +120,7 @@ class Lens:
 
 
 def compressed(color: NDArray[np.uint8], quality: float) -> NDArray[np.uint8]:
-    """Image (H, W, 3) after JPEG compression and decompression.
-
-    Raises:
-        FrameError: The image cannot be compressed.
-    """
+    """Image (H, W, 3) after JPEG compression and decompression."""
     done, code = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, round(quality)])
     if not done:
         raise FrameError("the colour image could not be compressed as JPEG")

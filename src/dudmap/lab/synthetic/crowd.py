@@ -1,4 +1,7 @@
-"""Stream of walking people that covers a given share of the image."""
+"""Stream of walking people that covers a given share of the image.
+
+A share that no crowd covers is a ``ConfigError``.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,9 +91,6 @@ def crowd_of(
     """Crowd that covers the share ``coverage`` of the image on average, once all of it is in view; by bisection.
 
     The frames have timestamps (N,) in seconds and camera poses (N, 4, 4).
-
-    Raises:
-        ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene covers it.
     """
     if not 0.02 <= coverage <= 0.95:
         raise ConfigError(f"coverage is {coverage}; expected a share of the image from 0.02 to 0.95")

@@ -31,7 +31,6 @@ class FloorPath:
 
     Args:
         smooth: Standard deviation of the smoothing, seconds.
-        yaw: Heading before the first motion, radians; None takes the direction of the first motion.
         gaps: Intervals (from, to) in which the object is absent, seconds.
     """
 
@@ -41,7 +40,6 @@ class FloorPath:
         points: Sequence[Sequence[float]],
         *,
         smooth: float = 0.15,
-        yaw: float | None = None,
         gaps: Sequence[tuple[float, float]] = (),
     ) -> None:
         self._start = times[0] - 1.0
@@ -59,12 +57,10 @@ class FloorPath:
         length[pieces - 1] = 0.0
         self.walked = np.concatenate([[0.0], np.cumsum(length)])
         moving = length > 0.01 * STEP
-        if yaw is None:
-            first = int(np.argmax(moving))
-            yaw = float(np.arctan2(step[first, 1], step[first, 0])) if moving.any() else 0.0
+        first = step[int(np.argmax(moving))] if moving.any() else np.array([1.0, 0.0])
         headings = np.where(moving, np.arctan2(step[:, 1], step[:, 0]), np.nan)
         known = np.where(np.isnan(headings), 0, np.arange(1, len(headings) + 1))
-        filled = np.concatenate([[yaw], headings])[np.maximum.accumulate(known)]
+        filled = np.concatenate([[np.arctan2(first[1], first[0])], headings])[np.maximum.accumulate(known)]
         self.yaws = smoothed(np.unwrap(np.append(filled, filled[-1:]))[:, None], 0.12)[:, 0]
 
     def at(self, t: float) -> tuple[NDArray[np.float64], float, float]:
@@ -90,10 +86,9 @@ def crossing(
     *,
     enter: float = 1.0,
     start_inside: bool = False,
-    pause: float = 1.0,
     entry_speed: float = 1.2,
 ) -> FloorPath:
-    """Path from one end of ``line`` to the other and, after a pause out of view, back again, until ``duration``.
+    """Path from one end of ``line`` to the other and, after a second out of view, back again, until ``duration``.
 
     The middle 40 % of the line are covered at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
     also come into view. 25 % of the line are covered at the time ``enter`` in seconds; with ``start_inside`` the path
@@ -115,7 +110,7 @@ def crossing(
         for share, moment in zip(shares, needed, strict=True):
             times.append(begin + float(moment))
             points.append(a + (share if ahead else 1 - share) * (b - a))
-        begin = times[-1] + pause
+        begin = times[-1] + 1.0
         gaps.append((times[-1], begin))
     return FloorPath(times, [list(p) for p in points], smooth=0.1, gaps=gaps)
 

@@ -306,10 +306,6 @@ MOVERS: dict[str, Callable[[Staging], list[SyntheticMover]]] = {
 
 
 def build_movers(names: tuple[str, ...], staging: Staging) -> list[SyntheticMover]:
-    """Movers by name.
-
-    Raises:
-        ConfigError: A name is unknown.
-    """
+    """Movers by name."""
     makers = [find(name, MOVERS, "mover") for name in names]
     return [mover for make in makers for mover in make(staging)]

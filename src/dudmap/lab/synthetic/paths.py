@@ -1,4 +1,7 @@
-"""Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion."""
+"""Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion.
+
+A path that is unknown, or does not fit the scene, is a ``ConfigError``.
+"""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -143,11 +146,7 @@ FOLLOW = "follow"
 
 
 def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers: list[SyntheticMover]) -> Array:
-    """Poses Ts_world_camera (N, 4, 4) of a built-in path or a trajectory file at ``times`` (N,), which start at 0.
-
-    Raises:
-        ConfigError: There is neither a path nor a file of this name, or the trajectory does not fit the scene.
-    """
+    """Poses Ts_world_camera (N, 4, 4) of a built-in path or a trajectory file at ``times`` (N,), which start at 0."""
     rng = np.random.default_rng([seed, 2])
     if str(path) == FOLLOW:
         if not movers:
@@ -166,9 +165,6 @@ def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Arr
 
     The mean orientation becomes that of the home pose. The centre of the positions is placed as close to the home
     position as possible, such that all positions are in the free space of the scene and clear of its solids.
-
-    Raises:
-        ConfigError: The trajectory is too short or too large for the scene.
     """
     start, end = trajectory.timestamps[0], trajectory.timestamps[-1]
     if times[-1] > end - start + 1e-6:

@@ -161,7 +161,7 @@ class SyntheticSequence:
         numbers = np.arange(1, len(self._movers) + 1, dtype=np.int16)
         return self._by_pixel(numbers, self._render(self._number(index), with_color=False))
 
-    def surface(self, observed: bool = False, views: int = 3) -> Mesh:
+    def surface(self, observed: bool = False) -> Mesh:
         """True static surface in the world frame at the end of the sequence.
 
         It includes the movers that were at rest during the last second. Triangles inside or between solids are left
@@ -169,8 +169,7 @@ class SyntheticSequence:
 
         Args:
             observed: Only the part that the camera saw (not occluded by movers, within the range of the sensor, not at
-                a grazing angle) in at least ``views`` of up to 120 evenly spread frames.
-            views: See ``observed``.
+                a grazing angle) in at least three of up to 120 evenly spread frames.
         """
         mesh = self._surface
         if not observed:
@@ -180,7 +179,7 @@ class SyntheticSequence:
         frames = np.unique(np.linspace(0, len(self) - 1, min(len(self), 120)).astype(int))
         shots = ((self.ground_truth.Ts_world_camera[index], self.exact_depth(index)) for index in frames)
         counts = count_views(mesh, self.camera, shots, reach, model.grazing if model else 0.1)
-        enough = counts >= min(views, len(frames))
+        enough = counts >= min(3, len(frames))
         return with_faces(mesh, np.all(enough[mesh.faces], axis=1))
 
     @cached_property

@@ -5,7 +5,7 @@ other measures, and a material of the scene or of the furniture. A row with ``re
 several, each with one of these numbers in place of every "*".
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -65,16 +65,9 @@ def poster(
     center: Vector, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
 ) -> Primitive:
     """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
-    w, h = size
-    material = Material(
-        "poster",
-        (0.5 / w, 0.5 / h),
-        ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25),
-        variation=0.05,
-        faces=False,
-    )
-    extent = (depth, w, h) if side else (w, depth, h)
-    return box(center, extent, material)
+    (w, h), middle = size, ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25)
+    material = Material("poster", (0.5 / w, 0.5 / h), middle, variation=0.05, faces=False)
+    return box(center, (depth, w, h) if side else (w, depth, h), material)
 
 
 def shelf(center: tuple[float, float], width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
@@ -117,13 +110,9 @@ SCENES = tables("synthetic/scenes.toml")
 """Rows of the scenes by name."""
 
 
-def build_scene(name: str) -> Scene:
-    """Build a scene by name.
-
-    Raises:
-        ConfigError: There is no scene of this name.
-    """
-    row = dict(find(name, SCENES, "scene"))
+def build_scene(name: str, scenes: Mapping[str, Any] = SCENES) -> Scene:
+    """Scene of a name from rows of scenes."""
+    row = dict(find(name, scenes, "scene"))
     if "painted" in row:
         scene = build_scene(row["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]

@@ -1,4 +1,7 @@
-"""Sensors: noise models of depth and colour, and five RGB-D cameras as people own them."""
+"""Sensors: noise models of depth and colour, and five RGB-D cameras as people own them.
+
+An unknown name is a ``ConfigError``.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -101,11 +104,7 @@ SENSORS = {name: _model(row) for name, row in tables("synthetic/sensors.toml")["
 
 
 class Sensor:
-    """Sensor, one of ``SENSORS``, that adds noise to ideal images; equal seeds and frame numbers give equal errors.
-
-    Raises:
-        ConfigError: The name is unknown.
-    """
+    """Sensor, one of ``SENSORS``, that adds noise to ideal images; equal seeds and frame numbers give equal errors."""
 
     def __init__(self, name: str, seed: int) -> None:
         self.model = find(name, SENSORS, "noise model")

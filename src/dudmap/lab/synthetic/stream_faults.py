@@ -46,11 +46,7 @@ class StreamFault(NamedTuple):
 
 
 class FaultyStream:
-    """A recording as it arrives, in ``deliveries``, with one of ``FAULTS``; its stamps need not increase.
-
-    Raises:
-        ConfigError: There is no such fault.
-    """
+    """A recording as it arrives, in ``deliveries``, with one of ``FAULTS``; its stamps need not increase."""
 
     def __init__(self, recording: Sequence, fault: str) -> None:
         self.recording = recording

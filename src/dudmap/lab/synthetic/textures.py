@@ -246,7 +246,7 @@ _MAKERS: dict[str, Maker] = {
 TEXTURES = tuple(_MAKERS)
 
 
-def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.int32]:
+def build_atlas(names: set[str]) -> NDArray[np.int32]:
     """Textures with mip maps, (number of textures, texels of all levels) int32; unused textures stay zero.
 
     A texel is red | green << 8 | blue << 16, each 0..255.
@@ -254,14 +254,14 @@ def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.int32]:
     atlas = np.zeros((len(TEXTURES), sum((SIZE >> level) ** 2 for level in range(LEVELS))), dtype=np.int32)
     for number, name in enumerate(TEXTURES):
         if name in names or number == 0:
-            atlas[number] = _mip_maps(name, seed)
+            atlas[number] = _mip_maps(name)
     return atlas
 
 
 @cache
-def _mip_maps(name: str, seed: int) -> NDArray[np.int32]:
+def _mip_maps(name: str) -> NDArray[np.int32]:
     """Texels of all levels of a texture, from the finest on; scenes share textures, which take long to compute."""
-    image = np.clip(_MAKERS[name](np.random.default_rng([seed, TEXTURES.index(name)])), 0.0, 1.0)
+    image = np.clip(_MAKERS[name](np.random.default_rng([0, TEXTURES.index(name)])), 0.0, 1.0)
     levels = []
     for level in range(LEVELS):
         size = SIZE >> level
