@@ -79,7 +79,7 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
     some, steps = b.points[:: max(1, len(b.points) // 200)], np.linspace(0, 1, 20)[:, None]
     gap, near = KDTree(a.points).query(some)
     ways = np.argsort(gap)[: max(5, len(some) // 5)]
-    start, end = some[ways][:, None], a.points[near[ways]][:, None]
+    start, end = some[ways][:, None], a.points[np.asarray(near)[ways]][:, None]
     samples, clear = own.sample((start + (end - start) * steps).reshape(-1, 3)), 2 * own.volume.voxel_size
     free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > clear))
     return bool(np.median(free.reshape(len(ways), -1).mean(axis=1) * gap[ways]) < clear)

@@ -78,12 +78,12 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
             if "error" in ours[-1]:
                 raise DudmapError(f"our run of the comparison failed: {ours[-1]['error']}")
             theirs.append(run_open3d(python, folder, Config().volume.voxel_size))
-    ates = []
+    ates: list[float | None] = []
     for row in (ours[-1], theirs[-1]):
         poses: list[Any] = [(t, np.array(T)) for t, T in zip(stamps, row["poses"], strict=True) if T is not None]
         scored = accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",)) if truth and poses else {}
         ates.append(scored.get("ate_rmse_m"))
-    return Comparison(median_ms(ours), median_ms(theirs), *ates, len(stamps), str(theirs[-1]["version"]))
+    return Comparison(median_ms(ours), median_ms(theirs), ates[0], ates[1], len(stamps), str(theirs[-1]["version"]))
 
 
 def save_frames(sequence: Sequence, frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:

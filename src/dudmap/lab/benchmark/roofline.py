@@ -73,7 +73,7 @@ def rates(threads: int) -> tuple[float, float]:
     first, second, third = (array[:8] for array in arrays[0])
     _triad(first, second, third, np.float32(2))
     _multiply_add(data[0], 1)
-    seconds = _best_seconds(threads, lambda k: _triad(*arrays[k], np.float32(2)))
+    seconds = _best_seconds(threads, lambda k: _triad(arrays[k][0], arrays[k][1], arrays[k][2], np.float32(2)))
     computed = threads * rounds * 2048 * 64 / _best_seconds(threads, lambda k: _multiply_add(data[k], rounds))
     return 3 * 4 * size * threads / seconds, computed
 

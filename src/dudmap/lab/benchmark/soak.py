@@ -66,9 +66,9 @@ class Tenths(RunObserver):
             self._lost += 1
         else:
             true = self._recording.ground_truth.Ts_world_camera[index]
-            if self._T_room_world is None:
-                self._T_room_world = true @ se3.inverse(result.T_world_camera)
-            self._errors.append(float(np.linalg.norm((self._T_room_world @ result.T_world_camera - true)[:3, 3])))
+            if (T_room_world := self._T_room_world) is None:
+                self._T_room_world = T_room_world = true @ se3.inverse(result.T_world_camera)
+            self._errors.append(float(np.linalg.norm((T_room_world @ result.T_world_camera - true)[:3, 3])))
         if (index + 1) % (len(self._recording) // 10) == 0:
             cpu, wall = np.median(self._times, axis=0)
             size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
