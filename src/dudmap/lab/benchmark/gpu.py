@@ -78,7 +78,7 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
             if "error" in ours[-1]:
                 raise DudmapError(f"our run of the comparison failed: {ours[-1]['error']}")
             theirs.append(run_open3d(python, folder, Config().volume.voxel_size))
-    ates: list[float | None] = []
+    ates: list[Any] = []
     for row in (ours[-1], theirs[-1]):
         poses: list[Any] = [(t, np.array(T)) for t, T in zip(stamps, row["poses"], strict=True) if T is not None]
         scored = accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",)) if truth and poses else {}
