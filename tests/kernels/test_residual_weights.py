@@ -37,6 +37,7 @@ OWNERS = {
         "core/formulas/residual.py",
         "core/tracking/tracker.py:parameters",  # hands them on
         "core/tracking/tracker.py:_judge",  # asks whether the weights have the noise
+        "fleet/sdf_alignment.py:align_maps",  # differences of two maps, without a reading or its noise
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",

@@ -139,14 +139,14 @@ def test_an_unknown_or_empty_view_is_not_recognised(room):
 
 def test_moving_pixels_give_no_features(room):
     observation, T = room[0]
-    static = np.zeros(SMALL.shape, dtype=bool)
+    dynamic = np.ones(SMALL.shape, dtype=bool)
     known = KeyframeDatabase(RelocalizationConfig(), SMALL)
-    known.add(observation, T, static)
+    known.add(observation, T, dynamic)
     known.settle()
     assert known.keyframes == []
-    static[:, :160] = True
+    dynamic[:, :160] = False
     known = KeyframeDatabase(RelocalizationConfig(), SMALL)
-    assert known.add(observation, T, static)
+    assert known.add(observation, T, dynamic)
     known.settle()
     u = SMALL.project(known.keyframes[0].features.points)[:, 0]
     assert u.max() < 160

@@ -44,8 +44,8 @@ class Places:
     def __init__(self, candidates, num_features):
         self.candidates, self.num_features, self.masks = candidates, num_features, []
 
-    def extract(self, observation, static_mask=None):
-        self.masks.append(static_mask)
+    def extract(self, observation, dynamic_mask=None):
+        self.masks.append(dynamic_mask)
         return features(self.num_features)
 
     def match(self, features):
@@ -74,9 +74,8 @@ class Registration:
         return PoseEstimate(replace(self.tracking, T_world_camera=shifted(self.moved) @ T_init), self.labels)
 
 
-def recover(subject, register, accept=lambda tracking: True, static_mask=None):
+def recover(subject, register, accept=lambda tracking: True, known_dynamic=None):
     level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
-    known_dynamic = None if static_mask is None else ~static_mask
     view = SimpleNamespace(
         observation=frame(5.0), labelled=level, timer=StageTimer(), known_dynamic=known_dynamic
     )  # what of a FrameView is used
@@ -137,9 +136,9 @@ def test_registration_must_confirm_the_features(register, passes):
     assert (recover(relocalizer([match(1, 0.2)]), register) is not None) == passes
 
 
-def test_the_static_mask_reaches_the_features():
+def test_the_dynamic_mask_reaches_the_features():
     subject, mask = relocalizer(), np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 20)
-    assert recover(subject, Registration(), static_mask=mask) is None
+    assert recover(subject, Registration(), known_dynamic=mask) is None
     assert len(subject.atlas.keyframes.masks) == 1
     assert np.array_equal(subject.atlas.keyframes.masks[0], mask)
 
