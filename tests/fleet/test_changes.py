@@ -15,9 +15,13 @@ from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.fleet.change_benchmark import draw_pair, figures, score_pair
 from dudmap.fleet.change_evidence import BEHIND, CONFIRMED, DENIED, Visit
+from dudmap.fleet.change_objects import Piece, is_hidden_between
 from dudmap.fleet.change_watch import WATCH_FILE, ChangeWatch
 from dudmap.fleet.changes import find_changes, vertical
 from dudmap.fleet.diff import diff_runs, summary
+from dudmap.lab.synthetic.folder import write_folder
+from dudmap.lab.synthetic.inserted import WithThing
+from dudmap.lab.synthetic.scene import Material, box, pose
 from dudmap.lab.synthetic.visits import parsed_changes, visits
 from rendered_places import CAMERA, true_map
 
@@ -205,11 +209,45 @@ def test_synth_writes_two_visits(tmp_path):
 def test_the_score_counts_missed_false_and_wrong_kinds(changed):
     whole = figures([changed.score | {"scene": "room"}])
     assert (whole["recall_15cm"], whole["precision"], whole["kind_right"]) == (1.0, 1.0, 1.0)
-    missed = score_pair(changed.changes[1:], changed.truth, changed.maps[0].T_scene_world)
+    others = [change for change in changed.changes if change.kind != "moved"]
+    missed = score_pair(others, changed.truth, changed.maps[0].T_scene_world)
     assert [thing["found"] for thing in missed["things"]] == [None, "disappeared"]
     assert score_pair(changed.changes, changed.truth[1:], changed.maps[0].T_scene_world)["false"] == ["moved"]
     wrong = [replace(change, kind="recoloured") for change in changed.changes]
     assert figures([score_pair(wrong, changed.truth, changed.maps[0].T_scene_world)])["kind_right"] == 0.0
+
+
+def test_a_thing_is_put_into_a_recording_where_nothing_nearer_hides_it(unchanged):
+    recording = unchanged.recordings[0]
+    T, frame = recording.ground_truth.Ts_world_camera[3], recording[3]
+    z = float(np.median(frame.depth[110:130, 150:170]))
+    thing = box((0, 0, 0), (0.2, 0.2, 0.2), Material("books")).moved(T @ pose((0, 0, z - 0.3)))
+    shown = WithThing(recording, range(2, 6), recording.ground_truth, [thing])
+    changed = shown[1].depth != frame.depth
+    assert changed[120, 160]
+    assert 0.001 < changed.mean() < 0.3
+    assert (shown[1].depth[changed & (frame.depth > 0)] < frame.depth[changed & (frame.depth > 0)] + 0.1).all()
+    assert np.linalg.norm(np.median(shown.seen[0], axis=0) - (T @ (0, 0, z - 0.4, 1))[:3]) < 0.06
+    behind = box((0, 0, 0), (0.2, 0.2, 0.2), Material("books")).moved(T @ pose((0, 0, z + 1)))
+    hidden = WithThing(recording, range(6), recording.ground_truth, [behind])[3]
+    assert (hidden.depth != frame.depth)[frame.depth > 0].sum() < 0.05 * changed.sum()
+
+
+def test_parts_are_joined_only_where_no_free_space_was_seen_between(changed):
+    visit = changed.visits[0]
+    points = visit.mesh.vertices[changed.found[0].state == CONFIRMED].astype(float)
+
+    def piece(at):
+        near = np.linalg.norm(points - at, axis=1) < 0.08
+        return Piece(np.flatnonzero(near), points[near], 0.01)
+
+    T = visit.keyframes[0]
+    seen = points[np.argsort(np.linalg.norm(points - (T @ (0, 0, 2.5, 1))[:3], axis=1))[0]]
+    front = T[:3, 3] + 0.7 * (seen - T[:3, 3])
+    behind = Piece(np.arange(5), seen + np.random.default_rng(1).normal(0, 0.01, (50, 3)), 0.01)
+    floating = Piece(np.arange(5), front + np.random.default_rng(1).normal(0, 0.01, (50, 3)), 0.01)
+    assert is_hidden_between(piece(seen), behind, visit)
+    assert not is_hidden_between(floating, behind, visit)  # the camera looked through the space between
 
 
 def test_a_fifth_of_the_pairs_has_no_change():
@@ -247,6 +285,15 @@ def test_what_is_gone_is_reported_while_the_run_goes_on(changed, unchanged, tmp_
             at = T[:3] @ np.append(change.before.mean(axis=0), 1)
             assert min(np.linalg.norm(np.array(row["centre"]) - at) for row in rows) < 0.25
         assert len(rows) <= 2 * len(pair.truth)
+
+
+def test_run_watches_for_changes_against_the_map_of_an_earlier_visit(changed, runs, tmp_path):
+    write_folder(changed.recordings[1], tmp_path / "next", surface=False)
+    words = ["run", str(tmp_path / "next"), "--map", str(runs[0]), "--watch", "--out", str(tmp_path / "out"), "--quiet"]
+    done = CliRunner().invoke(app, [*words, "--set", "volume.voxel_size=0.02", "--set", "device=cpu"])
+    assert done.exit_code == 0, done.output
+    rows = [json.loads(line) for line in (tmp_path / "out" / WATCH_FILE).read_text().splitlines()]
+    assert "disappeared" in {row["kind"] for row in rows}
 
 
 def test_what_is_new_is_reported_within_a_second_and_what_passes_is_not(unchanged, tmp_path):

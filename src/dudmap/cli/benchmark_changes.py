@@ -16,6 +16,10 @@ def changes(
     seed: Annotated[int, Option(min=0, help="Seed of the pairs.", metavar="N")] = 0,
     min_size: Annotated[float, Option(help="Edge of the smallest thing that is reported.", metavar="M")] = 0.1,
     out: Annotated[Path, Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
+    into: Annotated[
+        Path | None,
+        Option(help="Put things into, and cut them out of, the second half of a real recording.", metavar="PATH"),
+    ] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -24,12 +28,15 @@ def changes(
     A fifth of the pairs has no change, a fifth people in the second visit, and every third other light.
     """
     from dudmap.fleet.change_benchmark import figures, measure_changes
+    from dudmap.io.sequences import open_sequence
 
     def told(row: dict[str, Any]) -> None:
         hits = sum(thing["found"] is not None for thing in row["things"])
         outcome = row.get("error") or f"{hits} of {len(row['things'])} found, {len(row['false'])} false"
         say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
 
-    rows, text = measure_changes(seed, count, o.read_config(None, None, assignments), out, min_size, told)
+    recording = None if into is None else open_sequence(into)
+    config = o.read_config(None, None, assignments)
+    rows, text = measure_changes(seed, count, config, out, min_size, told, recording)
     tree = {"rows": rows, "figures": figures(rows), "out": out}
     answer(tree, f"{text}\nwritten to {out}", as_json=as_json)

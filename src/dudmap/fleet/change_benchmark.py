@@ -14,23 +14,35 @@ from scipy.spatial import KDTree
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.fleet.changes import Change
+from dudmap.fleet.change_evidence import Visit
+from dudmap.fleet.changes import Change, vertical
 from dudmap.fleet.diff import compared
+from dudmap.fleet.map_samples import OBSERVED, UNSEEN
+from dudmap.io.sequences import Sequence as Recording
 from dudmap.lab.benchmark.measure import save
+from dudmap.lab.synthetic.inserted import WithThing
 from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.scene import Primitive
+from dudmap.lab.synthetic.visits import THINGS as MAKERS
 from dudmap.lab.synthetic.visits import TrueChange, visits
 
 SCENES = {"room": 0.5, "corridor": 0.2, "desk": 0.3}
 THINGS = {"box": 0.35, "bin": 0.15, "ball": 0.1, "chair": 0.15, "shelf": 0.08, "poster": 0.1, "door": 0.07}
 LARGE = ("chair", "shelf", "door")
 """Things that do not fit on a desk."""
+ONCE = ("door", "poster")
+"""Things of which a scene may have only one."""
 KINDS = {"moved": 0.45, "appeared": 0.275, "disappeared": 0.275}
 PATHS = ("handheld", "pan", "orbit", "dolly")
 NONE, PEOPLE, LIGHT = 0.2, 0.2, 0.3
 """Shares of the pairs without any change, with people in the second visit, and with other light."""
 SAME = 0.06
 """Distance within which found and true surface are the same, metres: three voxels and the noise at 3 m."""
+SAME_MOTION_CM = 5.0
+"""Error of a motion below which a thing that one visit hardly saw has rightly been found as moved."""
 LEAST_SHARE = 0.5
 """Share of a found surface that must lie on that of a true change to be it."""
 IOU_CELL = 0.04
@@ -51,7 +63,7 @@ def draw_pair(seed: int, number: int, changed: bool | None = None) -> dict[str, 
     changes = []
     for _ in range(int(rng.integers(1, 5))):
         thing, kind = one_of(THINGS), one_of(KINDS)
-        while scene == "desk" and thing in LARGE:
+        while (scene == "desk" and thing in LARGE) or (thing in ONCE and thing in [name for name, _ in changes]):
             thing = one_of(THINGS)
         changes.append((thing, {"poster": "recoloured", "door": "opened"}.get(thing, kind)))
     return {
@@ -114,8 +126,10 @@ def score_pair(
         row: dict[str, Any] = {"thing": true.thing, "kind": true.kind, "size": true.size, "found": None}
         if mine:
             row |= {"found": mine[0].kind, "iou": _iou(surface(mine[0]), surface(true))}
-            if mine[0].T_after_before is not None and true.kind == "moved":
+            if mine[0].T_after_before is not None and not np.array_equal(true.T_after_before, np.eye(4)):
                 row |= _motion_error(true, T_scene_before @ mine[0].T_after_before @ se3.inverse(T_scene_before))
+                if row["motion_cm"] < SAME_MOTION_CM:  # seen by both visits, though one saw little
+                    row["kind"] = "moved"
         things.append(row)
     false += [c.kind for c, owner in zip(found, owners, strict=True) if owner is None]
     return {"things": things, "false": false}
@@ -151,12 +165,73 @@ def measure_pair(job: tuple[dict[str, Any], Config, float]) -> dict[str, Any]:
     return row | score_pair(changes, truth, recordings[0].ground_truth.Ts_world_camera[0])
 
 
+def measure_insertions(
+    recording: Recording, seed: int, count: int, config: Config, min_size: float, done: Callable[[dict[str, Any]], None]
+) -> list[dict[str, Any]]:
+    """Rows of so many things that are put into the second half of a real recording, or cut out of it: every other pair
+    is compared the other way round."""
+    rng, middle, rows = np.random.default_rng([seed, 35]), len(recording) // 2, []
+    halves = range(middle), range(middle, len(recording))
+    with tempfile.TemporaryDirectory() as folder:
+        plain = [Path(folder) / "before", Path(folder) / "plain"]
+        empty = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+        for frames, out in zip(halves, plain, strict=True):
+            run(WithThing(recording, frames, empty, []), config, out, progress=False)
+        trajectory = Trajectory.load(plain[1] / "trajectory.txt")
+        visit = Visit.of(SavedMap.load(plain[1]), np.eye(4))
+        for number in range(count):
+            size = float(rng.uniform(SMALL, 0.3))
+            thing = WithThing(recording, halves[1], trajectory, _stood(visit, rng, size))
+            after = Path(folder) / "after"
+            run(thing, config, after, progress=False)
+            points = np.unique(np.concatenate(thing.seen).round(2), axis=0)
+            none, kind = np.empty((0, 3)), ("appeared", "disappeared")[number % 2]
+            sides = (none, points) if kind == "appeared" else (points, none)
+            true = TrueChange("box", kind, size, np.eye(4), *sides, symmetric=False, at=points.mean(axis=0))
+            found = compared(*((plain[0], after) if kind == "appeared" else (after, plain[0])), min_size)
+            T = se3.inverse(found.visits[1].T_common_map) if kind == "appeared" else np.eye(4)
+            rows.append({"pair": number, "scene": recording.name} | score_pair(found.changes, [true], T))
+            done(rows[-1])
+    return rows
+
+
+def _stood(visit: Visit, rng: np.random.Generator, size: float) -> list[Primitive]:
+    """A box on a level surface in view of a visit, where nothing is in its way."""
+    up, mesh, camera = vertical(visit), visit.mesh, visit.volume.camera
+    level = np.flatnonzero(mesh.normals @ up > 0.95)
+    for vertex in rng.permutation(level)[:5000]:
+        at = mesh.vertices[vertex].astype(np.float64)
+        local = np.einsum("nij,j->ni", np.linalg.inv(visit.views), np.append(at + up * size / 2, 1))[:, :3]
+        pixel = camera.project(local)
+        inside = (local[:, 2] > 0.7) & (local[:, 2] < 2.5) & np.all((pixel > 60) & (pixel < (580, 420)), axis=1)
+        side = np.cross(up, rng.normal(size=3))
+        side /= np.linalg.norm(side)
+        T = np.eye(4)
+        T[:3] = np.stack([side, np.cross(up, side), up, at], axis=1)
+        solids = [solid.moved(T) for solid in MAKERS["box"][0](rng, size)]
+        around = rng.uniform(-0.5, 0.5, (300, 3)) * size + at + up * 0.7 * size
+        samples = visit.sample(around)
+        blocked = (samples.state == OBSERVED) & (samples.sdf < 0.1 * size)
+        if inside.mean() > 0.3 and not blocked.any() and np.mean(samples.state != UNSEEN) > 0.7:
+            return solids
+    raise ConfigError("no level surface in the second half of the recording has room for a box in view")
+
+
 def measure_changes(
-    seed: int, count: int, config: Config, out: Path, min_size: float, done: Callable[[dict[str, Any]], None]
+    seed: int,
+    count: int,
+    config: Config,
+    out: Path,
+    min_size: float,
+    done: Callable[[dict[str, Any]], None],
+    recording: Recording | None = None,
 ) -> tuple[list[dict[str, Any]], str]:
-    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``."""
-    rows = []
-    for number in range(count):
+    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``.
+
+    The pairs are rendered ones, or with a recording its halves, see ``measure_insertions``.
+    """
+    rows = [] if recording is None else measure_insertions(recording, seed, count, config, min_size, done)
+    for number in range(count) if recording is None else ():
         row = {"pair": number} | measure_pair((draw_pair(seed, number), config, min_size))
         rows.append(row)
         done(row)

@@ -7,13 +7,18 @@ same part of the place, which hold the error of the alignment and the bending of
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import SavedMap
@@ -23,8 +28,8 @@ UNKNOWN, CONFIRMED, DENIED, BEHIND = 0, 1, 2, 3
 """State of a vertex: the other map did not see the place; has a surface there; saw free space; or has it behind one."""
 DEVIATIONS = 3.0
 """Standard deviations that noise may reach."""
-MAX_VIEWS = 24
-"""Keyframes of a visit that are asked what they look through."""
+MAX_VIEWS, VIEWS = 24, 3
+"""Poses of a visit that are asked what they look through, and how many of them must look through a place."""
 CELL = 0.5
 """Edge of the cells in which the noise of the surfaces is measured, metres: the size of furniture."""
 MIN_CELL_POINTS = 50
@@ -47,10 +52,11 @@ class Evidence:
         state: (V,) uint8.
         sdf: (V,) float32, distance to the surface of the other map, metres; NaN where it is unknown.
         tolerance: (V,) distance that noise explains, metres.
-        blur: (V,) width of a depth edge: two pixels of the camera, two voxels at least, metres.
+        blur: (V,) width of a depth edge, metres: two pixels of the camera, two voxels at least, and the noise.
         weight: (V,) float32, of the own map there.
         min_weight: Weight that the mesh needs.
         other_color: (V, 3) float32, colour of the other map where it confirms, else 0.
+        cameras: (k, 3) positions of the own camera, metres, common frame.
     """
 
     mesh: Mesh
@@ -61,11 +67,18 @@ class Evidence:
     weight: NDArray[np.float32]
     min_weight: int
     other_color: NDArray[np.float32]
+    cameras: NDArray[np.float64]
 
-    @property
+    @cached_property
     def points(self) -> NDArray[np.float64]:
         """Vertices (V, 3), metres."""
         return self.mesh.vertices.astype(np.float64)
+
+    @cached_property
+    def parts(self) -> NDArray[np.intp]:
+        """Number (V,) of the surface to which each vertex belongs if what the other map confirms is left out."""
+        faces = self.mesh.faces[np.all(self.state[self.mesh.faces] != CONFIRMED, axis=1)]
+        return components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(self.state))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +90,14 @@ class Visit:
         T_common_map: (4, 4).
         mesh: Its surface in the common frame.
         keyframes: (k, 4, 4) poses of its keyframes in the common frame.
+        views: (n, 4, 4) some poses of the camera all along the visit, in the common frame.
     """
 
     volume: TsdfVolume
     T_common_map: NDArray[np.float64]
     mesh: Mesh
     keyframes: NDArray[np.float64]
+    views: NDArray[np.float64]
 
     @classmethod
     def of(cls, saved: SavedMap, T_common_map: NDArray[np.float64]) -> "Visit":
@@ -90,12 +105,17 @@ class Visit:
 
         Raises:
             MapError: The map is empty.
+            DatasetError: The trajectory beside it is damaged.
         """
         mesh, (R, t) = saved.volume.extract_mesh(), (T_common_map[:3, :3], T_common_map[:3, 3])
         vertices = (mesh.vertices.astype(np.float64) @ R.T + t).astype(np.float32)
         moved = Mesh(vertices, mesh.faces, mesh.colors, (mesh.normals @ R.T).astype(np.float32))
-        poses = np.array([T_common_map @ keyframe.T_world_camera for keyframe in saved.keyframes])
-        return cls(saved.volume, T_common_map, moved, poses)
+        keyframes = np.array([T_common_map @ keyframe.T_world_camera for keyframe in saved.keyframes])
+        path, views = saved.folder / "trajectory.txt", keyframes
+        if saved.folder != Path() and path.is_file():
+            views = T_common_map @ Trajectory.load(path).Ts_world_camera
+        chosen = np.unique(np.linspace(0, len(views) - 1, MAX_VIEWS).astype(int))
+        return cls(saved.volume, T_common_map, moved, keyframes, views[chosen])
 
     def sample(self, points: NDArray[np.float64]) -> MapSamples:
         """The map at points (n, 3) of the common frame."""
@@ -107,7 +127,7 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     points = own.mesh.vertices.astype(np.float64)
     samples, band = other.sample(points), other.volume.truncation
     sdf = np.where(samples.state == OBSERVED, samples.sdf, np.where(samples.state == EMPTY, band, np.nan))
-    near = KDTree(own.keyframes[:, :3, 3]).query(points)[0]
+    near = KDTree(own.views[:, :3, 3]).query(points)[0]
     sigma = own.volume.sensor.sigma(near)
     voxel = max(own.volume.voxel_size, other.volume.voxel_size)
     noise = sigma * noise_share(points, sdf / sigma, band / 2 / sigma)
@@ -120,25 +140,25 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     away = away[surface_tree(other.mesh.vertices).query(points[away], workers=-1)[0] > tolerance[away]]
     state[away] = np.where((seen & ~np.isnan(sdf))[away], DENIED, UNKNOWN)
     doubtful = away[state[away] == UNKNOWN]
-    state[doubtful[times_seen_through(other, points[doubtful], tolerance[doubtful]) >= READINGS]] = DENIED
-    blur = EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel).astype(np.float32)
+    state[doubtful[times_seen_through(other, points[doubtful], tolerance[doubtful]) >= VIEWS]] = DENIED
+    blur = (EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel) + noise).astype(np.float32)
     color = np.where((state == CONFIRMED)[:, None], samples.color, 0)
     weight = own.sample(points).weight
-    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color)
+    cameras = own.views[:, :3, 3]
+    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color, cameras)
 
 
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
-    """How many keyframes (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
+    """How many views (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
 
-    The map remembers free space block by block, and not where a part of a block is hidden. What a keyframe sees of the
+    The map remembers free space block by block, and not where a part of a block is hidden. What a view sees of the
     map is behind space that it saw to be free, farther than a margin (n,), metres, also beside the pixel.
     """
     import cv2
 
     counts, camera = np.zeros(len(points), np.int64), visit.volume.camera
     T_map = se3.inverse(visit.T_common_map)
-    step = max(1, len(visit.keyframes) // MAX_VIEWS)
-    for T in visit.keyframes[::step] if len(points) else ():
+    for T in visit.views if len(points) else ():
         depth = visit.volume.raycast(T_map @ T, camera).depth
         nearest = cv2.erode(depth, np.ones((3, 3), np.uint8))
         local = transformed(se3.inverse(T), points)
@@ -146,6 +166,12 @@ def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArra
         inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         counts[inside] += nearest[v[inside], u[inside]] > (local[:, 2] + 2 * margin)[inside]
     return counts
+
+
+def components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    """Number (count,) of the connected component of each node of a graph with edges (n, 2)."""
+    graph = csr_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def surface_tree(points: NDArray[np.floating]) -> KDTree:

@@ -6,6 +6,7 @@ a motion if each surface lies on the other, has its colours, and nothing of it w
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +22,30 @@ from dudmap.fleet.sdf_alignment import align_maps
 Array = NDArray[np.float64]
 TURNS = 16
 """Turns about the vertical from which the surfaces are brought together."""
-COARSE, REFINED = 300, 5
-"""Points of a surface in the first step, and poses that are refined."""
-ICP_ROUNDS = 25
+COARSE, FINE, REFINED = 300, 1500, 4
+"""Points of a surface in the first step and when a pose is judged, and poses that are refined."""
+ICP_ROUNDS, STOP = 25, 1e-3
+"""Steps of a registration, and the twist (m, rad) that ends it."""
 COLOR_LENGTH = 0.3
 """Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
 Kang 1997), in sizes of the thing."""
 COLOR_GATE = 50.0
 """Difference of colours at which points do not meet in the first step, grey levels."""
+COLOR_SCALE = 15.0
+"""Difference of colours at which the Geman-McClure weight of two points that meet falls to a quarter, grey levels."""
 PULL = 0.05
 """Weight of the distance to a point against that to its plane: holds flat surfaces from sliding."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
 LEAST_FIT, LEAST_SHAPE, LEAST_SEEN = 0.8, 0.6, 0.25
 """Shares of the surface that must lie on the other's: of what would else hang in free space, of what would else hang
-there or lie under the other's surface (the back of a thin thing does), and of all of it."""
+there or lie under the other's surface (the back of a thin thing does), and of the smaller of both surfaces."""
 MAX_COLOR, MAX_CHROMA = (4.0, 0.2), 0.04
 """Largest median difference of the colours after one gain for other light: grey levels and share of the brightness; and
 of the shares of red, green and blue."""
+TEXTURE, LEAST_CORRELATION = 8.0, 0.5
+"""Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
+two that are one: things of one make have the same texture, any others have about none."""
 RING = 0.15
 """Width of the ring around a thing in which the planes that it stands on are looked for, metres."""
 LEAST_PLANE = 0.15
@@ -63,23 +70,32 @@ class Body:
     tolerance: float
 
     @classmethod
-    def of(cls, found: Evidence, piece: Piece, box: Array) -> "Body":
-        """The surface around a piece and in a box (2, 3), without the planes that go on around it."""
+    def of(cls, found: Evidence, piece: Piece, box: Array, reach: float) -> "Body":
+        """The surface around a piece and in a box (2, 3), without the planes that go on around it; and so far (m) from
+        the box what hangs together with the piece and the other map does not confirm: it may be hidden there."""
         points, margin = found.points, float(np.median(found.tolerance[piece.vertices]))
-        wide = np.all((points > box[0] - RING) & (points < box[1] + RING), axis=1)
-        inside = np.flatnonzero(wide & np.all((points > box[0] - margin) & (points < box[1] + margin), axis=1))
-        around = np.flatnonzero(wide & (found.state == CONFIRMED))
-        around = around[~np.isin(around, inside)]
+
+        def within(far: float) -> NDArray[np.bool_]:
+            return np.all((points > box[0] - far) & (points < box[1] + far), axis=1)
+
+        wide, near = within(RING), within(margin)
+        hidden = within(reach) & np.isin(found.parts, np.unique(found.parts[piece.vertices]))
+        inside = np.flatnonzero((near & wide) | hidden)
+        around = np.flatnonzero(wide & (found.state == CONFIRMED) & ~near)
         keep = np.ones(len(inside), bool)
         for normal, offset in _planes(points[around], found.mesh.normals[around].astype(float), margin):
             flat = (np.abs(points[inside] @ normal - offset) < 2 * margin) & (found.mesh.normals[inside] @ normal > 0.8)
             keep &= ~flat
         numbers = np.union1d(inside[keep], piece.vertices)
-        denied = np.isin(numbers, piece.vertices)
-        mesh = found.mesh
+        denied, mesh = np.isin(numbers, piece.vertices), found.mesh
         return cls(
             points[numbers], mesh.normals[numbers].astype(float), mesh.colors[numbers].astype(float), denied, margin
         )
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """Of the points."""
+        return KDTree(self.points)
 
     def chosen(self, rows: NDArray) -> "Body":
         """Some of the points."""
@@ -125,10 +141,17 @@ def _planes(points: Array, normals: Array, margin: float) -> list[tuple[Array, f
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A rigid motion (4, 4) of a thing in the common frame, and the share of its surface that fits."""
+    """A rigid motion of a thing.
+
+    Attributes:
+        T_after_before: (4, 4), common frame.
+        fit: Share of the surface that fits, of what must.
+        explained: Vertices of both surfaces that the motion explains, less those that it leaves in free space.
+    """
 
     T_after_before: Array
     fit: float
+    explained: float
 
 
 def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
@@ -141,11 +164,12 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     T_a, T_b = before.T_common_map, after.T_common_map
     surfaces = new.sample(4000).surface(se3.inverse(T_b)), missing.sample(4000).surface(se3.inverse(T_a))
     for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN / 2]:
-        aligned = align_maps(after.volume, before.volume, *surfaces, se3.inverse(T_b) @ T @ T_a, MIN_POINTS)
+        start = se3.inverse(T_b) @ T @ T_a
+        aligned = align_maps(after.volume, before.volume, *surfaces, start, MIN_POINTS, changed=True)
         for candidate in (T_b @ aligned.T_a_b @ se3.inverse(T_a), T):
-            fit = _fit(after, missing, new, candidate), _fit(before, new, missing, se3.inverse(candidate))
-            if min(fit) > 0 and (best is None or sum(fit) > 2 * best.fit):
-                best = Motion(candidate, sum(fit) / 2)
+            motion = _judged(before, after, missing, new, candidate)
+            if motion is not None and (best is None or motion.explained > best.explained):
+                best = motion
     return best
 
 
@@ -167,11 +191,14 @@ def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
         T = np.eye(4)
         T[:3, :3] = se3.exp_rotation(up * turn)
         T[:3, 3] = middles[1] - T[:3, :3] @ middles[0]
-        for step in range(ICP_ROUNDS):
-            points, near, use = met(T, max(0.3 * size * 0.85**step, 3 * b.tolerance))
+        for count in range(ICP_ROUNDS):
+            points, near, use = met(T, max(0.3 * size * 0.85**count, 3 * b.tolerance))
             if use.sum() < 10:
                 break
-            T = se3.exp(_icp_step(points[use], b.points[near[use]], b.normals[near[use]])) @ T
+            step = _icp_step(points[use], b.points[near[use]], b.normals[near[use]])
+            T = se3.exp(step) @ T
+            if np.linalg.norm(step) < STOP:
+                break
         _, near, use = met(T, 3 * b.tolerance)
         alike = np.abs(a.colors - b.colors[near]).max(axis=1) < COLOR_GATE
         out.append((float((use & alike).mean()), T))
@@ -196,26 +223,53 @@ def _icp_step(p: Array, q: Array, n: Array) -> Array:
     return -np.linalg.solve(H + 1e-9 * np.eye(6), g)
 
 
-def _fit(there: Visit, own: Body, other: Body, T: Array) -> float:
-    """Share of the denied surface of a thing that lies on the other's after a motion; 0 if it does not belong to it."""
-    moved = own.chosen(own.denied).sample(1500)
+def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
+    """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
+    sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
+    meets, hangs, sunk = np.sum([side.count for side in sides], axis=0)
+    fewest = min(missing.denied.sum(), new.denied.sum())
+    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SHAPE * (meets + hangs + sunk), LEAST_SEEN * fewest, MIN_POINTS):
+        return None
+    mine = np.concatenate([sides[0].own, sides[1].other])
+    theirs = np.concatenate([sides[0].other, sides[1].own])
+    gain = np.clip(np.median(theirs) / max(np.median(mine), 1.0), 0.6, 1.7)
+    if not _alike(mine, theirs, gain):
+        return None
+    agree = np.mean(1 / np.square(1 + np.square(np.abs(gain * mine - theirs).max(axis=1) / COLOR_SCALE)))
+    return Motion(T, float(meets / (meets + hangs)), float(agree * meets - hangs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Landed:
+    """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, hang in free space or
+    lie under the other's surface; colours (n, 3) of some that lie on it, and of the other's points there."""
+
+    count: Array
+    own: Array
+    other: Array
+
+
+def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
+    moved = own.chosen(own.denied).sample(FINE)
     points, normals = transformed(T, moved.points), moved.normals @ T[:3, :3].T
-    gap, near = (np.asarray(found) for found in KDTree(other.points).query(points))
+    gap, near = (np.asarray(found) for found in other.tree.query(points))
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
     samples = there.sample(points)
     known = ~meets & (samples.state == OBSERVED)
     hangs = (~meets & (samples.state == EMPTY)) | (known & (samples.sdf > limit))
     sunk = known & (samples.sdf < -limit)
-    fits, seen = int(meets.sum()), int(meets.sum() + hangs.sum())
-    if fits < LEAST_FIT * seen or fits < LEAST_SHAPE * (seen + sunk.sum()) or meets.mean() < LEAST_SEEN:
-        return 0.0
-    return fits / max(seen, 1) if _alike(moved.colors[meets], other.colors[near[meets]]) else 0.0
+    each = own.denied.sum() / len(points)
+    count = each * np.array([meets.sum(), hangs.sum(), sunk.sum()])
+    return _Landed(count, moved.colors[meets], other.colors[near[meets]])
 
 
-def _alike(mine: Array, theirs: Array) -> bool:
-    """Whether colours (n, 3) of two surfaces are those of one thing, but for one gain."""
-    gain = np.clip(np.median(theirs) / max(np.median(mine), 1.0), 0.6, 1.7)
+def _alike(mine: Array, theirs: Array, gain: float) -> bool:
+    """Whether colours (n, 3) of two surfaces are those of one thing, but for a gain."""
     shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
-    limit = MAX_COLOR[0] + MAX_COLOR[1] * theirs.mean()
-    return bool(np.median(np.abs(gain * mine - theirs)) < limit and np.abs(shares[0] - shares[1]).max() < MAX_CHROMA)
+    if np.abs(shares[0] - shares[1]).max() > MAX_CHROMA:
+        return False
+    if np.median(np.abs(gain * mine - theirs)) > MAX_COLOR[0] + MAX_COLOR[1] * theirs.mean():
+        return False
+    grey = mine.mean(axis=1), theirs.mean(axis=1)
+    return bool(min(grey[0].std(), grey[1].std()) < TEXTURE or np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)

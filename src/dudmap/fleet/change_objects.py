@@ -4,23 +4,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, surface_tree
+from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
+from dudmap.fleet.map_samples import EMPTY, OBSERVED
 
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 BRIDGE = 0.15
-"""The same through surface that the other map did not see, metres: free space is known in blocks, whose borders remain
-unknown."""
+"""The same where no free space was seen between them, metres."""
+REACH = 0.25
+"""The same beside a larger piece, in its lengths."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
 LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
-CERTAIN = 2
+LEAST_FACING = 0.1
+"""Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
+CERTAIN = 3
 """A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
 
 
@@ -43,21 +45,60 @@ class Piece:
         """Lower and upper corner (2, 3)."""
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
 
+    @property
+    def length(self) -> float:
+        """Diagonal of the box, metres."""
+        return float(np.linalg.norm(self.box[1] - self.box[0]))
 
-def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
-    """Pieces of surface that the other map denies beyond the noise, the largest first."""
+
+def denied_pieces(found: Evidence, own: Visit, voxel_size: float, min_size: float) -> list[Piece]:
+    """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
     pieces = connected(found.mesh, opened(found, found.state == DENIED), LINK * voxel_size)
-    unseen = found.mesh.faces[np.all(found.state[found.mesh.faces] != CONFIRMED, axis=1)]
-    pieces = bridged(pieces, unseen, len(found.state))
-    return [piece for piece in pieces if is_certain(piece, found, min_size)]
+    return assembled([piece for piece in pieces if piece.area > LEAST_FACE * min_size**2], own, 0.0)
+
+
+def assembled(pieces: list[Piece], own: Visit, reach: float = REACH) -> list[Piece]:
+    """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space: something
+    stood before the middle of one thing. ``reach`` is that of the larger one, in its lengths."""
+    out: list[Piece] = []
+    for piece in sorted(pieces, key=lambda one: -one.area):
+        for n in reversed(range(len(out))):
+            if is_part(piece, out[n], own, reach):
+                piece = joined([out.pop(n), piece])
+        out.append(piece)
+    return sorted(out, key=lambda one: -one.area)
+
+
+def is_part(piece: Piece, thing: Piece, own: Visit, reach: float = REACH) -> bool:
+    """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
+    return gap_between(thing, piece) < max(BRIDGE, reach * thing.length) and is_hidden_between(thing, piece, own)
+
+
+def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
+    """Whether the visit of two pieces saw no free space on half of the shortest ways from one to the other."""
+    some, steps = b.points[:: max(1, len(b.points) // 200)], np.linspace(0, 1, 20)[:, None]
+    gap, near = KDTree(a.points).query(some)
+    ways = np.argsort(gap)[: max(5, len(some) // 5)]
+    start, end = some[ways][:, None], a.points[near[ways]][:, None]
+    samples, clear = own.sample((start + (end - start) * steps).reshape(-1, 3)), 2 * own.volume.voxel_size
+    free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > clear))
+    return bool(np.median(free.reshape(len(ways), -1).mean(axis=1) * gap[ways]) < clear)
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
-    """Whether a piece is large enough, wider than the depth edges there, and was seen often enough."""
+    """Whether a piece is large enough, wider than the depth edges there, and was seen often enough, from its front."""
     if piece.area < LEAST_FACE * min_size**2 or np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
+        return False
+    if np.median(_facing(found, piece.vertices[:: max(1, len(piece.vertices) // 500)])) < LEAST_FACING:
         return False
     blur = float(np.median(found.blur[piece.vertices]))
     return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
+
+
+def _facing(found: Evidence, vertices: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Cosine (n,) of the angle at which some keyframe sees each of some vertices best; negative from behind."""
+    rays = found.cameras[:, None] - found.points[vertices]
+    return (((rays * found.mesh.normals[vertices]).sum(axis=2)) / np.linalg.norm(rays, axis=2)).max(axis=0)
 
 
 def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
@@ -94,21 +135,8 @@ def connected(mesh: Mesh, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
     if len(numbers) == 0:
         return []
     places, cell = np.unique(np.floor(mesh.vertices[numbers] / (gap / 2)).astype(np.int64), axis=0, return_inverse=True)
-    group = _components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))
+    group = components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))
     return _grouped(numbers, group[cell.reshape(-1)], mesh)
-
-
-def bridged(pieces: list[Piece], unseen: NDArray[np.int32], count: int) -> list[Piece]:
-    """Pieces of which those are one that hang together by triangles (n, 3) of a mesh with ``count`` vertices."""
-    surface = _components(np.concatenate([unseen[:, :2], unseen[:, 1:]]), count)
-    parts = [np.unique(surface[piece.vertices]) for piece in pieces]
-    pairs = [
-        (a, b) for a in range(len(pieces)) for b in range(a)
-        if len(np.intersect1d(parts[a], parts[b], assume_unique=True))
-        and gap_between(pieces[a], pieces[b]) < BRIDGE
-    ]  # fmt: skip
-    group = _components(np.array(pairs, np.int64).reshape(-1, 2), len(pieces))
-    return [joined([pieces[n] for n in np.flatnonzero(group == g)]) for g in np.unique(group)]
 
 
 def gap_between(a: Piece, b: Piece) -> float:
@@ -132,12 +160,6 @@ def _grouped(numbers: NDArray[np.intp], group: NDArray[np.intp], mesh: Mesh) -> 
         points = mesh.vertices[numbers[members]].astype(np.float64)
         out.append(Piece(numbers[members], points, float(areas[members].sum())))
     return sorted(out, key=lambda piece: -piece.area)
-
-
-def _components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
-    """Number (count,) of the connected component of each node of a graph with edges (n, 2)."""
-    graph = csr_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:

@@ -62,9 +62,10 @@ def change_page(
         line = '<li data-id="{id}"><b class="{kind}">{id}. {kind}</b> <span>{text}</span>{pictures}</li>'
         rows.append(html(line, id=row["id"], kind=row["kind"], text=text, pictures=pictures))
     up = -np.mean([visit.keyframes[:, :3, 1].mean(axis=0) for visit in visits], axis=0)
-    first = visits[0].keyframes[0]
+    low, high = np.percentile(np.concatenate([visit.mesh.vertices[::20] for visit in visits]), [5, 95], axis=0)
     scene = {
-        "meshes": data, "up": up.round(4).tolist(), "eye": first[:3, 3].tolist(), "ahead": first[:3, 2].tolist(),
+        "meshes": data, "up": up.round(4).tolist(), "ahead": visits[0].keyframes[0][:3, 2].tolist(),
+        "middle": ((low + high) / 2).tolist(), "size": float(np.linalg.norm(high - low)),
         "changes": [{key: row[key] for key in ("id", "kind", "box")} for row in tree["changes"]],
         "tints": {kind: int.from_bytes(bytes(tint), "big") for kind, tint in TINTS.items()},
     }  # fmt: skip

@@ -12,8 +12,18 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.fleet.change_colors import SOLID, recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
-from dudmap.fleet.change_motion import Body, Motion, motion_between
-from dudmap.fleet.change_objects import BRIDGE, Piece, connected, denied_pieces, gap_between, joined
+from dudmap.fleet.change_motion import LEAST_FIT, Body, Motion, motion_between
+from dudmap.fleet.change_objects import (
+    Piece,
+    assembled,
+    connected,
+    denied_pieces,
+    gap_between,
+    is_certain,
+    is_part,
+    joined,
+)
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 from dudmap.io.exporting.gravity import CONE, PARALLEL
 from dudmap.io.exporting.mesh_editing import with_faces
 
@@ -21,9 +31,7 @@ Array = NDArray[np.float64]
 NEAR = 0.3
 """Gap between surfaces of one thing that moved by less than its size, metres: they then are its opposite faces."""
 ON_SURFACE = 0.02
-"""Distance of a piece from the surface that it would belong to after a motion, metres: the largest tolerances."""
-FRAGMENT = 0.15
-"""Area of a piece, in that of the one beside it, below which it is a part of the same thing."""
+"""Gap to a change beside which other colours are those that it has left at the border, metres."""
 LEAST_UNKNOWN = 0.25
 """Surface of a part of the place that only one visit saw, square metres, from which on it is listed."""
 
@@ -80,12 +88,12 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     """All changes of at least a size (m), the largest first, then what is unknown; and the evidence of both visits."""
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
-    missing, new = (denied_pieces(one, voxel, min_size) for one in found)
-    out = _moved(before, after, found, missing, new) if missing and new else []
-    missing = [piece for piece in missing if not _is_fragment(piece, [moved.before for moved in out])]
-    new = [piece for piece in new if not _is_fragment(piece, [moved.after for moved in out])]
-    out += [Change("disappeared", piece, None, _confidence(piece, found[0])) for piece in _with_fragments(missing)]
-    out += [Change("appeared", None, piece, _confidence(piece, found[1])) for piece in _with_fragments(new)]
+    missing, new = (denied_pieces(one, own, voxel, min_size) for one, own in zip(found, (before, after), strict=True))
+    out = _moved(before, after, found, missing, new, min_size) if missing and new else []
+    for kind, pieces, one, own in (("disappeared", missing, found[0], before), ("appeared", new, found[1], after)):
+        for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own):
+            sides = (piece, None) if kind == "disappeared" else (None, piece)
+            out.append(Change(kind, *sides, _confidence(piece, one)))
     painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
     for piece, share in painted[1]:  # both visits must say so: their meshes have other vertices and other edges
         touched = [part for change in out for part in (change.before, change.after) if part is not None]
@@ -100,27 +108,47 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
 
 
 def _moved(
-    before: Visit, after: Visit, found: tuple[Evidence, Evidence], missing: list[Piece], new: list[Piece]
+    before: Visit,
+    after: Visit,
+    found: tuple[Evidence, Evidence],
+    missing: list[Piece],
+    new: list[Piece],
+    min_size: float,
 ) -> list[Change]:
-    """Pairs of pieces that are one thing, the best fits first; they are taken out of the lists."""
+    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists."""
     motions: list[tuple[Motion, Piece, Piece]] = []
     up = vertical(before)
-    for old in missing:
-        for now in new:
-            motion = _motion(before, after, found, old, now, up)
+    certain = [
+        [is_certain(p, one, min_size) for p in pieces] for one, pieces in zip(found, (missing, new), strict=True)
+    ]
+    for old, old_certain in zip(missing, certain[0], strict=True):
+        for now, now_certain in zip(new, certain[1], strict=True):
+            motion = _motion(before, after, found, old, now, up) if old_certain or now_certain else None
             if motion is not None:
                 motions.append((motion, old, now))
     out: list[Change] = []
     surfaces = (surface_tree(after.mesh.vertices), surface_tree(before.mesh.vertices)) if motions else ()
-    for motion, old, now in sorted(motions, key=lambda row: -row[0].fit * min(row[1].area, row[2].area)):
-        if not (any(old is piece for piece in missing) and any(now is piece for piece in new)):
+    for motion, old, now in sorted(motions, key=lambda row: -row[0].explained):
+        if old not in missing or now not in new:
             continue
-        both, T = [], motion.T_after_before
-        for pieces, first, T_there, there in zip(
-            (missing, new), (old, now), (T, se3.inverse(T)), surfaces, strict=True
+        both, T, length = [], motion.T_after_before, max(old.length, now.length)
+        for pieces, first, one, own, there, T_there, tree in zip(
+            (missing, new),
+            (old, now),
+            found,
+            (before, after),
+            (after, before),
+            (T, se3.inverse(T)),
+            surfaces,
+            strict=True,
         ):
-            parts = [p for p in pieces if p is first or _explained(p, first, T_there, there)]
-            pieces[:] = [p for p in pieces if not any(p is part for part in parts)]
+            parts = [
+                p for p in pieces
+                if p is first or (gap_between(p, first) < length and _goes_along(p, one, there, T_there, tree))
+            ]  # fmt: skip
+            thing = joined(parts)
+            parts += [p for p in pieces if p not in parts and p.area < thing.area and is_part(p, thing, own)]
+            pieces[:] = [p for p in pieces if p not in parts]
             both.append(joined(parts))
         out.append(Change("moved", both[0], both[1], motion.fit, T))
     return out
@@ -135,10 +163,11 @@ def _motion(
         both = np.stack([np.minimum(old.box[0], now.box[0]), np.maximum(old.box[1], now.box[1])])
         boxes.append((both, both))
     best: Motion | None = None
+    length = max(old.length, now.length)
     for pair in boxes:
-        bodies = [Body.of(one, piece, box) for one, piece, box in zip(found, (old, now), pair, strict=True)]
+        bodies = [Body.of(one, piece, box, length) for one, piece, box in zip(found, (old, now), pair, strict=True)]
         motion = motion_between(before, after, bodies[0], bodies[1], up)
-        if motion is not None and (best is None or motion.fit > best.fit):
+        if motion is not None and (best is None or motion.explained > best.explained):
             best = motion
     return best
 
@@ -156,28 +185,12 @@ def vertical(visit: Visit) -> Array:
     return mean / np.linalg.norm(mean)
 
 
-def _explained(piece: Piece, first: Piece, T: Array, there: KDTree) -> bool:
-    """Whether a further piece near the first one of a thing went the same way, to a surface of the other visit."""
-    if gap_between(piece, first) > NEAR:
-        return False
-    return bool(np.median(there.query(piece.points @ T[:3, :3].T + T[:3, 3])[0]) < ON_SURFACE)
-
-
-def _is_fragment(piece: Piece, things: Sequence[Piece | None]) -> bool:
-    """Whether a piece is small beside a thing that it lies at: a part of it that was seen by chance."""
-    return any(piece.area < FRAGMENT * one.area and gap_between(piece, one) < BRIDGE for one in things if one)
-
-
-def _with_fragments(pieces: list[Piece]) -> list[Piece]:
-    """Pieces, largest first, joined with small ones beside them: parts of a thing that were seen by chance."""
-    out: list[Piece] = []
-    for piece in sorted(pieces, key=lambda one: -one.area):
-        near = [n for n, one in enumerate(out) if _is_fragment(piece, [one])]
-        if near:
-            out[near[0]] = joined([out[near[0]], piece])
-        else:
-            out.append(piece)
-    return out
+def _goes_along(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> bool:
+    """Whether a motion (4, 4) brings most of a piece onto surface of the other visit, and little into free space."""
+    points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
+    on, samples = tree.query(points)[0] < limit, there.sample(points)
+    hangs = ~on & ((samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > limit)))
+    return bool(on.mean() > 0.5 and hangs.mean() < 1 - LEAST_FIT)
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:

@@ -178,7 +178,7 @@ def decided(
 
 def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, changed: bool) -> MapPair:
     """Refine a relative pose and check what follows from it."""
-    aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
+    aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b, changed=changed)
     if not aligned.converged:
         return MapPair(None, "their surfaces cannot be aligned with each other", hypothesis, aligned)
     if aligned.stiffness < MIN_STIFFNESS:

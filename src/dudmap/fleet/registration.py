@@ -60,7 +60,8 @@ SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
 def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
     """Visual words (WORDS, 128) of features (n, 128); the same for the same features."""
     some = features[:: max(1, len(features) // TRAINING)].astype(np.float64)
-    words, _ = kmeans2(some, min(WORDS, len(some)), iter=20, minit="++", seed=1)
+    count = min(WORDS, len(some))
+    words, _ = kmeans2(some, count, iter=20, minit="++", seed=1)  # pyright: ignore[reportCallIssue] (rng from 1.15 on)
     return words.astype(np.float32)
 
 

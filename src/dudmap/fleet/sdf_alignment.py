@@ -17,6 +17,12 @@ from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_ma
 MAX_ITERATIONS = 40
 STOP = 1e-5
 """Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
+MAD, LEAST_SHADE, LEAST_NOISE = 1.4826, 0.005, 0.05
+"""Standard deviation over the median of the absolute values; least standard deviations of an intensity, a grey level of
+255, and of a distance, voxels; steps below the latter are short enough for visits, whose colours may creep on."""
+COLOR_SHARE = 0.1
+"""Factor of the standardised intensities of visits: those of a real camera are off in the same way over whole features,
+some hundred points, by blur, light and the time between colour and depth, where distances scatter."""
 SCALE = 0.5
 """Residual at which the Geman-McClure weight of a distance has fallen to a quarter, voxels: about the standard
 deviation of a surface. What only one of the maps has seen from the front lies up to a truncation distance off."""
@@ -55,15 +61,17 @@ def align_maps(
     of_b: SurfacePoints,
     T_a_b: NDArray[np.float64],
     min_points: int = MIN_POINTS,
+    changed: bool = False,
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
     It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
     scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities
-    the weights of the tracker.
+    the weights of the tracker. ``changed``: Things may have moved or been painted; intensities then have Geman-McClure
+    weights too, and count by their noise against that of the distances.
     """
     tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
-    center, scale = np.zeros(3), a.truncation
+    center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
         if len(rows.distance) < min_points:
@@ -72,6 +80,11 @@ def align_maps(
         weights = 1 / np.square(1 + np.square(rows.distance / scale))
         H, g = _normal_equations(rows.J_distance, rows.distance, weights)
         lit = tracker.color_weight * np.minimum(1.0, tracker.color_huber / np.maximum(np.abs(rows.shade), 1e-12))
+        if changed and len(rows.shade):
+            close = np.abs(rows.distance[np.abs(rows.distance) <= 2 * scale])
+            spread = min(spread, max(MAD * float(np.median(np.abs(rows.shade))), LEAST_SHADE))
+            noise = min(noise, max(MAD * float(np.median(close)), LEAST_NOISE * a.voxel_size) if len(close) else noise)
+            lit = np.square(COLOR_SHARE * noise / spread / (1 + np.square(rows.shade / (3 * spread))))
         H_c, g_c = _normal_equations(rows.J_shade, rows.shade, lit)
         center = rows.points.mean(axis=0)
         stiffness = _stiffness(H + H_c, center, rows.points)
@@ -85,7 +98,8 @@ def align_maps(
         if scale <= SCALE * a.voxel_size and at_points < STOP and np.linalg.norm(step[3:]) < STOP:
             converged = True
             break
-    return SdfAlignment(T_a_b, converged, residual, stiffness, center)
+    converged |= changed and at_points < LEAST_NOISE * a.voxel_size
+    return SdfAlignment(T_a_b, bool(converged), residual, stiffness, center)
 
 
 @dataclass(frozen=True, eq=False)

@@ -341,7 +341,7 @@ def _pixels_of_level(
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
 
 
-def _nearest_pixels(positions: NDArray[np.float64], level: Level) -> NDArray[np.int64]:
+def _nearest_pixels(positions: "NDArray[np.floating]", level: Level) -> NDArray[np.int64]:
     """Pixels (n, 2) int u, v of a level nearest to positions (n, 2)."""
     last = level.camera.width - 1, level.camera.height - 1
     return np.minimum(np.maximum(np.rint(positions), 0), last).astype(np.int64)

@@ -304,8 +304,8 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
         share = surface.area() / max(len(surface.vertices), 1) * len(points)
         seen.append((points, share))
     edges = np.sort(np.ptp(_samples(thing.before or thing.after), axis=0))
-    enough = [area > LEAST_SEEN * edges[1] * edges[2] * (0.3 if thing.kind == "moved" else 1) for _, area in seen]
     kind = "moved" if thing.kind == "opened" else thing.kind
+    enough = [area > LEAST_SEEN * edges[1] * edges[2] * (0.3 if kind == "moved" else 1) for _, area in seen]
     if kind == "moved" and not all(enough):
         kind = "disappeared" if enough[0] else "appeared" if enough[1] else "unknown"
     elif not any(enough):

@@ -26,7 +26,7 @@ class View {
     for (const change of data.changes) if (data.tints[change.kind] !== undefined) this.boxes.add(boxOf(change));
     this.scene.add(this.boxes);
     this.ahead = new THREE.Vector3(...data.ahead);
-    this.look(new THREE.Vector3(...data.eye).addScaledVector(this.ahead, 1.5), 3);
+    this.look(new THREE.Vector3(...data.middle), 0.8 * data.size);
     new ResizeObserver(() => this.draw()).observe(this.renderer.domElement.parentElement);
   }
 
