@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -200,7 +201,7 @@ class Explained:
 
     levels = (0,)
 
-    def __init__(self, costs: dict[frozenset[str], float]) -> None:
+    def __init__(self, costs: dict[frozenset[str], float | tuple[float, float]]) -> None:
         self.table, self.asked = costs, []
 
     def solve(self, pairs, start, free, levels=()):
@@ -210,17 +211,20 @@ class Explained:
     def costs(self, pairs, fit):
         self.asked.append(frozenset(fit.calibration.estimated))
         wobble = 0.01 * np.cos(np.arange(40.0))
-        return self.table.get(frozenset(fit.calibration.estimated), 1.0) * (1 + wobble)
+        cost = self.table.get(frozenset(fit.calibration.estimated), 1.0)
+        parts = cost if isinstance(cost, tuple) else (0.5 * cost, 0.5 * cost)  # of intensities and depths
+        return np.array(parts)[:, None] * (1 + wobble)
 
 
-def proven(costs: dict[str, float]) -> set[str]:
+def proven(costs: dict[str, float | tuple[float, float]]) -> set[str]:
     """Groups that leave their given values, by the cost that every set of groups leaves."""
     estimator = CalibrationEstimator(Calibration.registered(CAMERA), SensorConfig())
     table = {frozenset(key.split()): value for key, value in costs.items()}
     estimator.adjustment = Explained(table)
     given = Fit(estimator.given, np.empty((0, 4, 4)), np.empty((0, 2)))
-    start = _Trial(np.zeros(13, bool), [given] * 2, [estimator.adjustment.costs([], given)] * 2)
-    trial, evidence = estimator._proven([[], []], start)
+    halves = [SimpleNamespace(numbers=np.arange(80).reshape(40, 2))] * 2
+    start = _Trial(np.zeros(13, bool), [given] * 2, [estimator.adjustment.costs([], given)] * 2, halves)
+    trial, evidence = estimator._proven(halves, start)
     assert set(evidence) == set(GROUPS)
     return {name for name, members in GROUPS.items() if trial.free[mask_of(members)].all()}
 
@@ -233,8 +237,36 @@ def test_groups_that_explain_nothing_without_each_other_are_found_together():
     assert proven({"timing": 0.8, "timing lens": 0.799, "geometry timing": 0.81}) == {"timing"}
     # the geometry has more evidence than the lens, and too little to leave the given values
     assert proven({"geometry": 0.96, "lens": 0.97, "geometry lens": 0.96, "timing lens": 0.97}) == {"lens"}
+    # what explains the intensities at the cost of the depths is not used
+    assert proven({"timing": (0.2, 0.7), "lens": (0.4, 0.45)}) == {"lens"}
     everything = {"geometry timing lens": 0.3, "geometry timing": 0.5, "geometry lens": 0.6, "timing lens": 0.7}
     assert proven(alone | everything) == {"geometry", "timing", "lens"}
+
+
+def test_pairs_that_share_a_frame_are_less_evidence_than_others():
+    given = Fit(Calibration.registered(CAMERA), np.empty((0, 4, 4)), np.empty((0, 2)))
+    gains = np.random.default_rng(3).normal(0.1, 0.1, 80).repeat(4)  # every four are alike
+    apart, shared = np.arange(320).reshape(160, 2), np.stack([np.arange(40).repeat(4), np.arange(40, 200)], axis=1)
+    evidence = []
+    for frames in (apart, shared):
+        trial = _Trial(np.zeros(13, bool), [given] * 2, [], [SimpleNamespace(numbers=frames)] * 2)
+        evidence.append(trial.evidence(gains))
+    assert evidence[1] == pytest.approx(evidence[0] / 2)
+
+
+def test_standard_deviations_grow_with_what_the_halves_of_the_time_differ_by():
+    given = Calibration.registered(CAMERA)
+    estimator, covariance = CalibrationEstimator(given, SensorConfig()), np.diag(np.full(13, 0.5e-6))
+
+    def disagreement(step: float) -> float:
+        found = [given, given.retract(np.full(13, step) * ([1] * 3 + [0] * 10))]
+        fits = [Fit(each, np.empty((0, 4, 4)), np.empty((0, 2))) for each in found]
+        solve = lambda pairs, start, free, levels: (start, covariance)  # noqa: E731
+        estimator.adjustment = SimpleNamespace(levels=[0], solve=solve)
+        return estimator._disagreement([None, None], fits)
+
+    assert disagreement(1e-4) == 1.0
+    assert disagreement(1e-2) == pytest.approx(np.sqrt(3 * 1e-4 / 1e-6 / 13))
 
 
 def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():

@@ -15,11 +15,11 @@ from dudmap.core.calibration.pairs import PairSet
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 
-PRIOR_SIGMA = np.array([0.03] * 3 + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
+PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
 """Standard deviations of a camera about which nothing is known but what is given, in the units of ``PARAMETERS``; that
-of the principal point is a share of the width. Colour cameras lie 15 to 32 mm from their depth cameras; uncorrected
-focal lengths differ by up to 10 %; a lens that is not corrected bends by some per cent; a frame at 30 Hz takes
-33 ms."""
+of the principal point is a share of the width. Colour cameras lie 15 to 32 mm from their depth cameras, on one board
+and mostly beside them; uncorrected focal lengths differ by up to 10 %; a lens that is not corrected bends by some per
+cent; a frame at 30 Hz takes 33 ms."""
 POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
 """Standard deviation of the tracked pose of a frame, metres and radians: it binds only directions in which the images
 say nothing."""
@@ -162,14 +162,15 @@ class Adjustment:
         return fit, system.parts.residuals
 
     def costs(self, pairs: PairSet, start: Fit) -> NDArray[np.float64]:
-        """Mean robust cost (P,) of pairs whose poses are fitted with the calibration of a fit."""
+        """Mean robust costs (2, P) of intensities and depths of pairs whose poses are fitted with the calibration of a
+        fit."""
         _, residuals = self.with_poses(pairs, start)
         scaled = np.abs(residuals) / np.array(COST_SCALES, np.float32)[:, None]
         robust = np.where(scaled < HUBER, scaled * scaled, HUBER * (2 * scaled - HUBER))
         seen = np.isfinite(robust)
         of_pair = pairs.residual_starts[:-1]
         sums = np.add.reduceat(np.where(seen, robust, 0), of_pair, axis=1, dtype=np.float64)
-        return (sums / np.maximum(np.add.reduceat(seen, of_pair, axis=1, dtype=np.int64), 1)).sum(axis=0)
+        return sums / np.maximum(np.add.reduceat(seen, of_pair, axis=1, dtype=np.int64), 1)
 
     def _covariance(self, pairs: PairSet, system: _System, free: int) -> NDArray[np.float64]:
         """Sandwich (13, 13) with the scores of frames as its meat."""

@@ -32,9 +32,9 @@ MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.05}
 bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
 recording with such a depth (TUM fr1_xyz) the geometry gained 2 to 4 % and its use made the poses worse; 25 mm gain
 30 %."""
-EVIDENCE = 2.0
+EVIDENCE = 3.0
 """Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
-pairs of the other half. Chance does so in both halves once in 2000 times."""
+pairs of the other half, in the sum of both. Chance does so once in 700 times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class Estimate:
 
     Attributes:
         calibration: What was found, with its standard deviations; as given where there is no evidence.
-        evidence: Per group of ``GROUPS``, the decrease of the cost of pairs that were not used, in standard errors, the
-            smaller one of both halves; NaN where there were too few pairs.
+        evidence: Per group of ``GROUPS``, the decrease of the cost of pairs that were not used, in standard errors; NaN
+            where there were too few pairs.
         gain: Share by which the cost of pairs that were not used decreased.
         pairs: Number of pairs.
     """
@@ -57,24 +57,45 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Fits to both halves of the time with some free parameters, and the costs of the other halves' pairs with them."""
+    """Fits to both halves of the time with some free parameters, and the costs of the other halves' pairs with them.
+
+    Attributes:
+        free: (13,) bool.
+        fits: One per half.
+        costs: (2, P) each, of the intensities and the depths of the pairs of the other half.
+        halves: The pairs of either half of the time.
+    """
 
     free: NDArray[np.bool_]
     fits: list[Fit]
     costs: list[NDArray[np.float64]]
+    halves: list[PairSet]
+
+    def gains(self, other: "_Trial") -> NDArray[np.float64]:
+        """Decrease (2, P) of the costs of all pairs from another trial on."""
+        return np.concatenate(other.costs, axis=1) - np.concatenate(self.costs, axis=1)
+
+    def evidence(self, gains: NDArray[np.float64]) -> float:
+        """Mean of gains (P,) of all pairs in standard errors, where pairs that share a frame err together (Aronow,
+        Samii and Assenova 2015)."""
+        second, first = (pairs.numbers for pairs in self.halves)
+        frames, apart = np.concatenate([first, second + 1 + first.max()]), gains - gains.mean()
+        of_frames = sum(np.bincount(numbers, apart, frames.max() + 1) for numbers in frames.T)
+        squares = np.square(apart).sum()
+        return float(gains.sum() / max(np.sqrt(max(np.square(of_frames).sum() - squares, squares)), 1e-12))
 
     def improvement(self, other: "_Trial") -> tuple[float, float]:
-        """Decrease of the cost from another trial on, in standard errors and as a share; the smaller one of both
+        """Decrease of the cost from another trial on, in standard errors, and as a share, the smaller one of both
         halves."""
-        gains = [before - after for before, after in zip(other.costs, self.costs, strict=True)]
-        errors = [float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-12)) for gain in gains]
-        shares = [float(gain.mean() / before.mean()) for gain, before in zip(gains, other.costs, strict=True)]
-        return min(errors), min(shares)
+        shares = [1 - after.sum() / before.sum() for before, after in zip(other.costs, self.costs, strict=True)]
+        return self.evidence(self.gains(other).sum(axis=0)), float(min(shares))
 
     def proves(self, other: "_Trial", group: str) -> bool:
-        """Whether it explains so much more than another trial that a group may leave its given values."""
+        """Whether it explains so much more than another trial, and neither intensities nor depths worse, that a group
+        may leave its given values."""
         evidence, share = self.improvement(other)
-        return evidence >= EVIDENCE and share >= MATERIAL[group]
+        worse = min(self.evidence(gains) for gains in self.gains(other)) <= -EVIDENCE
+        return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
 
 
 def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
@@ -95,7 +116,8 @@ class CalibrationEstimator:
     too, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given
     values. The covariance is a sandwich with one score per frame, the sum of those of its pairs: it admits that the
     pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
-    for pairs counted twice).
+    for pairs counted twice). What both halves of the time differ by beyond that, such as by a bent depth image, makes
+    all standard deviations larger (Birge 1932).
 
     ``given`` is the calibration as given; 2 ``workers`` (threads) do both halves of the time at once.
     """
@@ -123,7 +145,8 @@ class CalibrationEstimator:
             self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given), self.adjustment.levels)[0]
             for pairs in halves
         ]
-        start = _Trial(~everything, fits, [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)])
+        costs = [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)]
+        start = _Trial(~everything, fits, costs, halves)
         proven, evidence = self._proven(halves, start)
         pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], PAIRS // 2)])
         free, levels = proven.free, self.adjustment.levels
@@ -135,9 +158,21 @@ class CalibrationEstimator:
         sigma = np.sqrt(np.diag(uncertain))
         if covariance is not None:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
+        sigma *= self._disagreement(halves, proven.fits)
         estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
-        gain = 1 - float(np.concatenate(proven.costs).mean() / np.concatenate(start.costs).mean())
+        gain = 1 - float(np.concatenate(proven.costs, axis=1).mean() / np.concatenate(start.costs, axis=1).mean())
         return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
+
+    def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
+        """By how many of their standard deviations the estimates of all parameters from both halves of the time differ
+        (root mean square, 1 at least): by so much the standard deviations are too small."""
+        everything, finest = np.ones(NUM_PARAMETERS, dtype=bool), self.adjustment.levels[-1:]
+        with ThreadPoolExecutor(self.workers) as pool:
+            solved = pool.map(lambda n: self.adjustment.solve(halves[n], starts[n], everything, finest), (0, 1))
+            (one, covariance), (other, other_covariance) = solved
+        apart = one.calibration.step_to(other.calibration)
+        squares = float(apart @ np.linalg.solve(covariance + other_covariance, apart))
+        return max(1.0, np.sqrt(squares / NUM_PARAMETERS))
 
     def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
         """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
@@ -200,4 +235,4 @@ class CalibrationEstimator:
 
         with ThreadPoolExecutor(self.workers) as pool:
             (one, other), (cost, other_cost) = zip(*pool.map(fitted, (0, 1)), strict=True)
-        return _Trial(free, [one, other], [cost, other_cost])
+        return _Trial(free, [one, other], [cost, other_cost], halves)

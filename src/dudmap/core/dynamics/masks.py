@@ -115,7 +115,7 @@ def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Dynamic pixels (H, W) bool at full resolution, with the holes of the depth inside of a dynamic region.
+    """Dynamic pixels (H, W) bool at full size, with the holes of the depth in a dynamic region and the gaps around it.
 
     Args:
         labels: Labels of the frame.
@@ -130,9 +130,27 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
     low = cv2.morphologyEx(labels.dynamic.view(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
-    if hidden:
-        low[labels.hidden] = 1
-    return full_size(low.view(np.bool_), level.depth, depth)
+    if labels.hidden is not None and hidden:
+        low[_hidden_region(labels.hidden, labels.dynamic, level.depth)] = 1
+    mask = full_size(low.view(np.bool_), level.depth, depth)
+    # where the sensor's window lies on both sides of an edge there is no reading, and the object ends in that gap
+    beside = cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
+    return mask | (beside & (depth <= 0))
+
+
+def _hidden_region(
+    hidden: NDArray[np.bool_], dynamic: NDArray[np.bool_], depth: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Pixels (h, w) without a reading that are nearer to a hidden one than to a static reading.
+
+    Behind the others of an object without readings, the background is not known, or looks alike.
+    """
+    import cv2
+
+    empty = depth <= 0
+    seeds = (hidden, ~(empty | dynamic))
+    near, far = (cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds)
+    return empty & (near < far)
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
