@@ -1,6 +1,7 @@
 """The first run, which compiles the kernels, gives what later ones give, which load them."""
 
 import ast
+import gc
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 
 import dudmap
 from dudmap.core.backends import threads
@@ -91,3 +93,11 @@ def test_kernels_of_the_first_frames_do_not_compile_numpys_sorting():
                 found |= {(node.name, name) for name in called & slow}
     assert kernels > 50
     assert found == set()
+
+
+def test_garbage_is_collected_again_once_a_kernel_is_compiled():
+    with event.trigger_event("numba:compile"):
+        with event.trigger_event("numba:compile"):
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+    assert gc.isenabled()

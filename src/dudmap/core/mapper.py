@@ -250,22 +250,22 @@ class Mapper:
             observation = frame.view.observation
             color = exposed_color(observation.rgb, frame.estimate.exposure)
             again = Frame(observation.timestamp, observation.depth, color)
-            new.integrate(again, T, self._static(frame.dynamic_mask), WINDOW_STEP)
+            new.integrate(again, T, self._static(frame.dynamic_mask, observation.depth), WINDOW_STEP)
         stamps = np.array([frame.view.timestamp for frame in window])
         corrections = after @ se3.inverse(before)
         atlas.move(stamps, corrections, new)
         self._redundancy.apply_correction(corrections[-1])
         return corrections[-1]
 
-    def _static(self, dynamic_mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Pixels (H, W) that are fused."""
-        return ~grown_mask(dynamic_mask, self._config.dynamics.margin_px * self._camera.width // 640)
+    def _static(self, dynamic_mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Pixels (H, W) that are fused: none within the margin of a dynamic reading."""
+        return ~grown_mask(dynamic_mask & (depth > 0), self._config.dynamics.margin_px * self._camera.width // 640)
 
     def integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
         observation = view.observation
         with view.timer("integrate"):
-            static = self._static(dynamic_mask)
+            static = self._static(dynamic_mask, observation.depth)
             if self._predictor.slow_crowd and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)

@@ -115,7 +115,7 @@ def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Dynamic pixels (H, W) bool at full size, with the holes of the depth in a dynamic region and the gaps around it.
+    """Dynamic pixels (H, W) bool at full size, with the holes of the depth inside of a dynamic region.
 
     Args:
         labels: Labels of the frame.
@@ -132,10 +132,7 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     low[(level.depth > 0) & ~labels.dynamic] = 0
     if labels.hidden is not None and hidden:
         low[_hidden_region(labels.hidden, labels.dynamic, level.depth)] = 1
-    mask = full_size(low.view(np.bool_), level.depth, depth)
-    # where the sensor's window lies on both sides of an edge there is no reading, and the object ends in that gap
-    beside = cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
-    return mask | (beside & (depth <= 0))
+    return full_size(low.view(np.bool_), level.depth, depth)
 
 
 def _hidden_region(
