@@ -50,7 +50,7 @@ def test_ctrl_c_writes_the_results_of_a_real_run(tmp_path):
     dudmap = [sys.executable, "-c", "from dudmap.cli import main; main()"]
     room = tmp_path / "room"
     subprocess.run(
-        [*dudmap, "synth", room, "--max-frames", "150", "--size", "160x120"], check=True, capture_output=True
+        [*dudmap, "synth", room, "--max-frames", "450", "--size", "160x120"], check=True, capture_output=True
     )
     out, file = tmp_path / "out", tmp_path / "walk.mcap"
     run = subprocess.Popen(

@@ -1,6 +1,7 @@
 """Frames are labelled where they fit the distances of the map, not where displaced colours have drawn their pose."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,19 @@ def test_what_fits_the_map_under_a_pose_near_the_tracked_one_is_static(tracked):
 def test_while_images_are_compared_the_pose_stays(tracked):
     """A mover of the first frame is part of a young map, and the distances alone would follow it."""
     assert labelled(tracked, moving=np.zeros(tracked[1].labelled.depth.shape, bool)) > 0.05
+
+
+def test_what_moves_close_to_the_camera_does_not_take_the_labelled_pose_along(tracked):
+    """The nearest fifth of the readings, which weighs most, has come 12 mm nearer."""
+    slam, view, tracking = tracked
+    depth, T = view.labelled.depth.copy(), tracking.T_world_camera
+    depth[(depth > 0) & (depth < np.percentile(depth[depth > 0], 20))] -= np.float32(0.012)
+    level = replace(view.labelled, depth=depth)
+    T_nearest = slam.front_end.blind_tracker.nearest(slam.reference, level, T)
+    assert np.linalg.norm(se3.log(T_nearest @ se3.inverse(T))[:3]) > 0.008
+    moved = SimpleNamespace(blind=False, known_dynamic=None, labelled=level)
+    prediction = PosePrediction(T, lambda: None, None)
+    np.testing.assert_array_equal(slam.front_end._by_distances(slam.reference, moved, prediction, T), T)
 
 
 def test_the_nearest_minimum_of_the_distances_is_at_the_true_pose_where_a_desk_determines_it(tracked):

@@ -19,6 +19,8 @@ from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
 
+NO_CHANCE = 3
+"""Excess of readings that come nearer to the map over those that do not, in standard deviations of chance."""
 UNCHANGED_SHARE = 0.02
 """Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
 on at the finest level alone."""
@@ -153,15 +155,23 @@ class FrontEnd:
     ) -> NDArray[np.float64]:
         """Pose (4, 4) near one of both terms at which the distances of the labelled image are smallest.
 
-        Not while images are compared: a mover of the first frame is part of the young map, and distances follow it.
+        Not while images are compared: a mover of the first frame is part of the young map, and distances follow it. Nor
+        where the farther half of the readings comes no nearer to the map: what is close to the camera weighs most in
+        this minimum, and may be what moves.
         """
         if view.blind or prediction.moving is not None or self.tracker.config.color_weight == 0:
             return T_world_camera
         excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.unverified_mask) if m is not None]
         weights = initial_weights([view.labelled], self.last_dynamic, excluded)
-        return self.blind_tracker.nearest(
-            volume, view.labelled, T_world_camera, None if weights is None else weights[0]
+        level = view.labelled
+        T_nearest = self.blind_tracker.nearest(volume, level, T_world_camera, None if weights is None else weights[0])
+        before, after = (
+            np.abs(volume.sample(level.depth, level.intensity, level.camera, T).distance)
+            for T in (T_world_camera, T_nearest)
         )
+        far = level.depth > np.median(level.depth[np.isfinite(before)])
+        nearer, farther = np.count_nonzero(far & (after < before)), np.count_nonzero(far & (before < after))
+        return T_nearest if nearer - farther > NO_CHANCE * np.sqrt(nearer + farther) else T_world_camera
 
     def _label(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult | Minimum
