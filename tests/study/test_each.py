@@ -1,4 +1,4 @@
-"""A model and a confirmation for every recording; cost and time in words."""
+"""A model and a confirmation for every recording; time in words."""
 
 import pytest
 
@@ -46,11 +46,9 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
     assert "5 of 15 runs tracked less than 90% of the frames" in report
 
 
-def test_progress_says_time_left_core_hours_and_cost():
+def test_progress_says_time_left_and_core_hours():
     state = Progress(total=100, done=20, begun=10, spent=7200.0, started=0.0, cores=2)
     assert "4.0 h of about 20.0 h of core time" in state.describe()
-    assert "cost" not in state.describe()
-    assert "cost 0.20 of about 1.00" in state.describe(0.05)
     assert "left" in state.describe()
     assert "3 s of about 26 s of core time" in Progress(total=9, done=1, begun=0, spent=2.836).describe()
     assert "run 0 of 9, 0 s of about 0 s of core time" in Progress(9, 0, 0).describe()

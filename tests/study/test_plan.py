@@ -147,12 +147,3 @@ def test_the_command_refuses_in_one_sentence(tmp_path, monkeypatch):
         assert len(result.stderr.strip().splitlines()) == 1
         assert result.stderr.startswith("dudmap: ")
     assert not (tmp_path / "runs").exists()
-
-
-def test_a_url_without_fsspec_is_refused_before_anything_is_run(tmp_path, monkeypatch):
-    monkeypatch.setenv("DUDMAP_CACHE", str(tmp_path))
-    monkeypatch.setattr("dudmap.extras.find_spec", lambda name: None)
-    plan = make_plan({**GOOD, "sequences": [{"path": "s3://bucket/desk.zip"}]})
-    assert plan.entries[0][0] == "desk"
-    with pytest.raises(DudmapError, match=r"needs the extra cluster \(fsspec is not installed\)"):
-        plan.check()

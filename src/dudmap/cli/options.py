@@ -28,15 +28,15 @@ GROUPS = {
     "--resolution --heights --world",
     "Calibration": "--calibration",
     "Live and viewing": "--live --view --host --port --token --orbit --sweep",
-    "Experiment": "--seed --seeds --count --min-size --only --quick --systems --score --open3d --width --cluster "
-    "--cost-per-core-hour --keep --max-runs",
+    "Experiment": "--seed --seeds --count --min-size --only --quick --systems --score --open3d --width --keep "
+    "--max-runs",
     "Advanced": "--config --preset --set --device --jobs --resume --checkpoint-every --help",
 }
 """Options by the group of the help pages that they stand in; those of a single command stand before them."""
 
 METAVARS = {
     "--out": "PATH", "--max-frames": "N", "--jobs": "N", "--seeds": "N", "--count": "N", "--only": "NAMES",
-    "--systems": "NAMES", "--width": "PIXELS", "--cost-per-core-hour": "PRICE", "--max-runs": "N",
+    "--systems": "NAMES", "--width": "PIXELS", "--max-runs": "N",
 }  # fmt: skip
 """What stands in the help pages for the value of options that commands explain in their own words."""
 

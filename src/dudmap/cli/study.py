@@ -15,7 +15,7 @@ from dudmap.extras import STUDY, need
 if TYPE_CHECKING:
     from dudmap.lab.study.conduct import Progress
     from dudmap.lab.study.plan import Plan
-    from dudmap.lab.study.worker import Executor
+    from dudmap.lab.study.worker import LocalExecutor
 
 app = typer.Typer(
     cls=DefaultGroup,
@@ -32,28 +32,18 @@ class SearchOptions:
     out: Annotated[Path | None, Option("--out", help="Study folder; an interrupted study in it goes on.")] = None
     jobs: Annotated[int, Option("--jobs", min=0, help="Runs at a time; 0: one per core.", metavar="N")] = 0
     max_runs: Annotated[int, Option("--max-runs", min=1, help="Refuse a design with more runs.")] = 1000
-    cluster: Annotated[
-        str, Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine.")
-    ] = ""
-    cost_per_core_hour: Annotated[
-        float, Option("--cost-per-core-hour", min=0, help="Price of a core for one hour; the progress shows the cost.")
-    ] = 0.0
     as_json: o.JsonOption = False
 
-    def executor(self) -> "Executor":
+    def executor(self) -> "LocalExecutor":
         """What does the runs."""
-        if self.cluster:
-            from dudmap.lab.study.cluster import RayExecutor
-
-            return RayExecutor(self.cluster, self.jobs or None)
         from dudmap.app.pipeline.environment import machine
         from dudmap.lab.study.worker import LocalExecutor
 
         return LocalExecutor(self.jobs or machine()["cores_usable"])
 
     def report(self, progress: "Progress") -> None:
-        """Show the progress with its cost."""
-        say(progress.describe(self.cost_per_core_hour), err=True)
+        """Show the progress."""
+        say(progress.describe(), err=True)
 
     def answer(self, outcome: str, out: Path) -> None:
         """Print the outcome, and where the study lies."""

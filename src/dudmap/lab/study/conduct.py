@@ -39,15 +39,14 @@ class Progress:
     started: float = 0.0
     cores: int = 1
 
-    def describe(self, price: float = 0.0) -> str:
-        """State in words, with the cost at a price per core-hour."""
+    def describe(self) -> str:
+        """State in words."""
         now, spent = self.done - self.begun, self.spent * self.cores / 3600  # core-hours
         whole = spent / max(self.done, 1) * self.total
         left = (time.monotonic() - self.started) / now * (self.total - self.done) if now else None
         return (
             f"run {self.done} of {self.total}{'' if left is None else f', {duration(left)} left'}, "
             f"{duration(3600 * spent)} of about {duration(3600 * whole)} of core time"
-            + (f", cost {spent * price:.2f} of about {whole * price:.2f}" if price else "")
             + (f", {self.deaths} workers died" if self.deaths else "")
         )
 

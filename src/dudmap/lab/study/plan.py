@@ -19,7 +19,6 @@ from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.data import find
 from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, count_of, make_factors, points_of
-from dudmap.lab.study.remote import RemoteEntry, name_of
 from dudmap.lab.study.responses import RESPONSES, Scale, check_truth
 
 MAX_RUNS = 1000
@@ -273,17 +272,12 @@ def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str,
 
 
 def place_of(entry: Entry) -> str | None:
-    """Where a recording is: its URL, its absolute path, or None of a synthetic one."""
-    if isinstance(entry, RemoteEntry):
-        return entry.url
+    """Absolute path of a recording, or None of a synthetic one."""
     return None if entry.path is None else str(entry.path.resolve())
 
 
 def _real(table: dict[str, Any], folder: Path) -> tuple[str, int, Entry]:
     given = checked(RealTable, table, "a sequence")
-    if "://" in given.path:
-        name = given.name or name_of(given.path).partition(".")[0]
-        return name, 0, RemoteEntry(name, Path(given.path), max_frames=given.frames, url=given.path)
     path = folder / Path(given.path).expanduser()
     name = given.name or path.resolve().name
     return name, 0, Entry(name, path, max_frames=given.frames)
