@@ -169,7 +169,10 @@ class FrontEnd:
             np.abs(volume.sample(level.depth, level.intensity, level.camera, T).distance)
             for T in (T_world_camera, T_nearest)
         )
-        far = level.depth > np.median(level.depth[np.isfinite(before)])
+        on_map = np.isfinite(before)
+        if not on_map.any():
+            return T_world_camera
+        far = level.depth > np.median(level.depth[on_map])
         nearer, farther = np.count_nonzero(far & (after < before)), np.count_nonzero(far & (before < after))
         return T_nearest if nearer - farther > NO_CHANCE * np.sqrt(nearer + farther) else T_world_camera
 
