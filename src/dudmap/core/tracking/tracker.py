@@ -201,7 +201,7 @@ class Tracker:
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and the
+        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and
         distances (h, w) of the readings to the map before and after these steps, metres, NaN off the map.
 
         Args:
