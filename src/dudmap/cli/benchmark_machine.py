@@ -52,6 +52,12 @@ def gpu(
 
 def speed(
     out: Annotated[Path, Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
+    open3d: Annotated[
+        Path | None, Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM.")
+    ] = None,
+    sequence: Annotated[
+        Path | None, Option(help="Recording of that comparison; default: a synthetic room.", metavar="SEQUENCE")
+    ] = None,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -59,7 +65,7 @@ def speed(
     from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.speed import markdown, speed_figures
 
-    figures = speed_figures(20 if quick else 300, _announced)
+    figures = speed_figures(20 if quick else 300, _announced, open3d, sequence)
     text, tree = markdown(figures), {"figures": [figure._asdict() for figure in figures]}
     answer(save(None, text, out, "speed", tree), text, as_json=as_json, out=out)
 

@@ -42,8 +42,18 @@ class SpeedFigure(NamedTuple):
     remark: str = ""
 
 
-def speed_figures(frames: int, announce: Callable[[str], None] = lambda text: None) -> list[SpeedFigure]:
-    """Measure all figures over so many frames; ``announce`` is called with a description of the next measurement."""
+def speed_figures(
+    frames: int,
+    announce: Callable[[str], None] = lambda text: None,
+    open3d: Path | None = None,
+    recording: Path | None = None,
+) -> list[SpeedFigure]:
+    """Measure all figures over so many frames; ``announce`` is called with a description of the next measurement.
+
+    Args:
+        open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
+        recording: Recording of that comparison; None takes a static synthetic room.
+    """
     figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
     for voxel, target in FRAME_TARGETS.items():
@@ -65,6 +75,24 @@ def speed_figures(frames: int, announce: Callable[[str], None] = lambda text: No
     figures.append(SpeedFigure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
     announce("starting")
     figures += _start_times()
+    if open3d is not None:
+        announce("Open3D's dense SLAM and ours in turn")
+        figures += _open3d_figures(open3d, recording, frames)
+    return figures
+
+
+def _open3d_figures(python: Path, recording: Path | None, frames: int) -> list[SpeedFigure]:
+    from dudmap.lab.benchmark.open3d_comparison import compare_with_open3d
+
+    static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
+    entry = static_room if recording is None else Entry(recording.resolve().name, recording)
+    found = compare_with_open3d(python, entry.open(), frames)
+    remark = f"{entry.name}, {found.frames} frames, {found.ours_ms:.1f} to {found.theirs_ms:.1f} ms"
+    figures = [SpeedFigure("frame, over Open3D's dense SLAM", "x", 1 / 8, found.ours_ms / found.theirs_ms, remark)]
+    if found.ours_ate is not None and found.theirs_ate is not None:
+        remark = f"{100 * found.ours_ate:.2f} to {100 * found.theirs_ate:.2f} cm; Open3D {found.version}"
+        ratio = found.ours_ate / found.theirs_ate
+        figures.append(SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, ratio, remark))
     return figures
 
 
