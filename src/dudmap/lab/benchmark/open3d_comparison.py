@@ -63,8 +63,13 @@ def compare_with_open3d(python: Path, sequence: Sequence, frames: int, rounds: i
         truth = sequence.ground_truth
         scored = accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",)) if truth and poses else {}
         ates.append(scored.get("ate_rmse_m"))
-    ours_ms, theirs_ms = (float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows])) for rows in (ours, theirs))
+    ours_ms, theirs_ms = (_median_ms(rows) for rows in (ours, theirs))
     return Comparison(ours_ms, theirs_ms, ates[0], ates[1], count, str(theirs[-1]["version"]))
+
+
+def _median_ms(rows: list[Row]) -> float:
+    """Median of the times per frame of runs, without the first frames of each, milliseconds."""
+    return float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows]))
 
 
 def _save_frames(sequence: Sequence, count: int, folder: Path) -> list[float]:
