@@ -112,9 +112,11 @@ def test_the_feed_hands_over_no_more_often_than_its_budget_allows():
 def test_a_new_map_replaces_the_old_one():
     first, second, feed = GrowingMap(), GrowingMap(), MeshFeed()
     first.step(0)
-    assert feed.changes(first.volume, now=True).reset
+    feed.offer(first.volume, now=True)
+    assert feed.take().reset
     second.step(0)
-    changes = feed.changes(second.volume, now=True)
+    feed.offer(second.volume, now=True)
+    changes = feed.take()
     assert changes.reset
     assert any(mesh is not None for mesh in changes.chunks.values())
 
@@ -154,7 +156,7 @@ def test_images_are_reduced_to_a_width():
 
 @pytest.mark.parametrize(
     ("package", "arguments", "extra"),
-    [("viser", ["--view"], ".[view]"), ("rerun", ["--rerun", "log.rrd"], ".[rerun]")],
+    [("viser", ["--view"], ".[view]")],
 )
 def test_a_missing_extra_is_named(slam, tmp_path, monkeypatch, package, arguments, extra):
     monkeypatch.chdir(tmp_path)
