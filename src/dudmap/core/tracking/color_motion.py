@@ -40,8 +40,9 @@ class RegisteredLevel(Level):
     def intensity(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Registered intensities (h, w)."""
         halvings = round(np.log2(self.observation.camera.width / self.camera.width))
-        scaled = replace(self.calibration, camera=self.calibration.camera.scaled(halvings))
-        projection = color_projection(scaled, self.velocity, self.observation.color_offset)
+        projection = color_projection(self.calibration, self.velocity, self.observation.color_offset)
+        camera = self.calibration.camera.scaled(halvings)
+        projection = projection._replace(intrinsics=camera.intrinsics, height=camera.height)
         recorded = recorded_intensity(self.observation, halvings)
         return register_color(recorded, self.depth, self.camera, projection)
 

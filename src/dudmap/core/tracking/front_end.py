@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.pyramid import reduced
@@ -164,15 +165,12 @@ class FrontEnd:
         excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.unverified_mask) if m is not None]
         weights = initial_weights([view.labelled], self.last_dynamic, excluded)
         level = view.labelled
-        T_nearest = self.blind_tracker.nearest(volume, level, T_world_camera, None if weights is None else weights[0])
-        before, after = (
-            np.abs(volume.sample(level.depth, level.intensity, level.camera, T).distance)
-            for T in (T_world_camera, T_nearest)
-        )
-        on_map = np.isfinite(before)
+        weights = None if weights is None else weights[0]
+        T_nearest, before, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
+        before, after, on_map = np.abs(before), np.abs(after), np.isfinite(before)
         if not on_map.any():
             return T_world_camera
-        far = level.depth > np.median(level.depth[on_map])
+        far = level.depth > median(level.depth[on_map])
         nearer, farther = np.count_nonzero(far & (after < before)), np.count_nonzero(far & (before < after))
         return T_nearest if nearer - farther > NO_CHANCE * np.sqrt(nearer + farther) else T_world_camera
 
