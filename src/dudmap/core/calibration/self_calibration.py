@@ -41,7 +41,7 @@ class SelfCalibration:
         self.sensor = sensor
         self.live = live
         self.estimate: Estimate | None = None
-        self._collector = KeyframeCollector(given.camera)
+        self._collector = KeyframeCollector(given)
         self._attempts = list(ATTEMPTS)
         self._frames = 0
         self._submap = 0
