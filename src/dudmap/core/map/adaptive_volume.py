@@ -59,8 +59,6 @@ class AdaptiveVolume(TsdfVolume):
     ``levels`` are the finer levels, that with the larger voxels first.
     """
 
-    levels: Sequence[FineBlocks]
-
     def _empty(self) -> None:
         super()._empty()
         levels: list[FineBlocks] = []
