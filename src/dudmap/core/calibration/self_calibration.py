@@ -49,7 +49,7 @@ class SelfCalibration(Stateful):
         self.given = given
         self.sensor = sensor
         self.live = live
-        self._collector = KeyframeCollector(given.camera)
+        self._collector = KeyframeCollector(given)
         self._attempts = list(ATTEMPTS)
 
     @property
