@@ -40,7 +40,7 @@ from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.observability import sentence as unobserved
+from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
@@ -227,7 +227,9 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
+        uncertain = unobserved_motion(estimate.tracking.unobservable) or self.predictor.ambiguity(
+            view, prediction, estimate
+        )
         fuse = self._is_news(view, estimate, uncertain)
         mask = self._dynamic_mask(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
@@ -312,7 +314,7 @@ class Slam(SlamResults, Stateful):
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
-            lambda tracking: not self.monitor.reason_to_doubt(tracking),
+            lambda tracking: not self.monitor.misfit_reason(tracking),
         )
         if found is None:
             return None
@@ -323,7 +325,9 @@ class Slam(SlamResults, Stateful):
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
-        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
+        self.relocalizer.lost(
+            view.timestamp, mostly_dynamic=self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
+        )
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):

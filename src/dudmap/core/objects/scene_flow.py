@@ -14,8 +14,8 @@ PAIRED_PIXELS = 60
 FEWEST_PIXELS = 15
 """Fewest pixels with a known displacement that determine that of their object."""
 WINDOW = 9
-"""Edge of the window that a pixel is matched by, pixels of an image REFERENCE_WIDTH wide."""
-REFERENCE_WIDTH = 160
+"""Edge of the window that a pixel is matched by, pixels of an image WINDOW_WIDTH wide."""
+WINDOW_WIDTH = 160
 """Default width of the label image."""
 
 
@@ -54,11 +54,11 @@ def displacements(
     h, w = now.ids.shape
     v_now, u_now = np.divmod(flat, w)
     pixels = np.stack([u_now, v_now], axis=1).astype(np.float32)
-    window = scaled_window(WINDOW, w, REFERENCE_WIDTH)
+    window = scaled_window(WINDOW, w, WINDOW_WIDTH)
     matches, found, _ = lucas_kanade(now.grey, last.grey, pixels, pixels, window, 2)
     back, found_back, _ = lucas_kanade(last.grey, now.grey, matches, matches, window, 2)
     u, v = np.rint(matches).astype(np.int64).T
-    good = found & found_back & (np.abs(back - pixels).max(axis=1) < 0.5 * w / REFERENCE_WIDTH)
+    good = found & found_back & (np.abs(back - pixels).max(axis=1) < 0.5 * w / WINDOW_WIDTH)
     good &= (u >= 0) & (v >= 0) & (u < w) & (v < h)
     number = now.ids[v_now, u_now]
     good[good] = last.ids[v[good], u[good]] == number[good]
