@@ -104,12 +104,6 @@ class Excerpt:
             self._masks[index] = self.recording.mask(index)
         return self._masks[index]
 
-    def load(self) -> "Excerpt":
-        """Read or render all frames and masks now, so that this falls into the time of nobody."""
-        for index in range(len(self)):
-            _ = self[index], self.mask(index)
-        return self
-
 
 DATA = tables("benchmark/suites.toml")
 SUITES: dict[str, str] = DATA["suites"]
