@@ -65,8 +65,7 @@ core.tracking.tracker:TrackingResult,Minimum,Tracker
 """All classes whose objects may be stored, and made from what is stored: modules of this package and names in them."""
 NOT_STORED: dict[str, dict[str, Any]] = {
     "Atlas": {"make_volume": ...},
-    "BlockPager": {"_store": None, "_executor": None}
-    | dict.fromkeys(("_away", "_writing", "_reading", "_returned", "_archived", "_archive"), ...),
+    "BlockPager": {"_store": None} | dict.fromkeys(("_away", "_returned", "_archived", "_archive"), ...),
     "FrameStore": {
         "registered": None,
         "_first_own": 0,
