@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.system import restore, take_snapshot
+from dudmap.app.state.system import take_snapshot
 from dudmap.core.geometry import se3
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.fine_blocks import BlockTree
@@ -15,6 +15,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.core.scratch_store import ScratchStore
 from dudmap.errors import MapError
+from state_parts import restore
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 
@@ -148,9 +149,7 @@ def test_a_paged_map_is_stored_and_goes_on(tmp_path):
         if number in (12, 18):
             database.close()
             reader, database = StateReader(tmp_path / "state.db"), StateDatabase(tmp_path / "state.db")
-            limit = MAX_BLOCKS if number == 12 else None  # None: a limit that came up on the way, on a full device
-            empty = TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit)
-            paged = restore(reader, {"map": empty}, database)["map"]
+            paged = restore(reader, {"map": TsdfVolume}, database)["map"]
             assert paged.pager.num_blocks > 0
             assert content(paged) == content(whole)
     assert content(paged) == content(whole)
@@ -170,7 +169,7 @@ def test_a_map_that_has_left_the_memory_is_stored_and_goes_on(tmp_path):
         if came_back:
             volume.look_at(frame(2)[1])
         database.write(take_snapshot({"map": volume}, database), {})
-        again = restore(StateReader(tmp_path / "state.db"), {"map": None})["map"]
+        again = restore(StateReader(tmp_path / "state.db"), {"map": TsdfVolume})["map"]
         assert content(again) == content(volume)
         if not came_back:
             volume.page_out()

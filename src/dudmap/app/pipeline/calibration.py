@@ -15,7 +15,6 @@ from dudmap.core.calibration.estimator import (
     EVIDENCE,
     GROUPS,
     MIN_PAIRS,
-    TRANSLATION,
     CalibrationEstimator,
     Estimate,
     mask_of,
@@ -98,7 +97,7 @@ def _sigma(calibration: Calibration, group: str) -> str:
     """Standard deviations of the parameters of a group, of several axes the largest, as text."""
     largest: dict[str, float] = {}
     for name, sigma in zip(PARAMETERS, calibration.sigma, strict=True):
-        if name in GROUPS[group] or (group == "geometry" and name in TRANSLATION):
+        if name in GROUPS[group]:
             largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), float(sigma))
     said = []
     for kind, sigma in largest.items():
@@ -160,7 +159,7 @@ def calibrate_sequence(
     small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
     slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence))
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
-    collector, submap = KeyframeCollector(small.calibration.camera, GAP * small.interval), 0
+    collector, submap = KeyframeCollector(small.calibration, GAP * small.interval), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
         for number, (_, read, *_) in enumerate(frames, start=1):
             progress(number, len(small))

@@ -5,6 +5,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.threads import bands, run_bands
 from dudmap.core.frames.observation import Level
 
 Number = TypeVar("Number", np.float32, np.float64)
@@ -16,6 +17,8 @@ WINDOW = 11
 """Edge of the window that a corner is matched by, pixels of an image 320 wide."""
 RETURN_PX = 0.5
 """Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
+FEWEST = 64
+"""Fewest corners that are worth another thread."""
 REFERENCE_WIDTH = 320
 """Image width that these distances are given for; they grow in proportion to the width of an image."""
 
@@ -107,13 +110,17 @@ def track_forward_backward(
         These corners (m, 2) int, their positions (m, 2) in the second image, the mean differences (m,) of the grey
         values of their windows, and which (n,) of all corners they are.
     """
-    width = first.shape[1]
-    window = scaled_window(WINDOW, width)
-    positions, found, difference = lucas_kanade(first, second, pixels, expected, window, 3)
-    back, found_back, _ = lucas_kanade(second, first, positions, pixels, window, 0)
-    good = found & found_back
-    error = lengths(back[good] - pixels[good].astype(np.float32))
-    good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
+    width, n = first.shape[1], len(pixels)
+    window, limit = scaled_window(WINDOW, width), RETURN_PX * width / REFERENCE_WIDTH
+
+    def track(start: int, stop: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+        begin = pixels[start:stop]
+        positions, found, difference = lucas_kanade(first, second, begin, expected[start:stop], window, 3)
+        back, found_back, _ = lucas_kanade(second, first, positions, begin, window, 0)
+        return positions, found & found_back & (lengths(back - begin.astype(np.float32)) < limit), difference
+
+    parts = run_bands(track, bands(n, max(FEWEST, -(-n // 2))) or [(0, 0)])
+    positions, good, difference = (np.concatenate(part) for part in zip(*parts, strict=True))
     return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64), good
 
 

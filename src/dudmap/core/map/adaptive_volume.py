@@ -5,8 +5,6 @@ from the surface are theirs. Blocks of half, and within them of a quarter of the
 surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,8 +52,6 @@ class AdaptiveVolume(TsdfVolume):
 
     ``levels`` are the finer levels, that with the larger voxels first.
     """
-
-    levels: Sequence[FineBlocks]
 
     def _empty(self) -> None:
         super()._empty()

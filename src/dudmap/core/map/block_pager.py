@@ -15,6 +15,7 @@ from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.scratch_store import ScratchStore
+from dudmap.core.state import Remembered, Stateful
 from dudmap.errors import MapError
 
 REGION_BITS = 4
@@ -39,7 +40,7 @@ class Away(NamedTuple):
     finer: int
 
 
-class BlockPager:
+class BlockPager(Stateful):
     """Moves regions of a map between memory and a store.
 
     A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are. A
@@ -49,6 +50,11 @@ class BlockPager:
     time; blocks within the view stay, even if they are more. ``failure`` says why the store could not be written the
     last time it was tried (empty if it could): the regions then stay in memory, and nothing is lost.
     """
+
+    failure: Remembered[str]
+    _next_serial: Remembered[int]
+    _away: Remembered[dict[Region, Away]]
+    _retry_in: Remembered[int]
 
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
@@ -62,7 +68,7 @@ class BlockPager:
         if self._store is not None:
             self._store.close()
         self._store = None
-        self._away: dict[Region, Away] = {}
+        self._away = {}
         self._returned: dict[Region, tuple[int, int]] = {}  # frame number and serial of what the store also holds
         self._archived: set[Region] = set()
         self._archive: Callable[[Region], BlockRecords] | None = None
@@ -96,13 +102,9 @@ class BlockPager:
         parts = self._stored.read(str(region))
         return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
 
-    def continue_from(
-        self, away: dict[Region, tuple[int, int, int, int]], archive: Callable[[Region], BlockRecords]
-    ) -> None:
-        """Take regions from an archive, which has them as long as they have not come back into memory."""
-        self.clear()
-        self._away = {region: Away(*numbers) for region, numbers in away.items()}
-        self._archived, self._archive = set(away), archive
+    def continue_from(self, archive: Callable[[Region], BlockRecords]) -> None:
+        """Take the regions that are away from an archive, which has them until they have come back into memory."""
+        self._archived, self._archive = set(self._away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
         """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""

@@ -13,6 +13,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_store import CELLS, FrameStore
 from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE, LOCAL_FRAMES
+from dudmap.core.state import Remembered, Stateful
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
 """Views within this distance (m) and angle (deg) of each other show the same: half of what separates keyframes."""
@@ -20,7 +21,7 @@ MIN_KEPT = 256
 """Kept frames of which none are removed: 50 MB at 640x480. Recordings of some minutes give fewer."""
 
 
-class FrameThinning:
+class FrameThinning(Stateful):
     """Removes the images of kept frames of the current submap whose view newer ones show.
 
     They are removed when, in every cell of its image that a frame was fused in, newer frames of the same view
@@ -29,6 +30,8 @@ class FrameThinning:
     been kept before any keyframe nearby was last seen: a return to its place is compared with what was kept until then.
 
     """
+
+    _stored: Remembered[int]
 
     def __init__(self, config: Config, atlas: Atlas) -> None:
         self.atlas = atlas

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.frame_view import FrameView
@@ -28,7 +30,7 @@ SAME_POSE = 0.01, 0.25
 """Initial poses nearer to each other than this (m, deg) lead to the same registration."""
 
 
-class FrontEnd:
+class FrontEnd(Stateful):
     """Registers frames to a map and labels their dynamic pixels.
 
     Args:
@@ -42,6 +44,8 @@ class FrontEnd:
     Attributes:
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
     """
+
+    last_dynamic: Remembered[NDArray[np.bool_] | None]
 
     def __init__(
         self,
@@ -60,7 +64,7 @@ class FrontEnd:
         self.motion = motion
         self.monitor = monitor
         self.color_motion = color_motion
-        self.last_dynamic: NDArray[np.bool_] | None = None
+        self.last_dynamic = None
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Pose and labels of a frame, from its predicted pose on.
@@ -164,15 +168,12 @@ class FrontEnd:
         excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.unverified_mask) if m is not None]
         weights = initial_weights([view.labelled], self.last_dynamic, excluded)
         level = view.labelled
-        T_nearest = self.blind_tracker.nearest(volume, level, T_world_camera, None if weights is None else weights[0])
-        before, after = (
-            np.abs(volume.sample(level.depth, level.intensity, level.camera, T).distance)
-            for T in (T_world_camera, T_nearest)
-        )
-        on_map = np.isfinite(before)
+        weights = None if weights is None else weights[0]
+        T_nearest, before, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
+        before, after, on_map = np.abs(before), np.abs(after), np.isfinite(before)
         if not on_map.any():
             return T_world_camera
-        far = level.depth > np.median(level.depth[on_map])
+        far = level.depth > median(level.depth[on_map])
         nearer, farther = np.count_nonzero(far & (after < before)), np.count_nonzero(far & (before < after))
         return T_nearest if nearer - farther > NO_CHANCE * np.sqrt(nearer + farther) else T_world_camera
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.config import TrackerConfig
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 
 VELOCITY_LIFETIME = 0.15
 """Time after the last accepted pose during which the velocity is still used, seconds."""
@@ -20,7 +21,7 @@ ACCELERATION = 1.0
 """Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
 
 
-class MotionModel:
+class MotionModel(Stateful):
     """Predicts the next pose from the last two.
 
     Args:
@@ -30,6 +31,12 @@ class MotionModel:
     Attributes:
         T_world_camera: (4, 4), the last accepted pose.
     """
+
+    T_world_camera: Remembered[NDArray[np.float64]]
+    _timestamp: Remembered[float]
+    _velocity: Remembered[NDArray[np.float64]]
+    _initialized: Remembered[bool]
+    _observed: Remembered[float]
 
     def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
         self.config = config

@@ -13,6 +13,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.motion_model import MotionModel
@@ -42,7 +43,7 @@ class PosePrediction:
     unverified_mask: NDArray[np.bool_] | None = None
 
 
-class PosePredictor:
+class PosePredictor(Stateful):
     """Predicts by constant velocity, and by ego-motion while the map is young or most of the view is dynamic.
 
     Args:
@@ -55,6 +56,11 @@ class PosePredictor:
         slow_crowd: Whether most of the view is seen to move, but only in comparison with an older image: what has not
             been seen to rest in between may move as well, and is neither registered nor fused.
     """
+
+    ego_motion: Remembered[EgoMotionSegmenter]
+    slow_crowd: Remembered[bool]
+    _single_frame_map: Remembered[bool]
+    _crowded_start: Remembered[bool]
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]

@@ -200,8 +200,9 @@ class Tracker:
         level: Level,
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float64]:
-        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and
+        distances (h, w) of the readings to the map before and after these steps, metres, NaN off the map.
 
         Args:
             volume: The map; its window must cover the view.
@@ -211,7 +212,10 @@ class Tracker:
         """
         weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
         rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
-        return self._descend(volume, level, T_world_camera, weights, None, rules, parameters).T_world_camera
+        first = self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
+        before = first.residuals[0]
+        found = self._descend(volume, level, T_world_camera, weights, first, rules, parameters)
+        return found.T_world_camera, before, found.equations.residuals[0]
 
     def _observability(
         self,
