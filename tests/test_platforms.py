@@ -15,7 +15,6 @@ import pytest
 from dudmap.app.pipeline import environment
 from dudmap.app.viewing.page_access import port_problem
 from dudmap.core.backends import threads
-from dudmap.lab.study.worker import LocalExecutor
 
 SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py"))
 POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
@@ -78,16 +77,6 @@ def test_cores_are_counted_without_affinity(monkeypatch):
     monkeypatch.delenv("DUDMAP_THREADS", raising=False)
     monkeypatch.setattr(threads, "_num_cores", threads._num_cores.__wrapped__)  # without what it has counted before
     assert threads.num_threads.__wrapped__() == environment.machine()["cores_usable"] == os.cpu_count()
-
-
-def test_closing_workers_that_are_gone_is_no_error(monkeypatch):
-    def kill(pid, number):
-        raise OSError(22, "The parameter is incorrect")  # Windows
-
-    monkeypatch.setattr(os, "kill", kill)
-    executor = LocalExecutor(1)
-    executor._pids[None] = 1
-    executor.close()
 
 
 @pytest.mark.parametrize("platform", ["linux", "win32"])

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from dudmap.errors import MissingExtraError
 
-STUDY = ("pyDOE3", "SALib", "statsmodels", "sklearn", "optuna", "pandas", "filelock", "threadpoolctl")
+STUDY = ("pyDOE3", "statsmodels", "optuna", "pandas", "threadpoolctl")
 """Modules of the extra ``study``."""
 
 

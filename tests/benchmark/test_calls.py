@@ -3,7 +3,7 @@
 from dudmap import Config, synthetic
 from dudmap.core.backends import threads
 from dudmap.core.geometry.camera import Camera
-from dudmap.lab.benchmark.roofline import COUNTED_FROM, count_calls, summary
+from dudmap.lab.benchmark.calls import COUNTED_FROM, count_calls, summary
 
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SMALL = Config().override(["volume.voxel_size=0.04", "preprocess.depth_max=4"])

@@ -29,7 +29,7 @@ EXCEPTIONS = {
     "app/pipeline/run_folder.py": "the lock, which is no result",
     "fleet/change_watch.py": "a stream that is readable up to where it ends",
     "fleet/change_benchmark.py": "tables for developers, made anew by their command",
-    "lab/study/": "a study's folder is locked, and every run in it is finished by a rename",
+    "lab/study/": "tables and reports that the same command makes anew from the stored figures of the runs",
     "lab/benchmark/": "tables for developers, made anew by their command",
     "cli/benchmark.py": "tables for developers, made anew by their command",
     "lab/warmup.py": "a temporary folder",

@@ -1,36 +1,33 @@
-"""A small study in a process of its own, which a test kills: python crash_study.py FOLDER RUNS real|fake."""
+"""A small study in a process of its own, which a test kills: python crash_study.py FOLDER RUNS."""
 
+import os
 import sys
 import time
 from pathlib import Path
 
-from dudmap.lab.study.conduct import conduct
 from dudmap.lab.study.plan import make_plan
-from dudmap.lab.study.worker import LocalExecutor
+from dudmap.lab.study.runs import conduct
 
 
-def sleep_row(run, out):
+def figures(job):
+    """Figures of a run, and the process that made them in a file beside the study."""
     time.sleep(0.05)
-    return {"ate_rmse_m": run.values["tracker.huber"], "lost": 0}
+    return {"ate_rmse_m": job.run.values["tracker.huber"], "lost": 0, "pid": os.getpid()}
 
 
-def die_once(run, out):
+def dies_once(job):
     """End the process without a word at the first attempt of one run."""
-    mark = Path(run.config.tracker.robust + "-died")  # in the current folder
-    if run.point == 1 and not mark.exists():
+    mark = Path("died")  # in the current folder
+    if job.run.point == 1 and not mark.exists():
         mark.touch()
-        import os
-
         os._exit(3)
-    return sleep_row(run, out)
+    return figures(job)
 
 
-def die_always(run, out):
-    import os
-
-    if run.point == 1:
+def dies_always(job):
+    if job.run.point == 1:
         os._exit(3)
-    return sleep_row(run, out)
+    return figures(job)
 
 
 def tiny_plan(runs):
@@ -45,7 +42,4 @@ def tiny_plan(runs):
 
 
 if __name__ == "__main__":
-    real = sys.argv[3] == "real"
-    executor = LocalExecutor(2, threads=1, kernels=real)
-    conduct(tiny_plan(int(sys.argv[2])).runs(), Path(sys.argv[1]), executor, do=None if real else sleep_row)
-    executor.close()
+    conduct(tiny_plan(int(sys.argv[2])).runs(), Path(sys.argv[1]), 2, measure=figures)

@@ -1,28 +1,28 @@
-"""Executor of the tests, and what a study folder says of its runs."""
+"""Runs of a study in the process of the tests."""
 
 import json
 from pathlib import Path
 
-from dudmap.lab.study.worker import perform
+from dudmap.lab.study.runs import Job, measure_run
 
 
 class Here:
-    """Executor that does jobs in this process with a given function, or with the system."""
+    """Does runs in this process with a given function of a run, or with the system, each once."""
 
-    workers, cores = 1, 1
+    def __init__(self, figures=None):
+        self.figures = figures or (lambda run: measure_run(Job(run, 1, None)))
+        self.runs, self.rows = [], {}
 
-    def __init__(self, do=None):
-        self.do, self.runs = do, []
-
-    def perform(self, job):
-        self.runs.append(job.run)
-        return perform(job._replace(do=self.do))
-
-    def close(self):
-        pass
+    def __call__(self, runs):
+        for run in runs:
+            if run.key not in self.rows:
+                self.runs.append(run)
+                self.rows[run.key] = self.figures(run)
+        return [self.rows[run.key] for run in runs]
 
 
-def journal(folder):
-    """All lines of the journals of a study folder in the order of time."""
-    lines = [line for path in Path(folder).glob("journal*.jsonl") for line in path.read_text().splitlines()]
-    return sorted((json.loads(line) for line in lines if line.endswith("}")), key=lambda line: line["time"])
+def kept(folder):
+    """Keys of the runs whose figures lie in a study folder."""
+    file = Path(folder) / "runs.jsonl"
+    lines = file.read_text().splitlines() if file.is_file() else []
+    return [json.loads(line)["label"]["run"] for line in lines if line.endswith("}")]

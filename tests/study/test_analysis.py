@@ -1,13 +1,11 @@
-"""Analysis of responses whose truth is known: indices, lack of fit, confirmation, Pareto front."""
+"""Analysis of responses whose truth is known: optimum, lack of fit, confirmation."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from dudmap.config import Config
-from dudmap.lab.study.analysis import pareto_front
 from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, make_factors, points_of
-from dudmap.lab.study.effects import emulated_indices, morris_indices, sobol_indices
 from dudmap.lab.study.response_surface import carried_by, confirm, fit_surface, lack_of_fit, predict_optimum
 from dudmap.lab.study.responses import Scale
 
@@ -52,48 +50,6 @@ def test_whole_numbers_stay_whole():
     factors = factors_of({"volume.max_weight": {"range": [10, 99]}, "tracker.huber": {"range": [0.005, 0.01]}})
     points = points_of(factors, DesignOptions(kind="latin-hypercube", samples=5))
     assert all(type(point["volume.max_weight"]) is int for point in points)
-
-
-def additive(x, y, z):
-    return 3 * x + y + 0 * z
-
-
-def test_sobol_indices_of_an_additive_function():
-    factors = factors_of()
-    table = runs_of(factors, DesignOptions(kind="saltelli", samples=256), additive)
-    found = sobol_indices(factors, table["ate"].to_numpy()).set_index(["term", "order"])["index"]
-    # variances of 3 x, y and 0 z are as 9 : 1 : 0
-    assert found["huber", "first"] == pytest.approx(0.9, abs=0.03)
-    assert found["voxel_size", "total"] == pytest.approx(0.1, abs=0.03)
-    assert found["damping", "total"] == pytest.approx(0, abs=0.01)
-    assert found["huber x voxel_size", "second"] == pytest.approx(0, abs=0.05)
-
-
-def test_an_emulator_gives_the_same_indices_from_a_latin_hypercube():
-    factors = factors_of()
-    table = runs_of(factors, DesignOptions(kind="latin-hypercube", samples=40), additive)
-    found, text = emulated_indices(table, factors, "ate")
-    assert "100%" in text
-    found = found.set_index(["term", "order"])["index"]
-    assert found["huber", "first"] == pytest.approx(0.9, abs=0.03)
-
-
-def test_an_emulator_of_noise_gives_no_indices():
-    factors = factors_of()
-    table = runs_of(factors, DesignOptions(kind="latin-hypercube", samples=40), lambda x, y, z: 0.0, noise=1.0)
-    found, text = emulated_indices(table, factors, "ate")
-    assert found is None
-    assert "mean nothing" in text
-
-
-def test_morris_ranks_the_factors():
-    factors = factors_of()
-    options = DesignOptions(kind="morris", samples=6)
-    table = runs_of(factors, options, additive)
-    coded = np.column_stack([factor.coded(table[factor.key]) for factor in factors])
-    found = morris_indices(factors, coded, table["ate"].to_numpy())
-    assert found["factor"].tolist() == ["huber", "voxel_size", "damping"]
-    assert found["sigma"].max() == pytest.approx(0, abs=1e-9)
 
 
 def bowl(x, y, z):
@@ -142,10 +98,3 @@ def test_a_logarithm_is_shown_in_the_unit_of_the_response():
     data = scale.usable(table)
     assert [scale.text(value) for value in data["ate"]] == ["10 mm", "20 mm"]
     assert scale.heading == "log of ATE RMSE, mm"
-
-
-def test_pareto_front():
-    points = pd.DataFrame({"ate": [3, 1, 2, 3, 2.5], "ms": [1, 3, 2, 3, 2.5]})
-    front = pareto_front(points, ["ate", "ms"])
-    assert front["ate"].tolist() == [1, 2, 3]
-    assert front["ms"].tolist() == [3, 2, 1]

@@ -69,9 +69,7 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"factors": {"volume.max_weight": {"range": [1.5, 9]}}}, "whole numbers"),
         ({"factors": {}}, "no factors"),
         ({"factors": {"tracker.huber": {"range": [0.01, 0.02]}}}, "needs levels, but tracker.huber has a range"),
-        ({"each": 3}, "each of the design is 3; expected true or false"),
         ({"design": "hexagonal"}, "kind of the design is 'hexagonal'; expected one of full-factorial"),
-        ({"design": {"kind": "sobol", "samples": 5}}, "power of two"),
         ({"design": "box-behnken"}, "three factors"),
         ({"design": {"sample": 5}}, "unknown key 'sample' of the design"),
         ({"design": {"samples": "many"}}, "samples of the design is 'many'"),
@@ -102,9 +100,9 @@ def test_every_mistake_is_one_sentence_before_anything_is_run(changed, words):
 def test_a_design_larger_than_max_runs_is_refused():
     with pytest.raises(DudmapError, match="3 runs, more than --max-runs 2"):
         make_plan(GOOD).check(max_runs=2)
-    huge = {"factors": {f"tracker.{key}": {"range": [0.01, 0.1]} for key in ("huber", "tukey", "damping")}}
-    with pytest.raises(DudmapError, match="8388608 runs"):
-        make_plan({**GOOD, **huge, "design": {"kind": "saltelli", "samples": 2**20}}).check()
+    huge = {"design": {"kind": "latin-hypercube", "samples": 2**20}, "factors": {"tracker.huber": {"range": [0.1, 1]}}}
+    with pytest.raises(DudmapError, match="1048576 runs"):
+        make_plan({**GOOD, **huge}).check()
 
 
 @pytest.mark.parametrize(("response", "words"), [("ate", "no true trajectory"), ("mesh_accuracy", "no true"),
@@ -124,7 +122,6 @@ def test_a_recording_without_the_truth_is_refused(tmp_path, response, words):
         ({"judge": [{**ROOM, "replicates": 3}]}, "in both sets"),
         ({"judge": [{**ROOM, "replicates": 3, "seed": 9}], "tune": {"trials": 999}}, "more than --max-runs"),
         ({"tune": {"trails": 3}}, "unknown key 'trails' of tune"),
-        ({"tune": {"early": 1.5}}, "early from 0 to below 1"),
     ],
 )
 def test_mistakes_of_a_search(changed, words):

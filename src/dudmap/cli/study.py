@@ -1,21 +1,23 @@
 """``dudmap study``: designed experiments over configurations, the thesis' chapter 6, and a search that is judged."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import DefaultGroup, answer
 from dudmap.extras import STUDY, need
 
 if TYPE_CHECKING:
-    from dudmap.lab.study.conduct import Progress
-    from dudmap.lab.study.plan import Plan
-    from dudmap.lab.study.worker import LocalExecutor
+    from collections.abc import Sequence
+
+    from dudmap.lab.benchmark.measure import Row
+    from dudmap.lab.study.plan import Plan, Run
 
 app = typer.Typer(
     cls=DefaultGroup,
@@ -34,16 +36,13 @@ class SearchOptions:
     max_runs: Annotated[int, Option("--max-runs", min=1, help="Refuse a design with more runs.")] = 1000
     as_json: o.JsonOption = False
 
-    def executor(self) -> "LocalExecutor":
-        """What does the runs."""
+    def conduct(self, runs: "Sequence[Run]", out: Path, *, keep: bool = False) -> "list[Row]":
+        """Do runs in a study folder."""
         from dudmap.app.pipeline.environment import machine
-        from dudmap.lab.study.worker import LocalExecutor
+        from dudmap.lab.study.runs import conduct
 
-        return LocalExecutor(self.jobs or machine()["cores_usable"])
-
-    def report(self, progress: "Progress") -> None:
-        """Show the progress."""
-        say(progress.describe(), err=True)
+        with counted("runs", quiet=self.as_json) as progress:
+            return conduct(runs, out, self.jobs or machine()["cores_usable"], keep=keep, progress=progress)
 
     def answer(self, outcome: str, out: Path) -> None:
         """Print the outcome, and where the study lies."""
@@ -60,8 +59,7 @@ class StudyOptions(SearchOptions):
         """Run a study."""
         from dudmap.lab.study.study import run_study
 
-        outcome = run_study(plan, out, self.executor(), max_runs=self.max_runs, keep=self.keep, report=self.report)
-        self.answer(outcome, out)
+        self.answer(run_study(plan, out, partial(self.conduct, out=out, keep=self.keep), self.max_runs), out)
 
 
 @app.command()
@@ -111,4 +109,4 @@ def tune(
 
     need("study", "dudmap study", STUDY)
     plan, out = load_plan(design), options.out or Path("runs/study") / f"{design.stem}-tune"
-    options.answer(run_tune(plan, out, options.executor(), max_runs=options.max_runs, report=options.report), out)
+    options.answer(run_tune(plan, out, partial(options.conduct, out=out), options.max_runs), out)

@@ -7,7 +7,9 @@ import csv
 import hashlib
 import json
 import multiprocessing
+import os
 import tempfile
+import threading
 import traceback
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -40,6 +42,10 @@ SAMPLES = 100_000
 """Points sampled on each surface; shares then vary by at most 0.03 %, a third of the gate's smallest margin."""
 FEWER_SAMPLES = 40_000
 """The same where many runs are compared; the standard error of a share of 1 % is then at most 0.05 %."""
+
+
+DIED: Row = {"error": "its process died without a result, as when it crashes or runs out of memory"}
+"""Row of a measurement whose process died."""
 
 
 class Job(NamedTuple):
@@ -148,6 +154,8 @@ def measure_each(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
     kept: Path | None = None,
+    *,
+    shared: bool = False,
 ) -> list[Row]:
     """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a process of its own.
 
@@ -157,11 +165,14 @@ def measure_each(
         workers: Number of processes at a time. Times per frame are reliable with one only.
         done: Called with every row as soon as it is measured.
         kept: File (.jsonl) to which every row is added then; rows that it already has are not measured again.
+        shared: Measure in as many processes as there are workers, whose start many short jobs share. If one of them
+            dies, the remaining jobs have processes of their own.
     """
     jobs = list(jobs)
     rows: dict[str, Row] = {}
     lines = kept.read_text(encoding="utf-8").splitlines() if kept is not None and kept.is_file() else []
     known = {_key(row["label"]): row["row"] for line in lines if line.endswith("}") for row in [json.loads(line)]}
+    pool = _processes(workers) if shared else None
 
     def one(job: tuple[Row, Any]) -> None:
         label, argument = job
@@ -169,15 +180,20 @@ def measure_each(
         if key in known:
             rows[key] = label | known[key]
             return
-        row = in_own_process(function, argument)
-        if kept is not None:
+        row = DIED if pool is None else _result(pool, function, argument)
+        row = in_own_process(function, argument) if row == DIED else row
+        if kept is not None and row != DIED:
             with kept.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps({"label": label, "row": row}) + "\n")
         rows[key] = label | row
         done(rows[key])
 
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, jobs))
+    try:
+        with ThreadPoolExecutor(workers) as threads:
+            list(threads.map(one, jobs))
+    finally:
+        if pool is not None:
+            pool.shutdown()
     return [rows[_key(label)] for label, _ in jobs]
 
 
@@ -193,16 +209,32 @@ def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] =
 
 def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
     """Result of ``function(argument)`` in a new process; ``{"error": sentence}`` if it raises or the process dies."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(function, argument).result()
-        except DudmapError as error:
-            return {"error": str(error)}
-        except BrokenProcessPool:
-            return {"error": "its process died without a result, as when it crashes or runs out of memory"}
-        except Exception as error:  # a defect in one measurement must not discard the others of a suite
-            traceback.print_exception(error)
-            return {"error": f"{type(error).__name__}: {error}"}
+    with _processes(1) as pool:
+        return _result(pool, function, argument)
+
+
+def _result(pool: ProcessPoolExecutor, function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
+    try:
+        return pool.submit(function, argument).result()
+    except DudmapError as error:
+        return {"error": str(error)}
+    except BrokenProcessPool:
+        return DIED
+    except Exception as error:  # a defect in one measurement must not discard the others of a suite
+        traceback.print_exception(error)
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+def _processes(count: int) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, context, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """End this process with the one that started it, which may be killed: it would wait for its next job forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 @cache

@@ -5,19 +5,10 @@ A response that no run has is a ``ConfigError``.
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from dudmap.lab.study import report as figures
 from dudmap.lab.study import screening
-from dudmap.lab.study.designs import Table, coded_points
-from dudmap.lab.study.effects import (
-    anova,
-    emulated_indices,
-    interactions,
-    main_effects,
-    morris_indices,
-    sobol_indices,
-)  # fmt: skip
+from dudmap.lab.study.designs import Table
+from dudmap.lab.study.effects import anova, interactions, main_effects
 from dudmap.lab.study.report import Report
 from dudmap.lab.study.response_surface import Prediction, lack_of_fit, predict_optimum, values_text
 from dudmap.lab.study.responses import RESPONSES
@@ -55,37 +46,12 @@ def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> 
     else:
         report.text(f"Analysis of variance ({variance[1]}):")
         report.table(variance[0].reset_index(names="term"))
-    describe_indices(report, plan, table, data, name)
     predicted = predict_optimum(data, factors, scale)
     if isinstance(predicted, str):
         report.text(predicted)
     else:
         describe_surface(report, predicted)
     return None
-
-
-def describe_indices(report: Report, plan: "Plan", table: Table, data: Table, name: str) -> None:
-    """Add the sensitivity indices of a sampled design."""
-    kind, seed, factors, found = plan.options.kind, plan.options.seed, plan.factors, None
-    if kind in ("latin-hypercube", "sobol"):
-        found, text = emulated_indices(data, factors, name, seed)
-        report.text(text)
-    elif kind in ("saltelli", "morris"):
-        means = data.groupby("point")[name].mean()
-        values = means.sort_index().to_numpy()
-        if len(data) < len(table) or len(means) != table["point"].nunique():
-            report.text(f"There are no indices: {len(table) - len(data)} runs of the design have no {name}.")
-        elif kind == "morris":
-            points = table.groupby("point")[[factor.key for factor in factors]].first().sort_index()
-            report.text("Elementary effects of Morris, from one end of a factor to the other:")
-            report.table(morris_indices(factors, coded_points(factors, points), values))
-        elif np.ptp(values) == 0:
-            report.text("There are no indices: the response does not vary.")
-        else:
-            found = sobol_indices(factors, values, seed)
-    if found is not None:
-        report.table(found)
-        report.figure(figures.indices_figure(found), "Sobol indices with 95 % intervals.")
 
 
 def describe_surface(report: Report, predicted: Prediction) -> None:
@@ -122,28 +88,15 @@ def point_table(plan: "Plan", table: Table) -> Table:
     return means.reset_index(drop=True)
 
 
-def pareto_front(points: Table, names: tuple[str, str]) -> Table:
-    """Points (one row each, a column per response) that no other beats in one of two responses, by the first."""
-    signs = [1 if RESPONSES[name].better == "low" else -1 for name in names]
-    ordered = (points.dropna(subset=list(names))[list(names)] * signs).sort_values(list(names))
-    return points.loc[ordered.index[ordered[names[1]] < ordered[names[1]].cummin().shift(fill_value=np.inf)]]
-
-
 def describe_points(report: Report, plan: "Plan", table: Table) -> None:
-    """Add the Pareto front of the first response and the time (or else the second), and the means of all points."""
+    """Add the means of all points, the best of the first response on top."""
     points = point_table(plan, table)
-    if points.empty:
+    known = [name for name in plan.responses if name in points]
+    if not known or len(points) > MOST_POINTS:
         return
-    names = [name for name in plan.responses if name in points]
-    if len(names) > 1 and names[0] == plan.responses[0]:
-        pair = (names[0], "ms" if "ms" in names[1:] else names[1])
-        front, headings = pareto_front(points, pair), [RESPONSES[name].heading for name in pair]
-        report.heading(f"Pareto front: {headings[0]} against {headings[1]}")
-        report.figure(figures.pareto_figure(points, front, pair, headings), "Means of the points over all recordings.")
-        report.table(front)
-    if len(points) <= MOST_POINTS:
-        report.heading("Means of all points over the recordings")
-        report.table(points.rename(columns={name: RESPONSES[name].heading for name in names}))
+    points = points.sort_values(known[0], ascending=RESPONSES[known[0]].better == "low")
+    report.heading("Means of all points over the recordings")
+    report.table(points.rename(columns={name: RESPONSES[name].heading for name in known}))
 
 
 def describe_losses(report: Report, table: Table) -> None:

@@ -135,11 +135,8 @@ Point = dict[str, Value]
 """Values of all factors by key."""
 Kind = Literal[
     "full-factorial", "fractional-factorial", "plackett-burman", "central-composite", "box-behnken", "latin-hypercube",
-    "sobol", "saltelli", "morris",
 ]  # fmt: skip
 DESIGNS: tuple[str, ...] = get_args(Kind)
-MORRIS_LEVELS = 4
-"""Levels per factor of a Morris design; Morris (1991) and SALib take 4."""
 
 
 class DesignOptions(BaseModel):
@@ -147,11 +144,10 @@ class DesignOptions(BaseModel):
 
     Attributes:
         kind: Name of the design.
-        samples: Number of points of a Latin hypercube or Sobol sequence; base samples N of a Saltelli design, which has
-            N (2 K + 2) points for K factors; trajectories N of a Morris design, which has N (K + 1) points.
+        samples: Number of points of a Latin hypercube.
         resolution: Resolution of a fractional factorial design.
         generators: Generators of a fractional factorial design such as ``a b c abc``, instead of a resolution.
-        seed: Seed of a sampled design.
+        seed: Seed of a Latin hypercube.
         foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
             interactions of two factors.
     """
@@ -167,7 +163,7 @@ class DesignOptions(BaseModel):
 
 
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
-    """All points of a design, each once; those of Saltelli and Morris need every row for their indices."""
+    """All points of a design, each once."""
     kind = options.kind
     found: list[Point]
     if kind == "full-factorial":
@@ -180,10 +176,8 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
         words = [factor.key for factor in factors if not factor.numeric]
         if words:
             raise ConfigError(f"a {kind} design needs numbers, but {words[0]} has levels that are none")
-        rows = (_response_surface if kind in ("central-composite", "box-behnken") else _sampled)(factors, options)
+        rows = (_latin_hypercube if kind == "latin-hypercube" else _response_surface)(factors, options)
         found = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
-    if kind in ("saltelli", "morris"):
-        return found
     return [point for number, point in enumerate(found) if point not in found[:number]]
 
 
@@ -193,9 +187,6 @@ def count_of(factors: Sequence[Factor], options: DesignOptions) -> int:
         return int(np.prod([max(len(factor.levels), 1) for factor in factors], dtype=object))
     by_kind = {
         "latin-hypercube": options.samples,
-        "sobol": options.samples,
-        "saltelli": options.samples * (2 * len(factors) + 2),
-        "morris": options.samples * (len(factors) + 1),
         "central-composite": 2 ** len(factors) + 2 * len(factors) + 1,
     }
     return by_kind[options.kind] if options.kind in by_kind else len(points_of(factors, options))
@@ -250,23 +241,7 @@ def _response_surface(factors: Sequence[Factor], options: DesignOptions) -> Code
     return np.asarray(ccdesign(count, center=(0, 1), face="faced") if composite else bbdesign(count, center=1))
 
 
-def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from SALib.sample import morris, sobol
-    from scipy.stats.qmc import LatinHypercube, Sobol
+def _latin_hypercube(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from scipy.stats.qmc import LatinHypercube
 
-    kind, samples, rng = options.kind, options.samples, np.random.default_rng(options.seed)
-    if kind in ("sobol", "saltelli") and samples & (samples - 1):
-        raise ConfigError(f"a {kind} design has {samples} samples; expected a power of two")
-    if kind == "latin-hypercube":
-        return 2 * LatinHypercube(len(factors), rng=rng).random(samples) - 1
-    if kind == "sobol":
-        return 2 * Sobol(len(factors), rng=rng).random_base2(samples.bit_length() - 1) - 1
-    if kind == "saltelli":
-        return sobol.sample(problem(factors), samples, calc_second_order=True, seed=options.seed)
-    return morris.sample(problem(factors), samples, num_levels=MORRIS_LEVELS, seed=options.seed)
-
-
-def problem(factors: Sequence[Factor]) -> dict[str, Any]:
-    """The factors in coded units, as SALib wants them."""
-    names = [factor.name for factor in factors]
-    return {"num_vars": len(factors), "names": names, "bounds": [[-1.0, 1.0]] * len(factors)}
+    return 2 * LatinHypercube(len(factors), rng=np.random.default_rng(options.seed)).random(options.samples) - 1

@@ -27,15 +27,11 @@ STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class TuneOptions(BaseModel):
-    """Table ``tune`` of a design file: configurations, seed of the proposals, and when they are pruned.
-
-    ``early`` is the share of the frames after which that happens; 0 prunes none.
-    """
+    """Table ``tune`` of a design file: number of configurations, and seed of the proposals."""
 
     model_config = STRICT
 
     trials: int = Field(default=40, ge=1)
-    early: float = Field(default=0.34, ge=0, lt=1, description="early from 0 to below 1")
     seed: int = 0
 
 
@@ -76,7 +72,6 @@ class DesignFile(BaseModel):
     log: list[str] = Field([], description="a list of responses")
     calibrate: bool = Field(False, description="true or false")
     confirm: int = Field(1, ge=0, description="the number of confirmation runs, 0 or more")
-    each: bool = Field(False, description="true or false")
     tune: dict[str, Any] = Field({}, description="a table with trials, early, seed")
 
 
@@ -142,7 +137,6 @@ class Plan:
         responses: Names of the responses; the first is optimised, the others are reported beside it.
         log: Names of the responses that are analysed as logarithms.
         confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
-        each: Whether every recording also has a model and a confirmation of its own.
         code: Hash of the code.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
     """
@@ -156,7 +150,6 @@ class Plan:
     log: tuple[str, ...] = ()
     calibrate: bool = False
     confirm: int = 1
-    each: bool = False
     code: str = ""
     tune: TuneOptions = field(default_factory=TuneOptions)
     judges: tuple[tuple[str, int, Entry], ...] = ()
@@ -243,7 +236,6 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
         log=tuple(file.log),
         calibrate=file.calibrate,
         confirm=file.confirm,
-        each=file.each,
         code=method_hash(),
         tune=checked(TuneOptions, file.tune, "tune"),
         judges=make_entries(file.judge, folder) if file.judge else (),

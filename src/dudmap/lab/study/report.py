@@ -166,31 +166,6 @@ def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
     return png(figure)
 
 
-def pareto_figure(points: Table, front: Table, names: Sequence[str], headings: Sequence[str]) -> bytes:
-    """Points in the plane of two responses, and those that no other beats."""
-    figure, axes = _axes(1, 1, 5.0, 3.6)
-    ax = axes[0][0]
-    ax.scatter(points[names[1]], points[names[0]], s=10, color="0.6", label="points of the design")
-    ordered = front.sort_values(names[1])
-    ax.plot(ordered[names[1]], ordered[names[0]], marker="o", ms=5, ls="--", lw=0.8, label="Pareto front")
-    ax.set(xlabel=headings[1], ylabel=headings[0])
-    ax.legend(fontsize=8)
-    return png(figure)
-
-
-def indices_figure(indices: Table) -> bytes:
-    """First-order and total Sobol indices with their intervals."""
-    figure, axes = _axes(1, 1, 5.0, 3.2)
-    for shift, order in ((-0.2, "first"), (0.2, "total")):
-        part = indices[indices["order"] == order]
-        x = np.arange(len(part)) + shift
-        axes[0][0].bar(x, part["index"], 0.38, yerr=part["95 % +-"], capsize=3, label=order)
-        axes[0][0].set_xticks(np.arange(len(part)), list(part["term"]), rotation=20, ha="right", fontsize=8)
-    axes[0][0].set_ylabel("Sobol index")
-    axes[0][0].legend()
-    return png(figure)
-
-
 def screening_figure(effects: Table, keys: Sequence[str], heading: str) -> bytes:
     """Effects of the keys on every recording with their intervals; the first key is on top."""
     recordings = list(dict.fromkeys(effects["recording"]))

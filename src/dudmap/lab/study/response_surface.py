@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from dudmap.lab.study.responses import Scale
 
 Numbers = NDArray[np.float64]
 
-MOST_STARTS = 3**6
-"""Starting points of the search for the optimum at most; all corners, edges and faces of six factors."""
+STARTS = 200
+"""Starting points of the search for the optimum. In a box a quadratic has few local optima, which few starts miss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,6 @@ class Surface:
     Attributes:
         scale: The response.
         factors: The K numeric factors.
-        features: Maps (N, K) coded values to (N, P) terms.
         model: Fitted model of statsmodels.
         blocks: Number of columns of the recordings after the P terms.
         observed: (N,) values of the response.
@@ -35,7 +34,6 @@ class Surface:
 
     scale: Scale
     factors: tuple[Factor, ...]
-    features: Any
     model: Any
     blocks: int
     observed: Numbers
@@ -60,7 +58,8 @@ class Surface:
 
     def predict(self, coded: Numbers) -> Numbers:
         """(N,) predictions at (N, K) coded values, for the mean over all recordings."""
-        return np.asarray(self.model.predict(self._exog(coded)))
+        terms = quadratic_terms(coded)
+        return terms @ self.model.params[: terms.shape[1]]
 
     def interval(self, coded: Numbers, count: int) -> tuple[float, float, float]:
         """Prediction at one point, and the interval in which the mean of ``count`` new runs should fall."""
@@ -88,21 +87,13 @@ class Surface:
         return float(self.scale.sign * np.min(self.scale.sign * self.point_means))
 
     def _exog(self, coded: Numbers) -> Numbers:
-        return np.hstack([np.asarray(self.features.transform(coded)), np.zeros((len(coded), self.blocks))])
+        return np.hstack([quadratic_terms(coded), np.zeros((len(coded), self.blocks))])
 
-    @property
-    def quadratic_form(self) -> tuple[Numbers, Numbers]:
-        """(K,) linear coefficients b and (K, K) symmetric matrix B of y = b0 + b'x + x'Bx."""
-        count = len(self.factors)
-        b, B = np.zeros(count), np.zeros((count, count))
-        for power, value in zip(self.features.powers_, self.model.params, strict=False):
-            at = np.repeat(np.arange(count), power)
-            if len(at) == 1:
-                b[at[0]] = value
-            elif len(at) == 2:
-                B[at[0], at[1]] += value / 2
-                B[at[1], at[0]] += value / 2
-        return b, B
+
+def quadratic_terms(coded: Numbers) -> Numbers:
+    """(N, P) terms of the full quadratic model: 1, x_i, and x_i x_j, of (N, K) coded values."""
+    pairs = combinations_with_replacement(coded.T, 2)
+    return np.column_stack([np.ones(len(coded)), coded, *(a * b for a, b in pairs)])
 
 
 def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface | str:
@@ -110,17 +101,16 @@ def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface
 
     Recordings are blocks whose effects sum to zero.
     """
+    import pandas as pd
     import statsmodels.api as sm
-    from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures
 
     used = tuple(factor for factor in factors if factor.numeric and data[factor.key].nunique() > 1)
     if not used:
         return "There is no response surface: no numeric factor varies."
     coded = coded_points(used, data)
-    features = PolynomialFeatures(2).fit(coded)
-    blocks = np.asarray(OneHotEncoder(sparse_output=False).fit_transform(data[["sequence"]]))
+    blocks = pd.get_dummies(data["sequence"]).to_numpy(float)
     effects = blocks[:, :-1] - blocks[:, -1:]
-    exog = np.hstack([np.asarray(features.transform(coded)), effects])
+    exog = np.hstack([quadratic_terms(coded), effects])
     rank, (runs, terms) = np.linalg.matrix_rank(exog), exog.shape
     if rank < terms:
         return (
@@ -135,7 +125,7 @@ def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface
     labels = [
         f"{values_text({f.key: row[f.key] for f in used})} on {row['sequence']}" for row in data.to_dict("records")
     ]
-    return Surface(scale, used, features, sm.OLS(observed, exog).fit(), effects.shape[1], observed, coded, labels)
+    return Surface(scale, used, sm.OLS(observed, exog).fit(), effects.shape[1], observed, coded, labels)
 
 
 def values_text(values: dict[str, Any]) -> str:
@@ -156,19 +146,14 @@ class Optimum:
 
 
 def optimum(surface: Surface) -> Optimum:
-    """Best prediction inside the bounds: L-BFGS-B (scipy) from all corners, edges, faces and the centre."""
+    """Best prediction inside the bounds: L-BFGS-B (scipy) from the centre and from random points."""
     import pandas as pd
     from scipy.optimize import minimize
-    from scipy.stats.qmc import Sobol
 
-    count = len(surface.factors)
-    if 3**count <= MOST_STARTS:
-        starts = np.array(list(product((-1.0, 0.0, 1.0), repeat=count)))
-    else:
-        starts = 2 * Sobol(count, rng=np.random.default_rng(0)).random_base2(9) - 1
-    b, B = (surface.scale.sign * part for part in surface.quadratic_form)
+    count, sign = len(surface.factors), surface.scale.sign
+    starts = [np.zeros(count), *np.random.default_rng(0).uniform(-1, 1, (STARTS, count))]
     found = [
-        minimize(lambda x: b @ x + x @ B @ x, start, jac=lambda x: b + 2 * B @ x, bounds=[(-1, 1)] * count)
+        minimize(lambda x: sign * float(surface.predict(x[None])[0]), start, bounds=[(-1, 1)] * count)
         for start in starts
     ]
     best = min(found, key=lambda result: result.fun).x

@@ -3,20 +3,18 @@
 A study that cannot be run is refused with a ``DudmapError`` before anything is run.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import ConfigError
 from dudmap.lab.data import find
-from dudmap.lab.study.conduct import Progress, conduct, table_of
 from dudmap.lab.study.designs import Table
-from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, make_plan
+from dudmap.lab.study.plan import MAX_RUNS, Plan, make_plan
 from dudmap.lab.study.responses import RESPONSES
-from dudmap.lab.study.worker import Executor
+from dudmap.lab.study.runs import Conduct, table_of
 
 if TYPE_CHECKING:
     from dudmap.lab.study.response_surface import Confirmation, Prediction
@@ -24,83 +22,22 @@ if TYPE_CHECKING:
 NOTHING = "There is nothing to confirm."
 
 
-def run_study(
-    plan: Plan,
-    out: Path,
-    executor: Executor,
-    *,
-    max_runs: int = MAX_RUNS,
-    keep: bool = False,
-    report: Callable[[Progress], None] = lambda progress: None,
-) -> str:
-    """Do all runs that are missing, confirm the optimum, and write runs.csv, confirmation.csv and the report.
-
-    The executor is closed. ``keep`` keeps whole run folders; ``report`` is called after every run.
-
-    Returns:
-        The outcome in words.
-    """
+def run_study(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS) -> str:
+    """Do all runs, confirm the optimum, and write runs.csv, confirmation.csv and the report; the outcome in words."""
     from dudmap.lab.study.response_surface import predict_optimum
 
-    try:
-        plan.check(max_runs)
-        runs, scale = plan.runs(), plan.scale(plan.responses[0])
-        do = partial(conduct, root=out, executor=executor, keep=keep, report=report)
-        state = do(runs)
-        table = table_of(runs, out)
-        table.to_csv(out / "runs.csv", index=False)
-        predicted = predict_optimum(scale.usable(table), plan.factors, scale)
-        confirmation = NOTHING if isinstance(predicted, str) or not plan.confirm else _confirm(plan, predicted, out, do)
-        each = confirm_each(plan, table, out, do) if plan.each else None
-    finally:
-        executor.close()
-    died = f"; {state.deaths} workers died" if state.deaths else ""
-    return write_report(plan, table, predicted, confirmation, out, f"{executor.workers} at a time{died}", each)
+    plan.check(max_runs)
+    runs, scale = plan.runs(), plan.scale(plan.responses[0])
+    table = table_of(runs, conduct(runs))
+    table.to_csv(out / "runs.csv", index=False)
+    predicted = predict_optimum(scale.usable(table), plan.factors, scale)
+    confirmation = (
+        NOTHING if isinstance(predicted, str) or not plan.confirm else _confirm(plan, predicted, out, conduct)
+    )
+    return write_report(plan, table, predicted, confirmation, out)
 
 
-def confirm_each(plan: Plan, table: Table, out: Path, do: Callable[[Sequence[Run]], Progress]) -> Table:
-    """Model, optimum and confirmation of every recording on its own; also written to each.csv.
-
-    One row per recording: values of the factors at the optimum, R2 of the model, R2 when each run is left out in turn,
-    prediction, mean of the confirmation runs, best point of the design on the same recordings, frames lost in the
-    confirmation runs, whether the model held, and whether anything spoke against it before.
-    """
-    import pandas as pd
-
-    from dudmap.lab.study.response_surface import predict_optimum
-
-    scale, rows = plan.scale(plan.responses[0]), []
-    for recording in plan.recordings:
-        alone = replace(plan, entries=tuple(entry for entry in plan.entries if entry[0] == recording))
-        predicted = predict_optimum(scale.usable(table[table["sequence"] == recording]), plan.factors, scale)
-        if isinstance(predicted, str):
-            rows.append({"recording": recording, "held": predicted})
-            continue
-        point, surface = {key.rpartition(".")[2]: value for key, value in predicted.point.items()}, predicted.surface
-        row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
-        row |= {"best run": scale.plain(surface.best_seen), "predicted": scale.plain(predicted.best.predicted)}
-        file = f"confirmation-{recording}.csv"
-        found = _confirm(alone, predicted, out, do, file)
-        if isinstance(found, str):
-            rows.append(row | {"held": found})
-            continue
-        runs = pd.read_csv(out / file)
-        row |= {"measured": scale.plain(found.measured), "best point": scale.plain(found.best_point)}
-        row["lost at the optimum"] = float(runs.loc[runs["at"] == "optimum", "lost"].mean())
-        warned = "yes" if predicted.reasons else "no"
-        rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
-    each = pd.DataFrame(rows)
-    each.to_csv(out / "each.csv", index=False)
-    return each
-
-
-def _confirm(
-    plan: Plan,
-    predicted: "Prediction",
-    out: Path,
-    do: Callable[[Sequence[Run]], Progress],
-    file: str = "confirmation.csv",
-) -> "Confirmation | str":
+def _confirm(plan: Plan, predicted: "Prediction", out: Path, conduct: Conduct) -> "Confirmation | str":
     """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
 
@@ -108,9 +45,10 @@ def _confirm(
 
     scale = plan.scale(plan.responses[0])
     at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)
-    do([*at_optimum, *at_best])
-    tables = {"optimum": table_of(at_optimum, out), "best point of the design": table_of(at_best, out)}
-    pd.concat(tables, names=["at"]).reset_index("at").to_csv(out / file, index=False)
+    rows = conduct([*at_optimum, *at_best])
+    tables = {"optimum": table_of(at_optimum, rows[: len(at_optimum)]),
+              "best point of the design": table_of(at_best, rows[len(at_optimum) :])}  # fmt: skip
+    pd.concat(tables, names=["at"]).reset_index("at").to_csv(out / "confirmation.csv", index=False)
     try:
         measured, best = (scale.usable(table)[scale.response].tolist() for table in tables.values())
     except ConfigError as error:
@@ -127,8 +65,6 @@ def write_report(
     predicted: "Prediction | str",
     confirmation: "Confirmation | str",
     out: Path,
-    how: str,
-    each: Table | None = None,
 ) -> str:
     """Write report.md and report.html; return the outcome in words."""
     from dudmap.app.pipeline.environment import machine, versions
@@ -139,7 +75,7 @@ def write_report(
     report, first = Report(f"Study {plan.name}"), plan.scale(plan.responses[0])
     report.text(
         f"{plan.options.kind} design of {len(plan.factors)} factors, {table['point'].nunique()} points, "
-        f"{len(table)} runs on {', '.join(plan.recordings)}; {how}."
+        f"{len(table)} runs on {', '.join(plan.recordings)}."
     )
     report.items(
         f"{f.key}: {', '.join(map(str, f.levels)) if f.levels else f'{f.low:g} to {f.high:g} ({f.scale})'}"
@@ -156,9 +92,6 @@ def write_report(
         if name == first.response:
             report.heading("Confirmation")
             report.text(str(confirmation))
-            if each is not None:
-                report.heading(f"{plan.scale(name)._replace(log=False).heading}: each recording on its own")
-                report.table(each)
     screened = plan.options.kind == "plackett-burman"
     if screened:
         import pandas as pd
@@ -230,7 +163,6 @@ def published_report(out: Path) -> str:
     The confirmation is the thesis' own: 0.089 m at its optimum, 0.080 m at the best point of the design.
     """
     from dudmap.lab.study.response_surface import confirm, predict_optimum
-    from dudmap.lab.study.study import write_report
 
     plan, table = thesis_plan(), published_table()
     recording = (str(table["sequence"][0]), 0, plan.entries[0][2])
@@ -242,4 +174,4 @@ def published_report(out: Path) -> str:
     predicted = predict_optimum(data, plan.factors, scale)
     assert not isinstance(predicted, str)
     confirmation = confirm(predicted.surface, predicted.best, [PUBLISHED_CONFIRMATION], [float(data["ate"].min())])
-    return write_report(plan, table, predicted, confirmation, out, "nothing was run")
+    return write_report(plan, table, predicted, confirmation, out)

@@ -1,7 +1,6 @@
 """Search for a configuration on training recordings, judged on recordings it never saw.
 
-Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). A configuration first runs on the early frames
-of the training recordings, where what is worse than the median is dropped. All figures are ratios to the base
+Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). All figures are ratios to the base
 configuration on the same recording, so that recordings count equally. The proposals depend on the seed and on earlier
 results only, and results are kept: a search that was stopped proposes the same again and finds its results.
 
@@ -19,11 +18,10 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.suites import Entry
-from dudmap.lab.study.conduct import Progress, StudyFolder, conduct
 from dudmap.lab.study.designs import Factor, Point, Table, configured
-from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, place_of
+from dudmap.lab.study.plan import MAX_RUNS, Plan, place_of
 from dudmap.lab.study.responses import RESPONSES, check_truth
-from dudmap.lab.study.worker import Executor
+from dudmap.lab.study.runs import Conduct
 
 if TYPE_CHECKING:
     import optuna
@@ -55,8 +53,7 @@ def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:
     for _, _, entry in plan.judges:
         if _identity(entry) in trained:
             raise ConfigError(f"{entry.name} is in both sets; a judge must not have been trained on")
-    rounds = 2 if plan.tune.early else 1
-    count = (plan.tune.trials + 1) * rounds * len(plan.entries) + (MOST_JUDGED + 1) * len(plan.judges)
+    count = (plan.tune.trials + 1) * len(plan.entries) + (MOST_JUDGED + 1) * len(plan.judges)
     if count > max_runs:
         raise ConfigError(f"the search has up to {count} runs, more than --max-runs {max_runs}")
     for _, _, entry in (*plan.entries, *plan.judges):
@@ -67,20 +64,17 @@ def _identity(entry: Entry) -> str:
     return place_of(entry) or repr(sorted(dict(entry.parameters).items()))
 
 
-def ratios(
-    points: Sequence[Point], plan: Plan, out: Path, do: Callable[[Sequence[Run]], Progress]
-) -> list[Numbers | None]:
+def ratios(points: Sequence[Point], plan: Plan, conduct: Conduct) -> list[Numbers | None]:
     """Ratios (recordings, responses) to the base configuration; None for a point with a failed run.
 
     A point that loses more frames than the base configuration on any recording counts as failed.
     """
     runs = [plan.runs_at(number, point) for number, point in enumerate([{}, *points])]
-    do([run for same in runs for run in same])
-    wanted, folder = [RESPONSES[name].key for name in plan.responses] + ["lost"], StudyFolder(out)
+    rows = conduct([run for same in runs for run in same])
+    wanted, size = [RESPONSES[name].key for name in plan.responses] + ["lost"], len(plan.entries)
     figures: list[Numbers | None] = []
-    for same in runs:
-        rows = [(folder.result(run.key) or {"row": {}})["row"] for run in same]
-        found = np.array([[row.get(key) for key in wanted] for row in rows], dtype=float)
+    for start in range(0, len(rows), size):
+        found = np.array([[row.get(key) for key in wanted] for row in rows[start : start + size]], dtype=float)
         figures.append(found if np.all(np.isfinite(found)) and np.all(found[:, :-1] > 0) else None)
     base, *others = figures
     if base is None:
@@ -98,15 +92,12 @@ def training_front(plan: Plan, measure: Measure) -> list[tuple[Point, tuple[floa
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     sampler = optuna.samplers.TPESampler(seed=plan.tune.seed)
     directions: Any = ["minimize"] * len(plan.responses)
-    study, early = optuna.create_study(directions=directions, sampler=sampler), list[float]()
+    study = optuna.create_study(directions=directions, sampler=sampler)
     for begin in range(0, plan.tune.trials, BATCH):
         trials = [study.ask() for _ in range(min(BATCH, plan.tune.trials - begin))]
         points = [suggest(trial, plan.factors) for trial in trials]
-        kept = _promising(points, plan, measure, early)
-        found = dict(zip(kept, measure([points[n] for n in kept], plan), strict=True))
-        for number, trial in enumerate(trials):
-            trial.set_user_attr("point", points[number])
-            measured = found.get(number)
+        for trial, point, measured in zip(trials, points, measure(points, plan), strict=True):
+            trial.set_user_attr("point", point)
             if measured is None:
                 study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             else:
@@ -114,20 +105,6 @@ def training_front(plan: Plan, measure: Measure) -> list[tuple[Point, tuple[floa
     different = {str(t.user_attrs["point"]): t for t in sorted(study.best_trials, key=lambda trial: trial.values)[::-1]}
     chosen = sorted(different.values(), key=lambda trial: trial.values)[:MOST_JUDGED]
     return [(trial.user_attrs["point"], tuple(trial.values)) for trial in chosen]
-
-
-def _promising(points: list[Point], plan: Plan, measure: Measure, early: list[float]) -> list[int]:
-    """Numbers of the points that are not worse, on the early frames, than the median of the earlier ones."""
-    if not plan.tune.early:
-        return list(range(len(points)))
-    kept = []
-    for number, found in enumerate(measure(points, shortened(plan, plan.tune.early))):
-        if found is not None:
-            value = float(geometric_mean(found)[0])
-            if len(early) < BATCH or value <= np.median(early):
-                kept.append(number)
-            early.append(value)
-    return kept
 
 
 def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
@@ -185,34 +162,14 @@ def suggest(trial: "optuna.trial.Trial", factors: Sequence[Factor]) -> Point:
     return point
 
 
-def shortened(plan: Plan, share: float) -> Plan:
-    """Plan with the first frames of every training recording only."""
-    entries = []
-    for name, replicate, entry in plan.entries:
-        count = entry.max_frames or len(entry.open())
-        entries.append((name, replicate, replace(entry, max_frames=max(3, round(share * count)))))
-    return replace(plan, entries=tuple(entries))
-
-
-def run_tune(
-    plan: Plan,
-    out: Path,
-    executor: Executor,
-    *,
-    max_runs: int = MAX_RUNS,
-    report: Callable[[Progress], None] = lambda progress: None,
-) -> str:
+def run_tune(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS) -> str:
     """Search, judge, and write tune.csv, and recommended.toml if a configuration holds; return the outcome in words."""
     import pandas as pd
 
     check_tune(plan, max_runs)
     recommended = out / "recommended.toml"
     recommended.unlink(missing_ok=True)
-    try:
-        do = partial(conduct, root=out, executor=executor, report=report)
-        rows = judged(plan, partial(ratios, out=out, do=do))
-    finally:
-        executor.close()
+    rows = judged(plan, partial(ratios, conduct=conduct))
     table = pd.DataFrame([row for _, row in rows])
     table.to_csv(out / "tune.csv", index=False)
     good = [point for point, row in rows if row["holds"] == "yes"]

@@ -139,11 +139,9 @@ class SyntheticSequence:
             if mover.present(t)
         ]
 
-    def static_twin(self, since: float = -np.inf) -> "SyntheticSequence":
-        """Recording with the same camera path and sensor noise, but without movers, or without them from a time on."""
-        movers = [replace(m, present=lambda t, m=m: t < since and m.present(t)) for m in self._movers]
-        kept, parameters = (movers, self.parameters) if since > -np.inf else ([], self.parameters | {"movers": []})
-        return self._like(self.scene, kept, parameters)
+    def static_twin(self) -> "SyntheticSequence":
+        """Recording with the same camera path and sensor noise, but without movers."""
+        return self._like(self.scene, [], self.parameters | {"movers": []})
 
     def in_scene(self, scene: Scene) -> "SyntheticSequence":
         """Recording with the same camera path, movers and sensor noise in another scene."""

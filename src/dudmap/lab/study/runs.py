@@ -1,0 +1,123 @@
+"""The runs of a study: each in a worker process, and its figures in the study folder as soon as it ends."""
+
+import os
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from dudmap.app.doctor import compiled_kernels
+from dudmap.app.pipeline.environment import machine
+from dudmap.app.pipeline.run_folder import locked
+from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, measure_each, measure_sequence
+from dudmap.lab.benchmark.suites import Entry, Excerpt
+from dudmap.lab.study.designs import Table
+from dudmap.lab.study.plan import Run
+from dudmap.lab.warmup import steps
+
+if TYPE_CHECKING:
+    from dudmap.evaluation.surface import Surface
+    from dudmap.io.sequences import Sequence as Recording
+
+Conduct = Callable[[Sequence[Run]], list[Row]]
+"""Does runs, equal ones once, and returns the figures of each in their order."""
+CACHED_BYTES = 300e6
+"""Frames of a recording that a worker keeps read or rendered between runs, bytes at most."""
+PIXEL_BYTES = 8
+"""Bytes per pixel of a kept frame: depth, colour and mask."""
+
+
+class Job(NamedTuple):
+    """A run, the number of its threads, and the folder that keeps it whole, if any."""
+
+    run: Run
+    threads: int
+    out: Path | None
+
+
+def conduct(
+    runs: Sequence[Run],
+    root: Path,
+    jobs: int = 1,
+    *,
+    keep: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    measure: Callable[[Job], Row] | None = None,
+) -> list[Row]:
+    """Do all runs that have no figures yet, so many ``jobs`` at a time; see ``Conduct``.
+
+    ``runs.jsonl`` in the folder ``root`` holds the figures of all runs so far by their keys. A run that fails has the
+    sentence ``error`` instead. With ``keep`` the run folders stay in ``runs/``. ``measure`` replaces the system.
+    """
+    unique = {run.key: run for run in runs}
+    if measure is None and not compiled_kernels():  # once, not in every worker
+        for _, step in steps():
+            step()
+    threads = max(1, machine()["cores_usable"] // jobs)
+    work = [({"run": key}, Job(run, threads, root / "runs" / key if keep else None)) for key, run in unique.items()]
+    done = list[Row]()
+
+    def count(row: Row) -> None:
+        done.append(row)
+        progress(len(done), len(work))
+
+    with locked(root):
+        rows = measure_each(measure or measure_run, work, jobs, count, root / "runs.jsonl", shared=True)
+    found = {row["run"]: row for row in rows}
+    return [found[run.key] for run in runs]
+
+
+def table_of(runs: Sequence[Run], rows: Sequence[Row]) -> Table:
+    """One row per run: number of the point, recording, replicate, values of the factors, figures or error."""
+    import pandas as pd
+
+    places = ({"point": run.point, "sequence": run.sequence, "replicate": run.replicate, **run.values} for run in runs)
+    return pd.DataFrame([{"run": run.key} | place | row for run, place, row in zip(runs, places, rows, strict=True)])
+
+
+def measure_run(job: Job) -> Row:
+    """Figures of one run of the system.
+
+    Frames are not prepared ahead in a second thread, so that the time per frame is all the time a frame takes.
+    """
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    os.environ["DUDMAP_THREADS"] = str(job.threads)
+    cv2.setNumThreads(job.threads)
+    threadpool_limits(job.threads)
+    _reset_peak_memory()
+    entry, run = job.run.entry, job.run
+    return measure_sequence(
+        _recording(entry), run.config, _surfaces(entry) if run.surfaces else None, job.out,
+        entry.max_frames, FEWER_SAMPLES, calibrate=run.calibrate, ahead=0,
+    )  # fmt: skip
+
+
+def _reset_peak_memory() -> None:
+    """Let the peak of the resident memory start anew, where the system can (Linux); elsewhere it is that of all runs of
+    the process so far."""
+    import gc
+
+    gc.collect()
+    switch = Path("/proc/self/clear_refs")
+    if switch.is_file():
+        switch.write_text("5", encoding="utf-8")  # proc(5): reset the peak resident set size
+
+
+@lru_cache(maxsize=1)
+def _recording(entry: Entry) -> "Recording":
+    """Recording of a run; a short one is read or rendered once for all runs that follow each other."""
+    sequence = entry.open()
+    frames = min(len(sequence), entry.max_frames or len(sequence))
+    size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES
+    return cast("Recording", Excerpt(sequence)) if size <= CACHED_BYTES else sequence
+
+
+@lru_cache(maxsize=4)
+def _surfaces(entry: Entry) -> "tuple[Surface, Surface] | None":
+    """True surfaces of a recording with their search trees."""
+    from dudmap.evaluation.surface import Surface
+
+    found: Any = entry.surfaces(entry.open())
+    return found and (Surface(found[0], "the true surface"), Surface(found[1], "its observed part"))
