@@ -70,7 +70,7 @@ class VoxelBlocks:
             were fused into it, 255 or more.
     """
 
-    def __init__(self, slots: int = 1 << 10) -> None:
+    def __init__(self, slots: int = 1 << 14) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
