@@ -60,16 +60,14 @@ class Bootstrap(Stateful):
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
 
-    textureless: Remembered[bool]
+    textureless: Remembered[bool] = False
     _frames: Remembered[list[StartFrame]]
     _window: Remembered[list[StartFrame]]
-    _num_fused: Remembered[int]
+    _num_fused: Remembered[int] = 0
 
     def __init__(self) -> None:
-        self.textureless = False
         self._frames = []
         self._window = []
-        self._num_fused = 0
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:

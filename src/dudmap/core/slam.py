@@ -94,7 +94,7 @@ class Slam(SlamResults, Stateful):
     redundancy: Remembered[RedundantViews]
     loops: Remembered[LoopCloser]
     objects: Remembered[MovingObjects]
-    _last: Remembered[FrameResult | None]
+    _last: Remembered[FrameResult | None] = None  # of the last frame, for one that repeats it
 
     def __init__(
         self,
@@ -132,7 +132,6 @@ class Slam(SlamResults, Stateful):
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
-        self._last = None  # of the last frame, for one that repeats it
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live

@@ -163,16 +163,14 @@ class KeyframeCollector(Stateful):
 
     keyframes: Remembered[list[ColorKeyframe]]
     _interval: Remembered[float]
-    _before: Remembered[tuple[float, NDArray[np.float64]] | None]
-    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None]
+    _before: Remembered[tuple[float, NDArray[np.float64]] | None] = None
+    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None] = None
 
     def __init__(self, given: Calibration, max_gap: float = MAX_GAP) -> None:
         self.given = given
         self.max_gap = min(max_gap, MAX_GAP)
         self.keyframes = []
         self._interval = INTERVAL
-        self._before = None
-        self._pending = None
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]

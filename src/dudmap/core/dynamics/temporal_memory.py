@@ -56,21 +56,18 @@ class TemporalMemory(Stateful):
         config: ``settle_time`` and ``start_seconds``.
     """
 
-    _last: Remembered[RememberedFrame | None]
+    _last: Remembered[RememberedFrame | None] = None
     _settle_frames: Remembered[deque[RememberedFrame]]
     _recent_frames: Remembered[deque[RememberedFrame]]
     _start_frames: Remembered[list[RememberedFrame]]
-    _imported: Remembered[bool]
-    _young_until: Remembered[float]
+    _imported: Remembered[bool] = False  # the frames of the first seconds come from another pass
+    _young_until: Remembered[float] = -np.inf
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._last = None
         self._settle_frames = deque()
         self._recent_frames = deque()
         self._start_frames = []
-        self._imported = False  # the frames of the first seconds come from another pass
-        self._young_until = -np.inf
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map, of this time in seconds."""

@@ -59,10 +59,10 @@ class Atlas(Stateful):
     keyframes: Remembered[KeyframeDatabase]
     volumes: Remembered[dict[int, TsdfVolume]]
     rebuildings: Remembered[dict[int, MapRebuilding]]
-    repainting: Remembered[MapRebuilding | None]
+    repainting: Remembered[MapRebuilding | None] = None
     current: Remembered[int]
     poses: Remembered[list[TimedPose]]
-    saved: Remembered[int | None]
+    saved: Remembered[int | None] = None
 
     def __init__(
         self,
@@ -76,10 +76,8 @@ class Atlas(Stateful):
         self.history = history
         self.volumes = {number: make_volume()}
         self.rebuildings = {}
-        self.repainting = None
         self.current = number
         self.poses = []
-        self.saved = None
 
     @classmethod
     def of(

@@ -41,20 +41,17 @@ class Relocalizer(Stateful):
 
     """
 
-    _lost_since: Remembered[float | None]
-    _crowded: Remembered[bool]
+    _lost_since: Remembered[float | None] = None
+    _crowded: Remembered[bool] = False  # most of the view moved in the last tracked frame
     _recent: Remembered[deque[FrameView]]
-    _place_unknown: Remembered[bool]
+    _place_unknown: Remembered[bool] = False
     _counted: Remembered[tuple[float, int]]
 
     def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
         self.config = config
         self.atlas = atlas
         self.prior_map = prior_map
-        self._lost_since = None
-        self._crowded = False  # most of the view moved in the last tracked frame
         self._recent = deque()  # lost frames: the last, those of LONGEST_BASELINE
-        self._place_unknown = False
         self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
 
     @property

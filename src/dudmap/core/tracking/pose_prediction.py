@@ -58,9 +58,9 @@ class PosePredictor(Stateful):
     """
 
     ego_motion: Remembered[EgoMotionSegmenter]
-    slow_crowd: Remembered[bool]
-    _single_frame_map: Remembered[bool]
-    _crowded_start: Remembered[bool]
+    slow_crowd: Remembered[bool] = False
+    _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
+    _crowded_start: Remembered[bool] = False  # most of the view has moved in every frame so far
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
@@ -69,9 +69,6 @@ class PosePredictor(Stateful):
         self.tracker = tracker
         self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
         self._known_poses = known_poses
-        self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
-        self.slow_crowd = False
-        self._crowded_start = False  # most of the view has moved in every frame so far
 
     def start(self, view: FrameView) -> None:
         """A map has been made of this frame."""

@@ -81,15 +81,13 @@ class ImageConsistency(Stateful):
         motion: Knows the pose of the last tracked frame.
     """
 
-    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None]
-    _gain: Remembered[float]
+    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None] = None  # coarsest level, dynamic pixels, blind
+    _gain: Remembered[float] = 1.0  # of the exposure of the last frame
 
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
         self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
-        self._last = None  # coarsest level, dynamic pixels, blind
-        self._gain = 1.0  # of the exposure of the last frame
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Compare the next frame with this one, whose pose is accepted."""
