@@ -46,6 +46,7 @@ def where(tmp_path_factory):
 CASES = [
     ("view", "viser", ["view", "seen"]),
     ("view", "viser", ["run", "desk", "--view"]),
+    ("rerun", "rerun", ["run", "desk", "--rerun", "a.rrd"]),
     ("ros-bags", "rosbags.typesys", ["info", "walk.bag"]),
     ("ros-bags", "rosbags.typesys", ["run", "walk.bag"]),
     ("ros-bags", "rosbags.rosbag2", ["export", "run", "--out", "a.mcap"]),

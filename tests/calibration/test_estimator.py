@@ -9,12 +9,11 @@ import pytest
 
 from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
-from dudmap.core.backends.cpu.color_registration import color_pixels
 from dudmap.core.calibration.adjustment import Adjustment, Fit
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
-from dudmap.core.calibration.keyframes import KeyframeCollector
+from dudmap.core.calibration.keyframes import KeyframeCollector, keyframe
 from dudmap.core.calibration.pairs import Pair, PairSet
-from dudmap.core.frames.color_registration import color_projection
+from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
@@ -22,6 +21,7 @@ from dudmap.core.geometry.calibration import PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(130.0, 130.0, 79.5, 59.5, 160, 120)
+GIVEN = Calibration.registered(CAMERA)
 FPS, FRAMES = 30.0, 80
 NORMALS = np.array([[0.75, 0.1, 0.65], [-0.65, 0.15, 0.75], [0.05, 0.8, 0.6]])
 NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
@@ -88,19 +88,19 @@ def recorded(name: str) -> tuple[Calibration, list[Frame]]:
 
 
 def estimate(frames: list[Frame]):
-    given = Calibration.registered(CAMERA)
-    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(GIVEN)
     for index, frame in enumerate(frames):
         wrong = se3.exp(np.random.default_rng(1000 + index).normal(0, 5e-4, 6))  # tracking is not perfect
         collector.add(preprocess(frame), pose(frame.timestamp) @ wrong, np.zeros(CAMERA.shape, bool))
-    return CalibrationEstimator(given, SensorConfig()).estimate(collector.keyframes)
+    return CalibrationEstimator(GIVEN, SensorConfig()).estimate(collector.keyframes)
 
 
 def displacement(one: Calibration, other: Calibration) -> float:
     """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
     depth = record(Calibration.registered(CAMERA), 0).depth
+    images = np.meshgrid(np.arange(CAMERA.width, dtype=np.float32), np.arange(CAMERA.height, dtype=np.float32))
     (u, v), (p, q) = (
-        color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
+        [register_color(image, depth, CAMERA, color_projection(c, np.zeros(6), 0.0)) for image in images]
         for c in (one, other)
     )
     return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))
@@ -270,7 +270,7 @@ def test_standard_deviations_grow_with_what_the_halves_of_the_time_differ_by():
 
 
 def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
-    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(GIVEN)
     for frame in recorded("as given")[1][:12]:
         collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
     given = Calibration.registered(CAMERA)
@@ -286,7 +286,7 @@ def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
 
 def test_relative_poses_follow_the_poses_of_both_frames():
     """A step of the frames' poses in the normal equations of a pair against differences of its depth residuals."""
-    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(GIVEN)
     for frame in recorded("as given")[1][:30]:
         collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
     given = Calibration.registered(CAMERA)
@@ -306,3 +306,21 @@ def test_relative_poses_follow_the_poses_of_both_frames():
     after, _ = cost_and_gradient([a + b for a, b in zip(start, step, strict=True)])
     predicted = H @ np.concatenate(step)  # the change of the gradient
     assert np.linalg.norm(after - before - predicted) < 0.15 * np.linalg.norm(predicted)
+
+
+@pytest.mark.parametrize("shift", [0.0, -0.25])
+def test_the_colours_of_what_moves_have_no_part_in_a_calibration(shift):
+    """However bright it is, and wherever the colour camera sees it: it changes no intensity that is compared."""
+    given = Calibration(CAMERA, np.array([[1, 0, 0, shift], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    frame, mask = recorded("as given")[1][0], np.zeros(CAMERA.shape, bool)
+    mask[40:80, 60:100] = True
+    aside = round(-shift * CAMERA.fx / float(np.median(frame.depth[mask])))
+    taken = []
+    for brightness in (0, 255):
+        color = frame.color.copy()
+        color[40:80, 60 - aside : 100 - aside] = brightness
+        observation = Preprocessor(CAMERA, PreprocessConfig(filter="none"))(replace(frame, color=color))
+        taken.append(keyframe(observation, given, np.eye(4), np.zeros(6), mask).intensities)
+    for dark, bright in zip(*taken, strict=True):
+        np.testing.assert_allclose(dark, bright, atol=1e-6)
+        assert 0.02 < np.isnan(dark).mean() < 0.4

@@ -110,8 +110,9 @@ def test_mesh_of_a_run_is_moved_into_the_true_world(folders):
     assert len(Mesh.load(run / "mesh_error.ply").faces) == 4
     apart = figures("mesh", run / "mesh.ply", recording / "surface.ply", "--samples", 2000, "--no-error-mesh")
     assert apart["accuracy_rmse_m"] > 0.1
-    near = figures("mesh", run, recording, "--samples", 2000, "--distances", "0.002")
-    assert near["precision_2mm"] > 0.99
+    aligned = figures("mesh", run, recording, "--register", "--samples", 2000, "--distances", "0.002")
+    assert aligned["icp_rmse_m"] < 1e-3
+    assert aligned["precision_2mm"] > 0.99
 
 
 def test_masks_of_a_run(folders):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, MapError
 from dudmap.evaluation.reconstruction import compare_surfaces, distance_colors, error_mesh
-from dudmap.evaluation.surface import Surface, point_triangle_distances
+from dudmap.evaluation.surface import Surface, moved, point_triangle_distances, register
 
 
 def mesh_of(vertices, faces):
@@ -123,6 +124,36 @@ def test_error_mesh_is_blue_where_right_and_red_where_wrong():
     assert len(np.unique(distance_colors(np.linspace(0, 1, 5, dtype=np.float32), 1.0), axis=0)) == 5
 
 
+def room():
+    """Floor, two walls, and a box: determined in all six directions."""
+    box = trimesh.creation.box((0.6, 0.5, 0.8))
+    box.apply_translation([1.2, 0.9, 0.4])
+    wall = moved(plane(2.0, 2.0), se3.exp(np.array([0, 0, 0, 0, -np.pi / 2, 0])))
+    other = moved(plane(2.0, 2.0), se3.exp(np.array([0, 0, 0, np.pi / 2, 0, 0])))
+    return together(plane(2.0, 2.0), wall, other, from_trimesh(box))
+
+
+def test_registration_finds_a_known_motion_in_spite_of_ghosts():
+    reference = room()
+    T = se3.exp(np.array([0.06, -0.04, 0.05, 0.04, -0.03, 0.05]))
+    estimate = moved(together(reference, plane(0.8, 0.8, 1.5, cells=4, x=0.6)), T)
+    found = register(estimate, reference, samples=6000)
+    error = found.T_reference_estimate @ T
+    assert found.free_directions == 0
+    assert np.linalg.norm(error[:3, 3]) < 5e-4
+    assert se3.rotation_angle(error) < 5e-4
+    assert found.rmse < 5e-4
+    started = register(estimate, reference, se3.inverse(T), samples=6000)
+    assert started.num_iterations < found.num_iterations
+
+
+def test_registration_does_not_move_along_a_plane():
+    T = se3.exp(np.array([0.03, 0.02, 0.04, 0.02, 0.01, 0]))
+    found = register(moved(plane(), T), plane(), samples=3000)
+    assert found.free_directions == 3
+    assert abs((found.T_reference_estimate @ T @ [1, 1, 0, 1])[2]) < 1e-4
+
+
 def test_errors_are_one_sentence():
     cloud = mesh_of(np.random.default_rng(0).random((200, 3)), np.empty((0, 3)))
     with pytest.raises(MapError, match="the estimate has 200 vertices but no faces with an area"):
@@ -141,3 +172,17 @@ def test_errors_are_one_sentence():
         compare_surfaces(plane(), plane(), ghost_distance=0)
     with pytest.raises(ConfigError, match="a threshold is nan"):
         compare_surfaces(plane(), plane(), thresholds=(np.nan,))
+    with pytest.raises(MapError, match="do not overlap where they start"):
+        register(plane(z=5), plane())
+
+
+def test_clouds_are_accepted_when_they_are_said_to_be_clouds():
+    random = np.random.default_rng(1)
+    cloud = mesh_of(np.c_[2 * random.random((4000, 2)), np.full(4000, 0.03)], np.empty((0, 3)))
+    result = compare_surfaces(cloud, plane(), points=True, samples=4000)
+    assert result.accuracy.mean == pytest.approx(0.03, rel=1e-4)
+    assert result.area_m2 is None
+    assert result.ghost_area_m2 is None
+    assert result.ghost_share == 0
+    back = compare_surfaces(plane(), cloud, points=True, samples=2000)
+    assert back.accuracy.median == pytest.approx(np.hypot(0.03, 0.015), abs=0.004)

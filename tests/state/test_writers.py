@@ -21,6 +21,7 @@ EXCEPTIONS = {
     "lab/synthetic/folder.py": "thousands of images of a new folder, whose lists come last; made anew by its command",
     "io/sequences/archive.py": "unpacks into a temporary folder, which is renamed",
     "io/cameras/recorder.py": "a stream that grows for hours and is readable up to where it ends",
+    "app/viewing/rerun_log.py": "a stream of a library",
     "app/pipeline/observer.py": "a stream that is readable up to where it ends",
     "core/map/map_file.py": "members of an archive that is written as a temporary file",
     "core/backends/device.py": "writes to the null device",

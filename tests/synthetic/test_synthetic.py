@@ -8,6 +8,7 @@ from dudmap import open_sequence
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, FrameError
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic import scene as parts
@@ -261,6 +262,20 @@ def test_hand_held_paths_have_their_speed(path, speed, turn):
     assert 30 * np.degrees(np.mean([se3.rotation_angle(T) for T in steps])) == pytest.approx(turn, rel=0.6)
 
 
+def test_recorded_path_keeps_its_shape(tmp_path):
+    stamps = np.arange(0, 3, 0.02) + 1341846313.6
+    Ts = np.stack([se3.exp(np.array([0.3 * np.sin(t), 0.1 * t, 0, 0, 0.2 * t, 0.1])) for t in stamps - stamps[0]])
+    Trajectory(stamps, se3.exp(np.array([5, 6, 7, 2.0, 0.3, 0.1])) @ Ts).save(tmp_path / "path.txt")
+    recording = synthetic.sequence(camera=TINY, camera_path=tmp_path / "path.txt", frames=60, fps=25, movers=())
+    made = recording.ground_truth.Ts_world_camera
+    for i, j in ((0, 20), (10, 50)):
+        expected = se3.inverse(Ts[2 * i]) @ Ts[2 * j]
+        assert np.allclose(se3.inverse(made[i]) @ made[j], expected, atol=1e-6)
+    assert recording.scene.clearance(made[:, :3, 3]).min() > 0.2
+    with pytest.raises(ConfigError, match=r"lasts 2\.98 s.*fewer frames"):
+        synthetic.sequence(camera_path=tmp_path / "path.txt", frames=120)
+
+
 def test_kidnapped_camera_jumps_and_comes_back_while_covered():
     recording = synthetic.sequence(situation="kidnapped", frames=120, camera=TINY, noise="kinect")
     jumps = np.array(
@@ -331,7 +346,7 @@ def test_folder_opens_again_as_the_same_recording(tmp_path):
         ({"scene": "palace"}, "unknown scene 'palace'; known scenes: room, corridor"),
         ({"movers": ("dog",)}, "unknown mover 'dog'; known movers: person"),
         ({"noise": "lidar"}, "unknown noise model 'lidar'; known noise models: kinect, realsense, none"),
-        ({"camera_path": "zigzag"}, "unknown camera path 'zigzag'; known camera paths: handheld"),
+        ({"camera_path": "zigzag"}, "camera path 'zigzag' is neither a trajectory file nor one of handheld"),
         ({"situation": "fog"}, "unknown situation 'fog'; known situations: people_at_start"),
         ({"coverage": 1.5}, "coverage is 1.5"),
         ({"coverage": 0.8, "scene": "desk"}, "the densest crowd in scene 'desk' covers"),

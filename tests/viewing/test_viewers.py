@@ -112,11 +112,9 @@ def test_the_feed_hands_over_no_more_often_than_its_budget_allows():
 def test_a_new_map_replaces_the_old_one():
     first, second, feed = GrowingMap(), GrowingMap(), MeshFeed()
     first.step(0)
-    feed.offer(first.volume, now=True)
-    assert feed.take().reset
+    assert feed.changes(first.volume, now=True).reset
     second.step(0)
-    feed.offer(second.volume, now=True)
-    changes = feed.take()
+    changes = feed.changes(second.volume, now=True)
     assert changes.reset
     assert any(mesh is not None for mesh in changes.chunks.values())
 
@@ -147,7 +145,7 @@ def test_images_are_reduced_to_a_width():
 
 @pytest.mark.parametrize(
     ("package", "arguments", "extra"),
-    [("viser", ["--view"], ".[view]")],
+    [("viser", ["--view"], ".[view]"), ("rerun", ["--rerun", "log.rrd"], ".[rerun]")],
 )
 def test_a_missing_extra_is_named(slam, tmp_path, monkeypatch, package, arguments, extra):
     monkeypatch.chdir(tmp_path)

@@ -98,6 +98,9 @@ def mesh(
     reference: Annotated[
         Path, Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
     ],
+    register_first: Annotated[
+        bool, Option("--register", help="Register the mesh to the reference first (ICP).")
+    ] = False,
     thresholds: Annotated[
         str, Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,...")
     ] = "0.01,0.02,0.05",
@@ -105,6 +108,7 @@ def mesh(
         float, Option(help="Estimated surface farther than this from the true one counts as ghost, m.")
     ] = 0.05,
     samples: Annotated[int, Option(help="Number of sampled points per surface.")] = 300_000,
+    points: Annotated[bool, Option("--points", help="Accept point clouds, which have no area.")] = False,
     error_mesh: Annotated[
         bool, Option("--error-mesh/--no-error-mesh", help="Write mesh_error.ply, coloured by the error.")
     ] = True,
@@ -122,7 +126,7 @@ def mesh(
 
     from dudmap.evaluation import reconstruction
     from dudmap.evaluation.files import first_pose_alignment, load_mesh
-    from dudmap.evaluation.surface import moved
+    from dudmap.evaluation.surface import moved, register
 
     ending = _plot_ending(plots, plot_format)
     file = estimate / "mesh.ply" if estimate.is_dir() else estimate
@@ -133,11 +137,17 @@ def mesh(
     figures: Figures = {"estimate": str(file), "reference": str(true_file)}
     figures["observed"] = str(observed_file) if observed is not None else None
     T = first_pose_alignment(estimate, reference)
+    if register_first:
+        registration = register(found, true, T)
+        T = registration.T_reference_estimate
+        figures |= {"icp_rmse_m": round(registration.rmse, 6), "icp_iterations": registration.num_iterations}
+        figures["icp_free_directions"] = registration.free_directions
     figures["T_reference_estimate"] = None if T is None else np.round(T, 9).tolist()
     found = found if T is None else moved(found, T)
     distances = o.numbers(thresholds, None, "--distances")
     result = reconstruction.compare_surfaces(
-        found, true, observed=observed, thresholds=distances, ghost_distance=ghost_distance, samples=samples
+        found, true, observed=observed, thresholds=distances, ghost_distance=ghost_distance, samples=samples,
+        points=points,
     )  # fmt: skip
     columns = result.histogram_edges, result.accuracy_histogram, result.completeness_histogram
     histogram = {name: np.round(column, 6).tolist()
@@ -148,7 +158,7 @@ def mesh(
     pictures: list[Path] = []
     if error_mesh:
         pictures.append(target / f"{stem}_error.ply")
-        reconstruction.error_mesh(found, true, largest=ghost_distance).save(pictures[-1])
+        reconstruction.error_mesh(found, true, largest=ghost_distance, points=points).save(pictures[-1])
     if ending:
         from dudmap.evaluation.plots import plot_surface
 

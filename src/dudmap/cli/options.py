@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GROUPS = {
     "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --run --trajectory "
     "--reference --max-frames --every",
-    "Output": "--out --sheet --save-masks --report --log --record --size --plots --plot-format --quiet --json",
+    "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
     "--resolution --heights --world",
     "Calibration": "--calibration",
@@ -181,6 +181,9 @@ class WatchingOptions:
     report: Annotated[
         bool, Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
     ] = True
+    rerun: Annotated[
+        Path | None, Option(help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd")
+    ] = None
     log: Annotated[
         Path | None, Option(help="File for one JSON object per line and event of the run.", metavar="FILE")
     ] = None

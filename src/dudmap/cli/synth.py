@@ -16,7 +16,11 @@ def synth(
     out: Annotated[Path, Argument(help="Output folder, in TUM layout with ground truth.")],
     scene: Annotated[str, Option(help="room, corridor, desk, yard, textureless, plane or box.")] = "room",
     camera_path: Annotated[
-        str | None, Option(help="handheld, slow, fast, still, pan, orbit, dolly, round or follow.", metavar="NAME")
+        str | None,
+        Option(
+            help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file in TUM format.",
+            metavar="FILE|NAME",
+        ),
     ] = None,
     movers: Annotated[
         list[str] | None,

@@ -46,6 +46,10 @@ def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
             from dudmap.app.viewing.report import ReportObserver
 
             watching.append(ReportObserver())
+        if wanted.rerun is not None:
+            from dudmap.app.viewing.rerun_log import RerunLog
+
+            watching.append(RerunLog(wanted.rerun))
         if wanted.view:
             from dudmap.app.viewing.live_view import LiveView
             from dudmap.app.viewing.window import Window

@@ -16,6 +16,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
@@ -45,7 +46,7 @@ class StartFrame:
     fused: bool
 
 
-class Bootstrap:
+class Bootstrap(Stateful):
     """Knows the first frames of a map, and what of them must be taken back.
 
     A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
@@ -59,11 +60,14 @@ class Bootstrap:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
 
+    textureless: Remembered[bool] = False
+    _frames: Remembered[list[StartFrame]]
+    _window: Remembered[list[StartFrame]]
+    _num_fused: Remembered[int] = 0
+
     def __init__(self) -> None:
-        self.textureless = False
-        self._frames: list[StartFrame] = []
-        self._window: list[StartFrame] = []
-        self._num_fused = 0
+        self._frames = []
+        self._window = []
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:

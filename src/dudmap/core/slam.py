@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
@@ -33,6 +33,7 @@ from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult
 from dudmap.core.slam_results import SlamResults
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.estimate import PoseEstimate
@@ -46,7 +47,20 @@ from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import ConfigError
 
 
-class Slam(SlamResults):
+@dataclass(frozen=True, eq=False)
+class SlamArguments:
+    """Arguments of ``Slam``, except a first pass and a saved map, of which the state holds what is used."""
+
+    camera: Camera
+    config: Config
+    calibration: Calibration | None
+    live: bool
+    localize: bool
+    max_blocks: int | MemoryLimit | None
+    timed: bool
+
+
+class Slam(SlamResults, Stateful):
     """Dense RGB-D SLAM in scenes where things move.
 
     Args:
@@ -66,6 +80,22 @@ class Slam(SlamResults):
         timed: Whether the times of the frames are those of a clock; False where they are invented.
     """
 
+    stream: Remembered[StreamCheck]
+    motion: Remembered[MotionModel]
+    color_motion: Remembered[ColorMotion]
+    detector: Remembered[DynamicDetector]
+    monitor: Remembered[QualityMonitor]
+    front_end: Remembered[FrontEnd]
+    predictor: Remembered[PosePredictor]
+    atlas: Remembered[Atlas]
+    color_calibration: Remembered[ColorCalibration]
+    bootstrap: Remembered[Bootstrap]
+    relocalizer: Remembered[Relocalizer]
+    redundancy: Remembered[RedundantViews]
+    loops: Remembered[LoopCloser]
+    objects: Remembered[MovingObjects]
+    _last: Remembered[FrameResult | None] = None  # of the last frame, for one that repeats it
+
     def __init__(
         self,
         camera: Camera,
@@ -79,15 +109,15 @@ class Slam(SlamResults):
         *,
         timed: bool = True,
     ) -> None:
-        self.max_blocks = max_blocks
         self.config = config = config or Config()
+        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed)
+        self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
         self.preprocess = Preprocessor(camera, config.preprocess, given)
         self.camera = self.preprocess.camera
-        self.first_camera = camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
@@ -102,7 +132,6 @@ class Slam(SlamResults):
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
-        self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live
@@ -114,7 +143,7 @@ class Slam(SlamResults):
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
             self.atlas.go_on_in(saved_map, self.camera, max_blocks)
-            self.monitor.restore(saved_map.registrations)
+            self.monitor.go_on_from(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
     @property
@@ -395,5 +424,10 @@ class Slam(SlamResults):
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.device)
         return make_volume(
-            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
+            self.camera,
+            config.volume,
+            config.sensor,
+            config.preprocess.depth_max,
+            backend,
+            self.arguments.max_blocks,
         )

@@ -3,7 +3,7 @@
 Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
 comparison of vertices would weight a mesh by its triangle density.
 
-A mesh without faces or with NaN is a ``MapError``, a distance or a number of samples
+A mesh without faces (unless point clouds are accepted) or with NaN is a ``MapError``, a distance or a number of samples
 that is not positive a ``ConfigError``.
 """
 
@@ -56,10 +56,10 @@ class SurfaceResult:
         accuracy: Distances from the estimate to the reference.
         completeness: Distances from the reference to the estimate.
         scores: Precision, recall and F-score per distance.
-        area_m2: Area of the estimate.
-        reference_area_m2: Area of the surface on which completeness is measured.
+        area_m2: Area of the estimate; None for a point cloud.
+        reference_area_m2: Area of the surface on which completeness is measured; None for a point cloud.
         ghost_distance: Distance from the reference above which the estimate counts as ghost, metres.
-        ghost_area_m2: Area of the ghosts.
+        ghost_area_m2: Area of the ghosts; None for a point cloud.
         ghost_share: Share of the ghosts in the area of the estimate.
         missing_share: Share of the reference farther than the ghost distance from the estimate.
         histogram_edges: (B + 1,) metres; the last bin also counts everything beyond.
@@ -71,10 +71,10 @@ class SurfaceResult:
     accuracy: Statistics
     completeness: Statistics
     scores: tuple[ThresholdScore, ...]
-    area_m2: float
-    reference_area_m2: float
+    area_m2: float | None
+    reference_area_m2: float | None
     ghost_distance: float
-    ghost_area_m2: float
+    ghost_area_m2: float | None
     ghost_share: float
     missing_share: float
     histogram_edges: NDArray[np.float64]
@@ -82,9 +82,9 @@ class SurfaceResult:
     completeness_histogram: NDArray[np.float64]
     num_samples: int
 
-    def figures(self) -> dict[str, float | int]:
+    def figures(self) -> dict[str, float | int | None]:
         """All numbers by name and unit, for tables and JSON."""
-        out: dict[str, float | int] = {}
+        out: dict[str, float | int | None] = {}
         for name, statistics in (("accuracy", self.accuracy), ("completeness", self.completeness)):
             for key in ("mean", "median", "rmse", "p95", "max"):
                 out[f"{name}_{key}_m"] = round(getattr(statistics, key), 6)
@@ -93,7 +93,8 @@ class SurfaceResult:
                 out[f"{key}_{1000 * score.distance:g}mm"] = round(getattr(score, key), 5)
         out["ghost_distance_m"] = round(self.ghost_distance, 5)
         for key in ("ghost_area_m2", "ghost_share", "missing_share", "area_m2", "reference_area_m2"):
-            out[key] = round(getattr(self, key), 5)
+            value = getattr(self, key)
+            out[key] = None if value is None else round(value, 5)
         return out | {"num_samples": self.num_samples}
 
 
@@ -105,6 +106,7 @@ def compare_surfaces(
     thresholds: Iterable[float] = THRESHOLDS,
     ghost_distance: float = GHOST_DISTANCE,
     samples: int = SAMPLES,
+    points: bool = False,
 ) -> SurfaceResult:
     """Accuracy, completeness, F-scores and ghosts of an estimated surface.
 
@@ -115,15 +117,16 @@ def compare_surfaces(
         thresholds: Distances in metres for precision, recall and F-score.
         ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
         samples: Number of points sampled on each surface.
+        points: Accept point clouds, whose points serve as samples and which have no area.
     """
     thresholds = tuple(thresholds)
     _check_positive("samples", samples)
     _check_positive("the ghost distance", ghost_distance)
     for threshold in thresholds:
         _check_positive("a threshold", threshold)
-    truth = _surface(reference, "the reference")
-    found = Surface(estimate, "the estimate")
-    part = truth if observed is None else _surface(observed, "the observed part of the reference")
+    truth = _surface(reference, "the reference", points)
+    found = Surface(estimate, "the estimate", points=points)
+    part = truth if observed is None else _surface(observed, "the observed part of the reference", points)
     to_truth = truth.distances(found.samples(samples, 0))
     to_found = found.distances(part.samples(samples, 1))
     ghost_share = float(np.mean(to_truth > ghost_distance))
@@ -135,7 +138,7 @@ def compare_surfaces(
         area_m2=found.area,
         reference_area_m2=part.area,
         ghost_distance=ghost_distance,
-        ghost_area_m2=ghost_share * found.area,
+        ghost_area_m2=None if found.area is None else ghost_share * found.area,
         ghost_share=ghost_share,
         missing_share=float(np.mean(to_found > ghost_distance)),
         histogram_edges=edges,
@@ -150,15 +153,15 @@ def _check_positive(name: str, value: float) -> None:
         raise ConfigError(f"{name} is {value}; expected a positive number")
 
 
-def _surface(mesh: Mesh | Surface, name: str) -> Surface:
+def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
     """Surface of a mesh; a given ``Surface`` is returned unchanged, so that its search tree is built once."""
-    return mesh if isinstance(mesh, Surface) else Surface(mesh, name)
+    return mesh if isinstance(mesh, Surface) else Surface(mesh, name, points=points)
 
 
-def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE) -> Mesh:
+def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
     """The estimate, each vertex coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
     _check_positive("the distance at the end of the colour scale", largest)
-    distances = Surface(reference, "the reference").distances(estimate.vertices)
+    distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)
     return Mesh(estimate.vertices, estimate.faces, distance_colors(distances, largest), estimate.normals)
 
 

@@ -50,8 +50,8 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         registered = Calibration.registered(camera)
         system = Slam(camera, Config().override(small), calibration=replace(registered, delay=0.01))
         process(system)
-        static = np.zeros(camera.shape, bool)
-        first, second = (keyframe(slam.preprocess(frames[n]), camera, poses[n], np.zeros(6), static) for n in (0, -1))
+        static, still = np.zeros(camera.shape, bool), np.zeros(6)
+        first, second = (keyframe(slam.preprocess(frames[n]), registered, poses[n], still, static) for n in (0, -1))
         pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, Config().sensor)
         adjustment.with_poses(pairs, Fit.tracked(pairs, registered), adjustment.levels)
 

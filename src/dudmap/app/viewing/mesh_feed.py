@@ -82,3 +82,13 @@ class MeshFeed:
             return MeshChanges({key: self._mesh.chunks.get(key) for key in changed}, reset)
         finally:
             self._free.set()
+
+    def changes(self, volume: "TsdfVolume", *, now: bool = False) -> MeshChanges:
+        """``offer`` and ``take`` in one thread, both at the expense of the budget."""
+        start = time.perf_counter()
+        self.offer(volume, now=now)
+        if not self.has_copy:
+            return MeshChanges()
+        out = self.take()
+        self._cost = 1000 * (time.perf_counter() - start)
+        return out

@@ -5,11 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.median import median
 from dudmap.core.frames.color_registration import recorded_intensity
 from dudmap.core.frames.observation import Observation
 from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.state import Remembered, Stateful
 
 GEOMETRY_WIDTH = 160
 """Width of the depth images that are compared, pixels."""
@@ -25,12 +28,14 @@ BAND = 1.0, 4.0
 """Standard deviations of the Gaussians whose difference filters the intensities, pixels. Vignetting, shading and
 exposure change slowly over the image and stay with the camera, which would look like a displacement of the colours;
 noise and detail of single pixels differ from view to view and spoil the derivatives."""
+BESIDE = 2
+"""Pixels beside what moves that are taken for it, since its outline is known no better."""
 INTERVAL = 0.1
 """Time between two keyframes at the start, seconds."""
 MAX_KEYFRAMES = 60
 """Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
-MAX_GAP = 0.2
-"""Largest time between the two neighbours of a keyframe for its velocity to be known, seconds."""
+MAX_GAP = 0.45
+"""Largest time between the neighbours of a keyframe for its velocity to be known, seconds: two intervals at 5 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,8 @@ class ColorKeyframe:
         depth: (h, w) float32, metres, 0 where there is no reading or something moves.
         points: (n, 3) float32 in the camera frame, away from depth edges.
         tangents: (n, 6) float32, two directions of the surface at each point.
-        intensities: (h, w) float32 of the colour image as recorded, filtered with ``BAND``, coarse to fine.
+        intensities: (h, w) float32 of the colour image as recorded, filtered with ``BAND``, coarse to fine; NaN where
+            something moves.
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
     """
@@ -72,26 +78,29 @@ def color_levels(camera: Camera) -> list[int]:
 
 def keyframe(
     observation: Observation,
-    color_camera: Camera,
+    given: Calibration,
     T_world_camera: NDArray[np.float64],
     velocity: NDArray[np.float64],
-    dynamic_mask: NDArray[np.bool_] | None,
+    dynamic_mask: NDArray[np.bool_],
 ) -> ColorKeyframe:
     """Keyframe of a preprocessed frame at a pose (4, 4) with a velocity (6,), twist per second in camera axes, without
-    the pixels (H, W) that move; ``color_camera`` is that of the colour images as recorded."""
+    the pixels (H, W) that move, in either image; ``given`` is the calibration of the colour images as recorded."""
     import cv2
 
     level = halvings_to(GEOMETRY_WIDTH, observation.camera)
     camera = observation.camera.scaled(level)
     depth, _ = halved(observation, level)
-    if dynamic_mask is not None and dynamic_mask.any():
-        moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
-        depth = np.where(moving, np.float32(0), depth)
-    intensities = []
-    for number in color_levels(color_camera):
-        image = recorded_intensity(observation, number)
-        fine, coarse = (np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32) for sigma in BAND)
-        intensities.append(fine - coarse)
+    moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+    readings = depth[moving & (depth > 0)]
+    distance = float(median(readings)) if len(readings) else 1.0
+    depth = np.where(moving, np.float32(0), depth)
+    intensities = [
+        _filtered(
+            recorded_intensity(observation, number),
+            _seen_moving(moving, distance, camera, given.camera.scaled(number), given.T_color_depth),
+        )
+        for number in color_levels(given.camera)
+    ]
     smooth = _off_edges(depth)[::POINT_STRIDE, ::POINT_STRIDE]
     points = camera.backproject(depth)
     tangents = np.zeros((*depth.shape, 6), np.float32)
@@ -102,6 +111,31 @@ def keyframe(
         observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, T_world_camera,
         velocity,
     )  # fmt: skip
+
+
+def _seen_moving(
+    moving: NDArray[np.bool_], distance: float, camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Pixels (h, w) of a colour image beside which, or where, it shows the ``moving`` pixels of the depth image, which
+    are ``distance`` metres away."""
+    import cv2
+
+    plane = T_color_depth[:3, :3] + np.outer(T_color_depth[:3, 3], (0, 0, 1 / distance))
+    homography = color_camera.K @ plane @ np.linalg.inv(camera.K)
+    seen = cv2.warpPerspective(moving.astype(np.uint8), homography, color_camera.shape[::-1])
+    return cv2.dilate(seen, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
+
+
+def _filtered(image: NDArray[np.float32], moving: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Intensities (h, w) filtered with ``BAND``, into which nothing of the ``moving`` pixels enters, which are NaN."""
+    import cv2
+
+    still = (~moving).astype(np.float32)
+    shares = [np.maximum(cv2.GaussianBlur(still, (0, 0), sigma), np.float32(1e-3)) for sigma in BAND]
+    fine, coarse = (
+        cv2.GaussianBlur(image * still, (0, 0), sigma) / share for sigma, share in zip(BAND, shares, strict=True)
+    )
+    return np.where(moving, np.float32(np.nan), fine - coarse)
 
 
 def _off_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -122,17 +156,21 @@ def central_velocity(
     return se3.log(se3.inverse(before[1]) @ after[1]) / max(after[0] - before[0], 1e-3)
 
 
-class KeyframeCollector:
-    """Collects ``keyframes``, in the order of time, evenly over the time since tracking began. ``max_gap`` is the
-    largest time between the two neighbours of a keyframe, seconds, if less than ``MAX_GAP``."""
+class KeyframeCollector(Stateful):
+    """Collects ``keyframes``, in the order of time, evenly over the time since tracking began; ``given`` is the
+    calibration of the colour images. ``max_gap`` is the largest time between the two neighbours of a keyframe, seconds,
+    if less than ``MAX_GAP``."""
 
-    def __init__(self, color_camera: Camera, max_gap: float = MAX_GAP) -> None:
-        self.color_camera = color_camera
+    keyframes: Remembered[list[ColorKeyframe]]
+    _interval: Remembered[float]
+    _before: Remembered[tuple[float, NDArray[np.float64]] | None] = None
+    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None] = None
+
+    def __init__(self, given: Calibration, max_gap: float = MAX_GAP) -> None:
+        self.given = given
         self.max_gap = min(max_gap, MAX_GAP)
-        self.keyframes: list[ColorKeyframe] = []
+        self.keyframes = []
         self._interval = INTERVAL
-        self._before: tuple[float, NDArray[np.float64]] | None = None
-        self._pending: tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None = None
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
@@ -145,7 +183,7 @@ class KeyframeCollector:
             before = self._before
             if before is not None and now - before[0] <= self.max_gap and self._is_due(middle.timestamp):
                 velocity = central_velocity(before, (now, T_world_camera))
-                self.keyframes.append(keyframe(middle, self.color_camera, T, velocity, mask))
+                self.keyframes.append(keyframe(middle, self.given, T, velocity, mask))
                 if len(self.keyframes) > MAX_KEYFRAMES:
                     del self.keyframes[1::2]
                     self._interval *= 2

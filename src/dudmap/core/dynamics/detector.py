@@ -29,6 +29,7 @@ from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_leng
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level, exposed
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
 """Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
@@ -84,7 +85,7 @@ class _Comparison:
         return self.sample.occupancy == FREE
 
 
-class DynamicDetector:
+class DynamicDetector(Stateful):
     """Labels the pixels of registered frames as static or dynamic.
 
     Args:
@@ -95,6 +96,9 @@ class DynamicDetector:
         memory: Remembered frames.
         background: The static background behind pixels without a reading.
     """
+
+    memory: Remembered[TemporalMemory]
+    background: Remembered[BackgroundModel]
 
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config

@@ -1,7 +1,7 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,6 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
@@ -75,8 +74,6 @@ class TsdfVolume(PagedMap):
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
-
-    levels: Sequence[FineBlocks] = ()
 
     def __init__(
         self,

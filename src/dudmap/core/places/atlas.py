@@ -23,6 +23,7 @@ from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.places.saved_map import PriorMap, SavedMap
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
 
@@ -40,7 +41,7 @@ class TimedPose:
     repeats: Repeats = ""
 
 
-class Atlas:
+class Atlas(Stateful):
     """The submaps and everything whose pose changes when a submap is corrected or joined with another.
 
     Attributes:
@@ -54,6 +55,15 @@ class Atlas:
             submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
     """
 
+    history: Remembered[FrameStore | None]
+    keyframes: Remembered[KeyframeDatabase]
+    volumes: Remembered[dict[int, TsdfVolume]]
+    rebuildings: Remembered[dict[int, MapRebuilding]]
+    repainting: Remembered[MapRebuilding | None] = None
+    current: Remembered[int]
+    poses: Remembered[list[TimedPose]]
+    saved: Remembered[int | None] = None
+
     def __init__(
         self,
         make_volume: Callable[[], TsdfVolume],
@@ -65,11 +75,9 @@ class Atlas:
         self.keyframes = keyframes
         self.history = history
         self.volumes = {number: make_volume()}
-        self.rebuildings: dict[int, MapRebuilding] = {}
-        self.repainting: MapRebuilding | None = None
+        self.rebuildings = {}
         self.current = number
-        self.poses: list[TimedPose] = []
-        self.saved: int | None = None
+        self.poses = []
 
     @classmethod
     def of(
@@ -132,7 +140,7 @@ class Atlas:
         for number in self.volumes:
             if number == self.saved:
                 continue
-            self.repainting = MapRebuilding(self.history, number, self.make_volume(), [], [])
+            self.repainting = MapRebuilding.of(self.history, number, self.make_volume())
             if not (gradually and number == self.current):
                 self._complete_repainting()
         self.switch_to(self.current)
@@ -288,7 +296,7 @@ class Atlas:
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
-            self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
+            self.rebuildings[self.current] = MapRebuilding.of(self.history, self.current, new, shown=fused)
         return corrections[-1]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
@@ -336,7 +344,7 @@ class Atlas:
             volume = self.make_volume()
             volume.take_over(self.volumes[target])
             volume.page_out()
-            running = MapRebuilding(self.history, target, volume, fused_nodes, [])
+            running = MapRebuilding.of(self.history, target, volume, fused_nodes)
         provisional = self.make_volume()
         nodes = np.array(self.kept_nodes(target))
         Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])

@@ -10,6 +10,7 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.map_rebuilding import AT_ONCE, nearest_views, view_distances
 from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.pose_graph import Edge, optimize
+from dudmap.core.state import Remembered, Stateful
 
 TRUNCATED_DISTANCE = 0.05
 """Distances to the map are truncated at this value in that comparison, metres."""
@@ -27,15 +28,17 @@ by 2 cm and 1 degree or by 5 cm gave more than 2 times.
 """
 
 
-class LoopCorrector:
+class LoopCorrector(Stateful):
     """Distributes the drift measured by loop closures over the stored frames of the current submap.
 
     ``edges`` are the motions measured by the loop closures so far, between numbers of stored frames.
     """
 
+    edges: Remembered[list[Edge]]
+
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
-        self.edges: list[Edge] = []
+        self.edges = []
 
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]

@@ -14,6 +14,7 @@ from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.tracker import TrackingResult
@@ -31,7 +32,7 @@ class Relocalization:
     submap: int
 
 
-class Relocalizer:
+class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
     A lost frame is compared with all keyframes of the atlas. Each candidate pose is verified by registering the frame
@@ -40,14 +41,17 @@ class Relocalizer:
 
     """
 
+    _lost_since: Remembered[float | None] = None
+    _crowded: Remembered[bool] = False  # most of the view moved in the last tracked frame
+    _recent: Remembered[deque[FrameView]]
+    _place_unknown: Remembered[bool] = False
+    _counted: Remembered[tuple[float, int]]
+
     def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
         self.config = config
         self.atlas = atlas
         self.prior_map = prior_map
-        self._lost_since: float | None = None
-        self._crowded = False  # most of the view moved in the last tracked frame
-        self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
-        self._place_unknown = False
+        self._recent = deque()  # lost frames: the last, those of LONGEST_BASELINE
         self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
 
     @property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.state import CACHE
 
 
 class StageTimer:
@@ -68,7 +69,7 @@ class FrameView:
     observation: Observation
     pyramid: Pyramid
     segmentation: Callable[[], Segmentation]
-    timer: StageTimer
+    timer: StageTimer = field(default_factory=StageTimer, metadata=CACHE)
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False
     color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))

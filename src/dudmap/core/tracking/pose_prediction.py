@@ -13,6 +13,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.motion_model import MotionModel
@@ -42,7 +43,7 @@ class PosePrediction:
     unverified_mask: NDArray[np.bool_] | None = None
 
 
-class PosePredictor:
+class PosePredictor(Stateful):
     """Predicts by constant velocity, and by ego-motion while the map is young or most of the view is dynamic.
 
     Args:
@@ -56,6 +57,11 @@ class PosePredictor:
             been seen to rest in between may move as well, and is neither registered nor fused.
     """
 
+    ego_motion: Remembered[EgoMotionSegmenter]
+    slow_crowd: Remembered[bool] = False
+    _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
+    _crowded_start: Remembered[bool] = False  # most of the view has moved in every frame so far
+
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
     ) -> None:
@@ -63,9 +69,6 @@ class PosePredictor:
         self.tracker = tracker
         self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
         self._known_poses = known_poses
-        self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
-        self.slow_crowd = False
-        self._crowded_start = False  # most of the view has moved in every frame so far
 
     def start(self, view: FrameView) -> None:
         """A map has been made of this frame."""

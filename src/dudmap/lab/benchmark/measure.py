@@ -143,7 +143,7 @@ def score_mesh(
     return {
         "mesh_accuracy_m": round(result.accuracy.mean, 6),
         "mesh_completeness": round(result.scores[0].recall, 5),
-        "ghost_area_m2": round(result.ghost_area_m2, 5),
+        "ghost_area_m2": None if result.ghost_area_m2 is None else round(result.ghost_area_m2, 5),
         "ghost_share": round(result.ghost_share, 5),
     }
 

@@ -1,14 +1,18 @@
-"""Camera paths. One that is unknown, or has nothing to follow, is a ``ConfigError``."""
+"""Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion.
+
+A path that is unknown, or does not fit the scene, is a ``ConfigError``.
+"""
 
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
-from dudmap.errors import ConfigError
-from dudmap.lab.data import find
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.synthetic.movers import SyntheticMover
 from dudmap.lab.synthetic.scene import Scene, look_at
 
@@ -141,11 +145,54 @@ PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {
 FOLLOW = "follow"
 
 
-def camera_poses(path: str, scene: Scene, times: Array, seed: int, movers: list[SyntheticMover]) -> Array:
-    """Poses Ts_world_camera (N, 4, 4) of a path at ``times`` (N,), which start at 0."""
+def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers: list[SyntheticMover]) -> Array:
+    """Poses Ts_world_camera (N, 4, 4) of a built-in path or a trajectory file at ``times`` (N,), which start at 0."""
     rng = np.random.default_rng([seed, 2])
-    if path == FOLLOW:
+    if str(path) == FOLLOW:
         if not movers:
             raise ConfigError("camera path 'follow' needs a mover to follow; name one")
         return follow(scene, rng, times, movers[0])
-    return find(path, PATHS, "camera path")(scene, rng, times)
+    if str(path) in PATHS:
+        return PATHS[str(path)](scene, rng, times)
+    if not Path(path).is_file():
+        known = ", ".join([*PATHS, FOLLOW])
+        raise ConfigError(f"camera path {str(path)!r} is neither a trajectory file nor one of {known}")
+    return placed(Trajectory.load(path), scene, times, str(path))
+
+
+def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Array:
+    """Recorded trajectory, resampled at ``times`` and placed in the scene by a rigid motion.
+
+    The mean orientation becomes that of the home pose. The centre of the positions is placed as close to the home
+    position as possible, such that all positions are in the free space of the scene and clear of its solids.
+    """
+    start, end = trajectory.timestamps[0], trajectory.timestamps[-1]
+    if times[-1] > end - start + 1e-6:
+        raise ConfigError(
+            f"{name} lasts {end - start:.2f} s, but the frames need {times[-1]:.2f} s; ask for fewer frames"
+        )
+    try:
+        Ts = np.stack([trajectory.interpolate(min(start + t, end)) for t in times])
+    except DatasetError as error:
+        raise ConfigError(f"{name}: {error}") from None
+    mean = np.eye(4)
+    mean[:3, :3] = se3.nearest_rotation(Ts[:, :3, :3].mean(axis=0))
+    mean[:3, 3] = (Ts[:, :3, 3].min(axis=0) + Ts[:, :3, 3].max(axis=0)) / 2
+    Ts = scene.home @ se3.inverse(mean) @ Ts
+    low, high = (np.asarray(corner) for corner in scene.space)
+    first, last = Ts[:, :3, 3].min(axis=0), Ts[:, :3, 3].max(axis=0)
+    size = last - first
+    margin = 0.25 * min(scene.mover_scale, 1.0)
+    if np.all(size <= high - low):
+        nearest = np.clip(0.0, low - first, high - last)  # smallest shift into the free space
+        steps = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3), axis=-1).reshape(-1, 3)
+        shifts = np.clip(nearest + steps * (high - low) / 2, low - first, high - last)
+        for shift in shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]:
+            if scene.clearance(Ts[::5, :3, 3] + shift).min() >= margin:
+                Ts[:, :3, 3] += shift
+                return Ts
+    spans, space = (" x ".join(f"{x:.2f}" for x in numbers) for numbers in (size, high - low))
+    raise ConfigError(
+        f"{name} spans {spans} m over these frames, but scene {scene.name!r} has only {space} m of free space; "
+        "take a larger scene or fewer frames"
+    )

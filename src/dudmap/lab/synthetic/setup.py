@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def cover(
 def sequence(
     scene: str = "room",
     movers: Sequence[str] | None = None,
-    camera_path: str | None = None,
+    camera_path: str | Path | None = None,
     frames: int = 120,
     fps: float = 30.0,
     noise: str | None = None,
@@ -109,7 +110,8 @@ def sequence(
     Args:
         scene: Name of a scene (``names()["scenes"]``).
         movers: Names of the movers, () for none; None for one person, or those of the situation.
-        camera_path: Name of a path (``names()["camera_paths"]``); None for hand-held, or that of the situation.
+        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or that of the
+            situation.
         frames: Number of frames.
         fps: Frames per second.
         noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or that of the sensor.
@@ -172,7 +174,7 @@ def sequence(
     covered, elsewhere = ([[share * float(times[-1]) for share in span] for span in spans]
                           for spans in (special.covered, special.elsewhere))  # fmt: skip
     parameters: dict[str, object] = {
-        "scene": scene, "movers": list(names), "camera_path": path, "frames": frames, "fps": fps,
+        "scene": scene, "movers": list(names), "camera_path": str(path), "frames": frames, "fps": fps,
         "sensor_name": sensor, "noise": noise, "speed": speed, "coverage": coverage, "start_dynamic": at_once,
         "situation": situation, "covered_s": covered, "elsewhere_s": elsewhere, "seed": seed,
         "motion_blur": motion_blur, "exposure_change": exposure_change,

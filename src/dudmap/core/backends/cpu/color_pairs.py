@@ -64,7 +64,7 @@ def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, 
         D: (2, 16) float32 out, derivatives of the pixel u, v by the parameters and by the point.
 
     Returns:
-        Intensity, NaN outside the image or at its border; its derivatives along u and v.
+        Intensity, NaN outside the image, at its border or where ``image`` is; its derivatives along u and v.
     """
     h, w = image.shape
     p = elements(place)
@@ -224,7 +224,9 @@ def linearize_pair(
         after, gu, gv = _color(
             second, place, second_twist, intrinsics, lens, scale, second_offset, readout, x, y, z, two
         )
-        if not (np.isfinite(before) & np.isfinite(after)):
+        slopes = fu + fv + gu + gv
+        # NaN beside what moves; of sums, the compiler may take isfinite() apart
+        if not (np.isfinite(before) & np.isfinite(after) & (slopes == slopes)):
             continue
         p0, p1, p2, p3 = _across_surface(one, tangents[n], unturned)
         q0, q1, q2, q3 = _across_surface(two, tangents[n], t)
