@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 MARGIN = 6 / 640
 """Width by which masks grow, as a share of the image's: blur, mixed pixels and the disparity window of the sensor."""
 REACH = 24 / 640
-"""Pixels so near a mask that lie in front of the map belong to it: in a finished map only what moved is in front."""
+"""Largest distance from a mask, as a share of the width, of pixels in front of the map that are added to it: in front of
+a finished map lies only what moved."""
 IN_FRONT = 0.04
 """A reading is in front of the map if it is nearer by this share: 2.5 standard deviations of a Kinect at 5 m
 (0.0012 m + 0.0019 (z - 0.4)^2)."""
@@ -150,7 +151,7 @@ class Cleaner:
 
 
 def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
-    """Mask (H, W) grown by about so many pixels, at least one."""
+    """Mask (H, W) dilated by a disk with a radius of ``width`` pixels, at least one."""
     import cv2
 
     radius = max(1, round(width))

@@ -13,8 +13,8 @@ from dudmap.lab.benchmark.measure import Row, grid
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 
 KERNELS_EVERY = 4
-"""Every so many frames the kernels are measured, and in the others the frames and their stages: events around each
-kernel take time."""
+"""In every fourth frame the kernels are measured, in the others the frame and its stages: events around each kernel
+take time."""
 
 
 def measure_devices(

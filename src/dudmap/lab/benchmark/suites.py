@@ -78,7 +78,7 @@ def local_entries(data: Path) -> list[Entry]:
 
 
 class Excerpt:
-    """The first frames of a recording, all without a number, each of which is read or rendered once."""
+    """The first ``frames`` frames of a recording (None: all), each of which is read or rendered once."""
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
