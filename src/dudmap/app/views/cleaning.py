@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 MARGIN = 6 / 640
 """Width by which masks grow, as a share of the image's: blur, mixed pixels and the disparity window of the sensor."""
 REACH = 24 / 640
-"""Largest distance from a mask, as a share of the width, of pixels in front of the map that are added to it: in front of
-a finished map lies only what moved."""
+"""Largest distance from a mask, as a share of the width, of pixels in front of the map that are added to it: only what
+moved lies in front of a finished map."""
 IN_FRONT = 0.04
 """A reading is in front of the map if it is nearer by this share: 2.5 standard deviations of a Kinect at 5 m
 (0.0012 m + 0.0019 (z - 0.4)^2)."""
