@@ -135,7 +135,7 @@ def consistent_with_static(
     pixels: NDArray[np.int64],
     expected: NDArray[np.float64],
     allowed: NDArray[np.float64],
-    difference: NDArray[np.float64],
+    difference: NDArray[np.floating],
 ) -> NDArray[np.bool_]:
     """Whether corners (n,) that were found elsewhere match as well at the position of a static point.
 
