@@ -34,8 +34,8 @@ INTERVAL = 0.1
 """Time between two keyframes at the start, seconds."""
 MAX_KEYFRAMES = 60
 """Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
-MAX_GAP = 0.2
-"""Largest time between the two neighbours of a keyframe for its velocity to be known, seconds."""
+MAX_GAP = 0.45
+"""Largest time between the neighbours of a keyframe for its velocity to be known, seconds: two intervals at 5 Hz."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -266,8 +266,7 @@ def _still(
         if unmarked and frame.dynamic.any():
             marked = chosen & _seen_marked(found, n)
             still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
-        if not stand_still(segments, chosen, found.gap[n], found.difference[n], still):
-            return np.zeros(chosen.shape, bool)
+    stand_still(segments, chosen, found.gap, found.difference, still)
     return chosen & still[labels]
 
 

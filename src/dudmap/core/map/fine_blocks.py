@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.adaptive_raycasting import FinerLevels
+from dudmap.core.backends.cpu.octree_field import FinerLevels
 from dudmap.core.backends.mirror import grown
 from dudmap.core.backends.parameters import VoxelGrid
 from dudmap.core.map.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks

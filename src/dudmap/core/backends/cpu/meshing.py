@@ -287,14 +287,19 @@ def extract_chunks(
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
+    covered: NDArray[np.bool_] | None = None,
 ) -> list[Mesh]:
-    """Meshes of groups of blocks; see ``TsdfVolume.extract_chunks``, and ``extract`` for the other arguments."""
+    """Meshes of groups of blocks; see ``TsdfVolume.extract_chunks``, and ``extract`` for the other arguments.
+
+    ``covered`` (n, 8) are the octants, number 4 dx + 2 dy + dz, whose cells are left out; None = none.
+    """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
     vertices, faces, vertex_colors, normals, first_face = _extract(
-        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
-    )
+        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum()),
+        None if covered is None else covered[order],
+    )  # fmt: skip
     begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
     first = np.empty(num_chunks + 1, dtype=np.int64)
@@ -317,6 +322,7 @@ def _extract(
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     num_meshed: int,
+    covered: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
     """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
     face (n + 1,) of each block."""
@@ -331,6 +337,10 @@ def _extract(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
+    if covered is not None:
+        cells = covered[:num_meshed].reshape(-1, 2, 2, 2).repeat(4, axis=1).repeat(4, axis=2).repeat(4, axis=3)
+        cases[:num_meshed][cells.reshape(-1, 512)] = 0
+        triangles = [TRIANGLE_COUNT[cases[:num_meshed]].sum(axis=1, dtype=np.int64)]
     owned = np.zeros(n, dtype=np.int64)
     _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags, owned)
     first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
