@@ -5,7 +5,7 @@ other measures, and a material of the scene or of the furniture. A row with ``re
 several, each with one of these numbers in place of every "*".
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -105,9 +105,9 @@ SCENES = tables("synthetic/scenes.toml")
 """Rows of the scenes by name."""
 
 
-def build_scene(name: str, scenes: Mapping[str, Any] = SCENES) -> Scene:
-    """Scene of a name from rows of scenes."""
-    row = dict(find(name, scenes, "scene"))
+def build_scene(name: str) -> Scene:
+    """Scene of a name."""
+    row = dict(find(name, SCENES, "scene"))
     if "painted" in row:
         scene = build_scene(row["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]
