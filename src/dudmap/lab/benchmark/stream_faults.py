@@ -72,12 +72,12 @@ class FaultRun:
         return "skipped and counted" if self.rejected else "handled"
 
 
-def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
-    """A synthetic scene with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+def default_room(frames: int, width: int, seed: int) -> Sequence:
+    """A synthetic room with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
 
     camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
-    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera)
+    return synthetic.sequence(frames=frames, seed=seed, camera=camera)
 
 
 def measure_stream_faults(
