@@ -15,12 +15,18 @@ from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
-from dudmap.core.frames.optical_flow import consistent_with_static, lengths, track_forward_backward
+from dudmap.core.frames.optical_flow import (
+    FLOW_WIDTH,
+    RETURN_PX,
+    WINDOW,
+    consistent_with_static,
+    lengths,
+    scaled_window,
+    track_forward_backward,
+)
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry.camera import Camera
 
-REFERENCE_WIDTH = 320
-"""Image width that distances in pixels are given for; they grow in proportion to the width of an image."""
 NOISE_PX = 0.7
 """Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
@@ -84,8 +90,8 @@ def rigid_motion(
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
-    """Distance in pixels of an image, given that in an image of REFERENCE_WIDTH with the same view."""
-    return distance * camera.width / REFERENCE_WIDTH
+    """Distance in pixels of an image, given that in an image of FLOW_WIDTH with the same view."""
+    return distance * camera.width / FLOW_WIDTH
 
 
 @lru_cache(maxsize=8)
@@ -228,7 +234,9 @@ def dominant_motion(
     T_expected = np.eye(4) if T_expected is None else T_expected
     points = before.corner_points
     expected = reproject(T_expected, points, camera)
-    pixels, targets, difference, found = track_forward_backward(first, second, before.corners, expected)
+    window, limit = scaled_window(WINDOW, camera.width), pixels_at_width(RETURN_PX, camera)
+    found_at, differences, found = track_forward_backward(first, second, before.corners, expected, window, 3, limit)
+    pixels, targets, difference = before.corners[found], found_at[found].astype(np.float64), differences[found]
     points, labelled = points[found], _pixels_of_level(pixels, fine, before.labelled)
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:

@@ -51,16 +51,14 @@ class BlockPager(Stateful):
     last time it was tried (empty if it could): the regions then stay in memory, and nothing is lost.
     """
 
-    failure: Remembered[str]
-    _next_serial: Remembered[int]
+    failure: Remembered[str] = ""
+    _next_serial: Remembered[int] = 0
     _away: Remembered[dict[Region, Away]]
     _retry_in: Remembered[int]
 
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
-        self.failure = ""
         self._store: ScratchStore | None = None
-        self._next_serial = 0
         self.clear()
 
     def clear(self) -> None:
