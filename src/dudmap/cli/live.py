@@ -18,7 +18,7 @@ def live(
     camera: Annotated[
         str | None,
         Argument(
-            help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
+            help="realsense, oak, orbbec, iphone, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="CAMERA",
             autocompletion=o.camera_names,

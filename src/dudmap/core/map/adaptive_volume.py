@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import raycasting
 from dudmap.core.backends.parameters import (
+    BlockVisit,
     DepthView,
     FusionParameters,
-    MeshParameters,
     RaycastParameters,
     RaycastResult,
     TouchedBlocks,
@@ -113,7 +113,7 @@ class AdaptiveVolume(TsdfVolume):
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied, _ = self.backend.fuse(
-            grid, view, touched, candidates, blocks.fused, turn, count, None, self._parameters_of(n + 1)
+            grid, view, touched, BlockVisit(candidates, blocks.fused, turn, count, None), self._parameters_of(n + 1)
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
@@ -158,10 +158,6 @@ class AdaptiveVolume(TsdfVolume):
         return raycasting.raycast(
             self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, two_levels(self.levels)
         )
-
-    def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
-        """See ``TsdfVolume._extract``."""
-        return level_meshes(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)[0]
 
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None

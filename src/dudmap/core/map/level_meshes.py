@@ -14,9 +14,9 @@ from dudmap.core.backends.cpu import meshing
 from dudmap.core.backends.parameters import MeshParameters
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map import morton
-from dudmap.core.map.fine_blocks import NEIGHBOURHOOD, OCTANTS, FineBlocks
+from dudmap.core.map.fine_blocks import OCTANTS, FineBlocks
 from dudmap.core.map.refinement import prolonged
-from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
+from dudmap.core.map.voxel_blocks import BLOCK, NEIGHBOURHOOD, BlockRecords, VoxelBlocks
 
 SHAPE = (-1, BLOCK, BLOCK, BLOCK)
 
@@ -56,8 +56,8 @@ def level_meshes(
         )
         every = np.arange(current.num_slots, dtype=np.int32)
         meshes = meshing.extract_chunks(
-            current.geometry, current.colors, every, current.slot_coords, current.neighbours(every), of_level, groups,
-            covered,
+            current.geometry, current.colors, every, current.slot_coords, current.neighbourhood(every), of_level,
+            groups, covered,
         )  # fmt: skip
         for part, mesh in zip(parts, meshes, strict=False):
             part.append(mesh)

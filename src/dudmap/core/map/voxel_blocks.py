@@ -18,6 +18,8 @@ COORDINATE_BITS = 18
 """Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
+"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
 LARGEST_TABLE = 2**26
@@ -309,13 +311,10 @@ class VoxelBlocks(Stateful):
         entries = hashing.find_all(self.table, self.coords, coords)
         return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
 
-    def neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
-        out = np.empty((len(slots), 8), dtype=np.int32)
-        for column in range(8):
-            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            out[:, column] = self.slots_at(self.slot_coords[slots] + offset)
-        return out
+    def neighbourhood(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+        coords = self.slot_coords[slots][:, None] + NEIGHBOURHOOD
+        return self.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
     @classmethod
     def restored(

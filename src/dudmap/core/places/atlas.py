@@ -296,7 +296,7 @@ class Atlas(Stateful):
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
-            self.rebuildings[self.current] = MapRebuilding.of(self.history, self.current, new, shown=fused)
+            self.rebuildings[self.current] = MapRebuilding.of(self.history, self.current, new, fused)
         return corrections[-1]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
@@ -317,7 +317,7 @@ class Atlas(Stateful):
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
         self._complete_repainting()
-        moved_nodes, fused_nodes = self.kept_nodes(source), self.nodes(target)
+        moved_nodes = self.kept_nodes(source)
         for moved in (*self.poses, *self.keyframes.keyframes):
             if moved.submap == source:
                 moved.T_world_camera = T_target_source @ moved.T_world_camera
@@ -332,23 +332,11 @@ class Atlas(Stateful):
             if target in self.rebuildings:
                 self.rebuildings[target].add_shown(moved_nodes)
         else:
-            self._fuse_gradually(target, fused_nodes)
+            nodes = np.array(self.kept_nodes(target))
+            Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
+            near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
+            provisional = self.make_volume()
+            self.history.reintegrate(provisional, near)
+            self.volumes[target].take_over(provisional)
+            self.rebuildings[target] = MapRebuilding.of(self.history, target, self.make_volume(), near)
         self.switch_to(target)
-
-    def _fuse_gradually(self, target: int, fused_nodes: list[int]) -> None:
-        """Add the stored frames of a submap that its map lacks over the frames to come; it holds ``fused_nodes``, or is
-        to hold them first."""
-        assert self.history is not None
-        running = self.rebuildings.pop(target, None)
-        if running is None:
-            volume = self.make_volume()
-            volume.take_over(self.volumes[target])
-            volume.page_out()
-            running = MapRebuilding.of(self.history, target, volume, fused_nodes)
-        provisional = self.make_volume()
-        nodes = np.array(self.kept_nodes(target))
-        Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
-        near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
-        self.history.reintegrate(provisional, near)
-        self.volumes[target].take_over(provisional)
-        self.rebuildings[target] = running.restarted(near)

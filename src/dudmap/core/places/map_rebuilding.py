@@ -52,11 +52,9 @@ class MapRebuilding:
     start: int
 
     @classmethod
-    def of(
-        cls, history: FrameStore, submap: int, volume: TsdfVolume, fused: Iterable[int] = (), shown: Iterable[int] = ()
-    ) -> "MapRebuilding":
-        """A rebuilding that begins now, with some frames in the new and in the provisional map."""
-        return cls(history, submap, volume, set(fused), set(shown), len(history))
+    def of(cls, history: FrameStore, submap: int, volume: TsdfVolume, shown: Iterable[int] = ()) -> "MapRebuilding":
+        """A rebuilding that begins now, with some frames in the provisional map."""
+        return cls(history, submap, volume, set(), set(shown), len(history))
 
     @property
     def missing(self) -> list[int]:
@@ -70,10 +68,6 @@ class MapRebuilding:
             self.history.reintegrate(self.volume, [n])
             self.fused.add(n)
         return count is None or len(missing) <= count
-
-    def restarted(self, shown: Sequence[int]) -> "MapRebuilding":
-        """The same with another provisional map, which holds the stored frames of these numbers."""
-        return MapRebuilding.of(self.history, self.submap, self.volume, self.fused, shown)
 
     def add_shown(self, numbers: Sequence[int]) -> None:
         """Note that the provisional map holds stored frames of these numbers, too."""

@@ -10,7 +10,13 @@ from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
-from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.core.backends.parameters import (
+    LevelImage,
+    NormalEquations,
+    RegistrationParameters,
+    SensorNoise,
+    TruncationBand,
+)
 from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level, chained, exposed
@@ -261,10 +267,8 @@ class Tracker:
         parameters: RegistrationParameters,
     ) -> Descent:
         """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
-        return volume.backend.register(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
-            parameters,
-        )  # fmt: skip
+        image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
+        return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
         """Rules of the steps of a level along all directions.
