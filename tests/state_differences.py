@@ -41,11 +41,8 @@ def _level(level):
 
 
 def _window(window):
-    return (
-        vars(window)
-        | window.state()
-        | {"mirror": None, "stamps": None, "cells": None if window.origin is None else window.cells}
-    )
+    cells = None if window.origin is None else window.cells
+    return vars(window) | window.state() | {"mirror": None, "stamps": None, "cells": cells}
 
 
 def _pager(pager):

@@ -16,6 +16,7 @@ from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.optical_flow import (
+    FLOW_WIDTH,
     RETURN_PX,
     WINDOW,
     consistent_with_static,
@@ -26,8 +27,6 @@ from dudmap.core.frames.optical_flow import (
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry.camera import Camera
 
-REFERENCE_WIDTH = 320
-"""Image width that distances in pixels are given for; they grow in proportion to the width of an image."""
 NOISE_PX = 0.7
 """Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
@@ -91,8 +90,8 @@ def rigid_motion(
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
-    """Distance in pixels of an image, given that in an image of REFERENCE_WIDTH with the same view."""
-    return distance * camera.width / REFERENCE_WIDTH
+    """Distance in pixels of an image, given that in an image of FLOW_WIDTH with the same view."""
+    return distance * camera.width / FLOW_WIDTH
 
 
 @lru_cache(maxsize=8)

@@ -19,7 +19,7 @@ RETURN_PX = 0.5
 """Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
 FEWEST = 128
 """Fewest pixels whose flow is worth another thread."""
-REFERENCE_WIDTH = 320
+FLOW_WIDTH = 320
 """Image width that these distances are given for; they grow in proportion to the width of an image."""
 
 
@@ -28,7 +28,7 @@ def grey(level: Level) -> NDArray[np.uint8]:
     return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
 
 
-def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
+def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
     """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 

@@ -108,26 +108,17 @@ class VoxelBlocks(Stateful):
         return state | {name: state[name][:m] for name in ("entry_of", "slot_coords", "written", "fused")}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the index of other blocks; the voxels are empty.
-
-        Raises:
-            ValueError: Its parts do not fit each other.
-        """
-        room = len(self.entry_of)
+        """Take the index of other blocks; the voxels are empty. A ``ValueError`` if its parts do not fit each other."""
+        room = max(len(self.entry_of), len(state["entry_of"]))
         super().restore(state)
         n, m, owned = len(self.coords), len(self.entry_of), np.flatnonzero(self.entry_of >= 0)
-        if (
-            (len(self.free_count), len(self.slot_of)) != (n, n)
-            or (len(self.slot_coords), len(self.written), len(self.fused)) != (m, m, m)
-            or not np.array_equal(self.slot_of[self.entry_of[owned]], owned)
-            or not n <= MAX_LOAD * min(self.table_size, LARGEST_TABLE)
-            or self.table_size > LARGEST_TABLE
-        ):
+        sizes = [len(array) for array in (self.free_count, self.slot_of, self.slot_coords, self.written, self.fused)]
+        fitting = sizes == [n, n, m, m, m] and np.array_equal(self.slot_of[self.entry_of[owned]], owned)
+        if not (fitting and n / MAX_LOAD <= self.table_size <= LARGEST_TABLE):
             raise ValueError("the parts of the index of a map do not fit each other")
-        room, self.num_entries = max(room, m), n
-        self.entry_of = grown(self.entry_of, room, -1)
-        self.slot_coords, self.written = grown(self.slot_coords, room, 0), grown(self.written, room, 0)
-        self.fused = grown(self.fused, room, 0)
+        self.num_entries = n
+        for name, unused in (("entry_of", -1), ("slot_coords", 0), ("written", 0), ("fused", 0)):
+            setattr(self, name, grown(getattr(self, name), room, unused))
         self.geometry, self.colors = (np.zeros((room, BLOCK**3), np.int32) for _ in range(2))
         self.use_slots(m)
         self.table = np.full(self.table_size, hashing.EMPTY, dtype=np.int32)

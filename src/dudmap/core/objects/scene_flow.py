@@ -14,10 +14,10 @@ PAIRED_PIXELS = 60
 FEWEST_PIXELS = 15
 """Fewest pixels with a known displacement that determine that of their object."""
 WINDOW = 9
-"""Edge of the window that a pixel is matched by, pixels of an image REFERENCE_WIDTH wide."""
+"""Edge of the window that a pixel is matched by, pixels of an image WINDOW_WIDTH wide."""
 RETURN_PX = 0.5
-"""Largest error of a pixel that is tracked into the last image and back, pixels of an image REFERENCE_WIDTH wide."""
-REFERENCE_WIDTH = 160
+"""Largest error of a pixel that is tracked into the last image and back, pixels of an image WINDOW_WIDTH wide."""
+WINDOW_WIDTH = 160
 """Default width of the label image."""
 
 
@@ -56,8 +56,8 @@ def displacements(
     h, w = now.ids.shape
     v_now, u_now = np.divmod(flat, w)
     pixels = np.stack([u_now, v_now], axis=1)
-    window = scaled_window(WINDOW, w, REFERENCE_WIDTH)
-    limit = RETURN_PX * w / REFERENCE_WIDTH
+    window = scaled_window(WINDOW, w, WINDOW_WIDTH)
+    limit = RETURN_PX * w / WINDOW_WIDTH
     matches, _, good = track_forward_backward(now.grey, last.grey, pixels, pixels, window, 2, limit)
     u, v = np.rint(matches).astype(np.int64).T
     good &= (u >= 0) & (v >= 0) & (u < w) & (v < h)

@@ -20,7 +20,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
-from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
+from dudmap.core.places.map_rebuilding import MAX_ADDED, MAX_IMMEDIATE, PER_FRAME, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.state import Remembered, Stateful
@@ -218,7 +218,7 @@ class Atlas(Stateful):
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
         """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
         if number in self.rebuildings:
-            self.rebuildings[number].show(self.volumes[number], T_world_camera, SHOWN)
+            self.rebuildings[number].show(self.volumes[number], T_world_camera, MAX_ADDED)
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
@@ -327,7 +327,7 @@ class Atlas(Stateful):
             self.history.submaps[n] = target
         del self.volumes[source]
         self.rebuildings.pop(source, None)
-        if len(moved_nodes) <= AT_ONCE or target == self.saved:  # not all frames of a saved map are stored
+        if len(moved_nodes) <= MAX_IMMEDIATE or target == self.saved:  # not all frames of a saved map are stored
             self.history.reintegrate(self.volumes[target], moved_nodes)
             if target in self.rebuildings:
                 self.rebuildings[target].add_shown(moved_nodes)
@@ -348,7 +348,7 @@ class Atlas(Stateful):
         provisional = self.make_volume()
         nodes = np.array(self.kept_nodes(target))
         Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
-        near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, AT_ONCE)].tolist()
+        near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
         self.history.reintegrate(provisional, near)
         self.volumes[target].take_over(provisional)
         self.rebuildings[target] = running.restarted(near)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
-AT_ONCE = 24
+MAX_IMMEDIATE = 24
 """A map of at most this many stored frames is rebuilt at once, of a larger one those nearest to the present view."""
 PER_FRAME = 2
 """Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
 one is stored with a frame, so that the rebuilding ends."""
-SHOWN = 8
+MAX_ADDED = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
 """Depth of the point by which views are compared, metres: the middle of what a camera sees indoors."""

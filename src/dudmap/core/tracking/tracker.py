@@ -17,7 +17,7 @@ from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
-from dudmap.core.tracking.gradient_agreement import SHOWN, GradientAgreement
+from dudmap.core.tracking.gradient_agreement import MIN_AGREEMENT, GradientAgreement
 from dudmap.core.tracking.observability import COMPLETE, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
@@ -247,7 +247,7 @@ class Tracker:
                 self._descend(volume, level, T, weights, None, NO_STEP, parameters).equations.residuals
                 for T in (se3.retract(T_world_camera, way * twist) for way in (step, -step))
             )
-            shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
+            shown.append(agreement.along(twist, forth, back, step) >= MIN_AGREEMENT)
         return seen.with_shown(np.array(shown), R)
 
     def _descend(

@@ -49,7 +49,7 @@ class FaultRun:
     flagged: NDArray[np.bool_]
 
     def wrong(self, clean: "FaultRun") -> tuple[int, int]:
-        """Poses that are wrong although the run calls them tracked: without a word, and those it calls doubtful."""
+        """Numbers of wrong poses that the run calls tracked: not flagged, and flagged as doubtful."""
         wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
         return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
