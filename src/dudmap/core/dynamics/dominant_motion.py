@@ -147,10 +147,11 @@ class LabelledCorners:
     pixels: NDArray[np.int64]
     moving: NDArray[np.bool_]
 
-    def count_by_segment(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
-        """Corners (count + 1,) in each segment, all or the chosen (n,) of them; entry 0: in none."""
-        segment = self.segment_of if chosen is None else self.segment_of[chosen]
-        return np.bincount(segment, minlength=self.segmentation.count + 1)
+    @cached_property
+    def count_by_segment(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Moving corners (count + 1,) in each segment, and all; entry 0: in none."""
+        size, segment = self.segmentation.count + 1, self.segment_of
+        return np.bincount(segment[self.moving], minlength=size), np.bincount(segment, minlength=size)
 
     @cached_property
     def segment_of(self) -> NDArray[np.int32]:
@@ -315,7 +316,7 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
         return np.zeros(level.depth.shape, dtype=bool)
-    num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
+    num_moving, num_all = corners.count_by_segment
     enough = num_moving >= FEWEST_MOVING
     whole = enough & (num_moving >= AGREED * num_all)
     mixed = enough & ~whole
@@ -335,7 +336,8 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of such corners."""
-    num_static, num_all = corners.count_by_segment(~corners.moving), corners.count_by_segment()
+    num_moving, num_all = corners.count_by_segment
+    num_static = num_all - num_moving
     static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
     static[0] = False
     return static[corners.segmentation.labels]

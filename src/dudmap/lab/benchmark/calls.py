@@ -4,7 +4,7 @@ import gc
 import sys
 import time
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -65,11 +65,11 @@ def summary(costs: list[FrameCost]) -> dict[str, float]:
 
 
 def stage_table(costs: list[FrameCost]) -> str:
-    """Mean time of each stage, in kernels and around them, as a Markdown table."""
+    """Median time of each stage, in kernels and around them, as a Markdown table."""
     rows = []
     for name in dict.fromkeys(name for one in costs for name in one.stages):
-        whole = fmean(one.stages.get(name, 0.0) for one in costs)
-        inside = fmean(one.kernels.get(name, 0.0) for one in costs)
+        whole = median(one.stages.get(name, 0.0) for one in costs)
+        inside = median(one.kernels.get(name, 0.0) for one in costs)
         rows.append([name, f"{whole:.2f}", f"{inside:.2f}", f"{whole - inside:.2f}"])
     return grid(["stage", "ms", "in kernels", "around"], rows, words=1)
 
