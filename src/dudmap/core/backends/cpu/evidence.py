@@ -190,17 +190,18 @@ def moving_pixels(
                 odds[v, u] = surface_log_odds(distance[v, u], s, least, offset, slope, limit)
             if rules.free_space and (occupancy[v, u] == FREE or (seen and seen_free[v, u])):
                 odds[v, u] = -limit
-    probability[:] = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
+    smoothed = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
     for v in range(h):
         for u in range(w):
+            probability[v, u] = smoothed[v, u]
             dynamic[v, u] = probability[v, u] < np.float32(0.5) and depth[v, u] > ZERO
     if not rules.regions:
         return
-    seeds[:] = opened(dynamic, rules.half_seam)
+    wide = opened(dynamic, rules.half_seam)
     open_pixels = np.empty((h, w), np.bool_)
     for v in range(h):
         for u in range(w):
-            seeds[v, u] = seeds[v, u] or (dynamic[v, u] and occupancy[v, u] == FREE)
+            seeds[v, u] = wide[v, u] or (dynamic[v, u] and occupancy[v, u] == FREE)
             open_pixels[v, u] = odds[v, u] < ONE
     regions, count = grow_regions(seeds, open_pixels, depth, tolerance)
     area, seeded = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
