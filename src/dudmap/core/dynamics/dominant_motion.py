@@ -237,7 +237,8 @@ def dominant_motion(
     expected = reproject(T_expected, points, camera)
     window, limit = scaled_window(WINDOW, camera.width), pixels_at_width(RETURN_PX, camera)
     found_at, differences, found = track_forward_backward(first, second, before.corners, expected, window, 3, limit)
-    pixels, targets, difference = before.corners[found], found_at[found].astype(np.float64), differences[found]
+    targets, difference = (values[found].astype(np.float64) for values in (found_at, differences))
+    pixels = before.corners[found]
     points, labelled = points[found], _pixels_of_level(pixels, fine, before.labelled)
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
