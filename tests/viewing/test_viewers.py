@@ -27,6 +27,8 @@ class Recorder:
 
     def __init__(self):
         self.frames, self.images, self.parts, self.poses, self.cleared = [], [], {}, None, 0
+        self.show_change = lambda change: self.changes.append(change)
+        self.changes = []
         self.gate = threading.Event()
         self.gate.set()
 
@@ -57,8 +59,12 @@ def test_a_live_view_shows_every_frame_and_the_whole_map(tmp_path):
     view.start(slam, tmp_path, 20)
     for k in range(20):
         view.frame(k, read(k), slam.step(k), 12.0)
+    change = {"id": 1, "kind": "appeared", "box": [[0, 0, 1], [0.2, 0.2, 1.2]]}
+    view.event("change", **change)
+    view.event("calibration", estimated=[])
     view.finish(tmp_path)
     view.close()
+    assert window.changes == [change]
     assert [frame.timestamp for frame in window.frames] == list(range(20))
     assert window.cleared == 1
     area = sum(mesh.area() for mesh in window.parts.values() if mesh is not None)

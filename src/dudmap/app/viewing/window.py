@@ -26,6 +26,7 @@ MAX_IMAGES = 300
 PLOT_POINTS = 500
 """Points of a plot over time."""
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
+CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
 PATH_COLOR, CAMERA_COLOR = (0, 150, 220), (255, 120, 40)
 
 
@@ -86,6 +87,8 @@ class Window:
             self._frames.clear()
             self._images.clear()
             self._shown = -1
+            for name in [name for name in self._handles if name.startswith("/changes/")]:
+                self._remove(name)
 
     def show_mesh(self, changes: MeshChanges) -> None:
         """Replace the changed parts of the map."""
@@ -119,6 +122,15 @@ class Window:
             self._draw_plots()
             if self._follow.value:
                 self.show_frame(len(self._frames) - 1)
+
+    def show_change(self, change: dict[str, Any]) -> None:
+        """Show the box of a change since an earlier visit, an object of changes.jsonl."""
+        with self._lock:
+            low, high = np.array(change["box"])
+            name, middle = f"/changes/{change['id']}", (low + high) / 2
+            color = CHANGE_COLORS[change["kind"]]
+            self._add(f"{name}/box", "add_box", color=color, dimensions=high - low, position=middle, wireframe=True)
+            self._add(f"{name}/label", "add_label", text=f"{change['id']}: {change['kind']}", position=middle)
 
     def add_images(self, timestamp: float, files: dict[str, bytes]) -> None:
         """JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
