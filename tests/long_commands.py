@@ -39,7 +39,7 @@ FAKED = {
     ),
     "benchmark gpu": (
         ["benchmark", "gpu", "--out", "gpu"],
-        {"dudmap.lab.benchmark.gpu.recordings": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
+        {"dudmap.lab.benchmark.gpu.measure_devices": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
     ),
     "benchmark faults": (
         ["benchmark", "faults"],

@@ -16,6 +16,7 @@ from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.state import Stateful, remembered
 from dudmap.core.tracking.frame_view import StageTimer
 
 
@@ -40,7 +41,8 @@ def _level(level):
 
 
 def _window(window):
-    return vars(window) | {"mirror": None, "stamps": None, "cells": None if window.origin is None else window.cells}
+    cells = None if window.origin is None else window.cells
+    return vars(window) | window.state() | {"mirror": None, "stamps": None, "cells": cells}
 
 
 def _pager(pager):
@@ -80,10 +82,12 @@ def _content(value):
     for cls, view in VIEWS.items():
         if isinstance(value, cls):
             return view(value)
-    cls = type(value)
+    cls, own = type(value), dict(vars(value))
+    if isinstance(value, Stateful):
+        own |= {name: getattr(value, name) for name in remembered(cls)}  # also those with the value of the class
     return {
         name: one
-        for name, one in vars(value).items()
+        for name, one in own.items()
         if name not in PROCESS and not isinstance(getattr(cls, name, None), cached_property)
     }
 

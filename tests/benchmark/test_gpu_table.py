@@ -1,8 +1,6 @@
 """The table of the GPU: what it measures on the machine at hand, and what it makes of a device's events."""
 
-import pytest
-
-from dudmap.errors import ConfigError, DeviceError
+from dudmap.errors import DeviceError
 from dudmap.lab.benchmark import gpu
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
@@ -26,12 +24,6 @@ def test_kernels_are_listed_by_their_time():
     text = gpu.table([row])
     assert text.index("| integrate | 0.500 |") < text.index("| trace | 0.100 |")
     assert "Nothing was measured" not in text
-
-
-def test_lists_of_the_command_line():
-    assert gpu.numbers("2,0.5", "640x480,") == ([0.02, 0.005], [(640, 480)])
-    with pytest.raises(ConfigError, match="640 by 480"):
-        gpu.numbers("2", "640 by 480")
 
 
 def test_a_device_that_fails_gives_a_row_that_says_so(monkeypatch):

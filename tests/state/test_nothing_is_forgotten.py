@@ -22,9 +22,8 @@ NO_STATE = {
         "VoxelBlocks.num_slots", "VoxelBlocks.table", "KeyframeDatabase._unsettled",
     ),
     "threads, files, and what is of one process": (
-        "BlockPager._executor", "BlockPager._reading", "BlockPager._returned", "BlockPager._store",
-        "BlockPager._writing", "SiftExtractor._detector", "FrameStore._encoder", "FrameStore._file",
-        "FrameStore._pending", "LoopCloser._executor", "StageTimer._running", "StageTimer._stage",
+        "BlockPager._returned", "BlockPager._store", "SiftExtractor._detector", "FrameStore._encoder",
+        "FrameStore._file", "FrameStore._pending", "LoopCloser._executor", "StageTimer._running", "StageTimer._stage",
         "StageTimer._within", "TsdfVolume.map_id",
     ),
     "observers, which begin anew": (

@@ -119,7 +119,7 @@ def test_what_a_snapshot_does_not_copy_never_changes(tmp_path, settings):
 def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch):
     """A loop says that the camera is 3 mm farther; the map of the 18 frames stored is rebuilt over the next 14."""
     for module in ("atlas", "loop_correction"):
-        monkeypatch.setattr(f"dudmap.core.places.{module}.AT_ONCE", 4)
+        monkeypatch.setattr(f"dudmap.core.places.{module}.MAX_IMMEDIATE", 4)
     monkeypatch.setattr(
         "dudmap.core.places.loop_correction._is_worse", lambda after, before: False
     )  # there was no loop

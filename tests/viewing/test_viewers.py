@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 from dudmap.app.viewing.live_view import LiveView
 from dudmap.app.viewing.mesh_feed import MeshFeed
 from dudmap.app.viewing.snapshot import RESIDUAL_RANGE, FrameImages, depth_colors, mask_overlay, residual_colors
-from dudmap.app.viewing.window import Window, first_hit
+from dudmap.app.viewing.window import Window
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
 from fake_slam import FakeResult
 from growing_map import GrowingMap, read
 from recordings import write_recording
-from run_folders import wall, write_run
+from run_folders import write_run
 
 
 class Recorder:
@@ -123,15 +123,6 @@ def test_a_new_map_replaces_the_old_one():
     changes = feed.changes(second.volume, now=True)
     assert changes.reset
     assert any(mesh is not None for mesh in changes.chunks.values())
-
-
-def test_the_point_under_the_pointer():
-    mesh = wall()
-    hit = first_hit(np.array([0.3, 0.2, 0.0]), np.array([0.0, 0.1, 2.0]), [mesh, mesh])
-    np.testing.assert_allclose(hit, [0.3, 0.3, 2.0], atol=1e-6)
-    assert first_hit(np.zeros(3), np.array([0.0, 0.0, -1.0]), [mesh]) is None
-    assert first_hit(np.zeros(3), np.array([1.0, 0.0, 0.5]), [mesh]) is None
-    assert first_hit(np.zeros(3), np.array([0.0, 0.0, 1.0]), []) is None
 
 
 def test_the_colours_of_the_images():

@@ -109,19 +109,21 @@ def _print_world(row: dict[str, Any]) -> None:
 @app.command()
 def calls(
     recording: Annotated[Path | None, Argument(help="Recording; default: a synthetic room with a person.")] = None,
-    max_frames: Annotated[int, Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    max_frames: Annotated[int, Option(min=44, help="Number of frames; the first 40 are not counted.")] = 60,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
+    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame, and time its stages."""
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.calls import count_calls, summary
+    from dudmap.lab.benchmark.calls import count_calls, stage_table, summary
     from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
     source = room.open() if recording is None else open_sequence(recording)
-    tree = summary(count_calls(source, o.read_config(None, None, assignments), max_frames))
-    answer(tree, ", ".join(f"{value:.0f} {name}" for name, value in tree.items()), as_json=as_json)
+    costs = count_calls(source, o.read_config(None, None, assignments), max_frames)
+    tree = summary(costs)
+    text = ", ".join(f"{value:.0f} {name}" for name, value in tree.items())
+    answer(tree, f"{text}\n{stage_table(costs)}", as_json=as_json)
 
 
 @app.command()

@@ -24,11 +24,9 @@ def gpu(
     device: Annotated[str, Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")] = "auto",
     max_frames: Annotated[int, Option(min=2, help="Number of frames of each run.")] = 120,
     voxels: Annotated[str, Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
-    sizes: Annotated[
-        str, Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
-    ] = "640x480,1280x720",
     sequence: Annotated[
-        list[Path] | None, Option(help="Also measure this recording; repeatable.", metavar="SEQUENCE")
+        list[Path] | None,
+        Option(help="Recording; repeatable; default: a synthetic room in two sizes.", metavar="SEQUENCE"),
     ] = None,
     out: Annotated[Path, Option(help="Output folder for gpu.md and gpu.json.")] = RUNS / "gpu",
     quick: QuickOption = False,
@@ -38,14 +36,18 @@ def gpu(
 
     Without a GPU, only the CPU is measured, and the table says why.
     """
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab import synthetic
     from dudmap.lab.benchmark import gpu as measurements
     from dudmap.lab.benchmark.measure import save
 
-    steps, shapes = measurements.numbers(voxels, sizes)
+    steps, sizes = [size / 100 for size in o.numbers(voxels, None, "--voxels")], [(640, 480), (1280, 960)]
     if quick:
-        steps, shapes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
-    content = measurements.recordings(shapes, max_frames, sequence or [])
-    rows = measurements.measure_devices(content, steps, max_frames, device, _announced)
+        steps, sizes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
+    rooms = {f"room {w}x{h}": {"frames": max_frames, "camera": (w, h)} for w, h in sizes}
+    found = {name: synthetic.sequence(**world) for name, world in rooms.items()} if not sequence else {}
+    found |= {f"{path.name}": open_sequence(path) for path in sequence or []}
+    rows = measurements.measure_devices(found, steps, max_frames, device, _announced)
     text = measurements.table(rows)
     answer(save(None, text, out, "gpu", {"rows": rows}), text, as_json=as_json, out=out)
 

@@ -60,20 +60,18 @@ class Bootstrap(Stateful):
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
 
-    textureless: Remembered[bool]
+    textureless: Remembered[bool] = False
     _frames: Remembered[list[StartFrame]]
     _window: Remembered[list[StartFrame]]
-    _num_fused: Remembered[int]
+    _num_fused: Remembered[int] = 0
 
     def __init__(self) -> None:
-        self.textureless = False
         self._frames = []
         self._window = []
-        self._num_fused = 0
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:
-        """Sentence on why a frame cannot start a map, empty if it can."""
+        """Reason why a frame cannot start a map, empty if it can."""
         depth = view.observation.depth
         enough = np.count_nonzero(depth[~dynamic_mask]) >= MIN_READINGS * depth.size
         return "" if enough else "the depth image holds hardly any readings"
@@ -272,7 +270,7 @@ class Mapper:
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask, observation.depth)
-            if self._predictor.slow_crowd and estimate.unverified_mask is not None:
+            if self._predictor.mostly_slow and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded

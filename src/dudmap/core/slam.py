@@ -1,9 +1,8 @@
 """The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Unpack
+from dataclasses import replace
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.masks import full_mask
 from dudmap.core.frames.frame import Frame, FrameArrays
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -24,7 +22,6 @@ from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.mapper import Bootstrap, Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
-from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.loop_closing import LoopCloser
 from dudmap.core.places.loop_verification import LoopQuery
@@ -32,7 +29,7 @@ from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult
-from dudmap.core.slam_results import SlamResults
+from dudmap.core.slam_results import SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
@@ -40,24 +37,10 @@ from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.observability import sentence as unobserved
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import ConfigError
-
-
-@dataclass(frozen=True, eq=False)
-class SlamArguments:
-    """Arguments of ``Slam``, except a first pass and a saved map, of which the state holds what is used."""
-
-    camera: Camera
-    config: Config
-    calibration: Calibration | None
-    live: bool
-    localize: bool
-    max_blocks: int | MemoryLimit | None
-    timed: bool
 
 
 class Slam(SlamResults, Stateful):
@@ -94,7 +77,7 @@ class Slam(SlamResults, Stateful):
     redundancy: Remembered[RedundantViews]
     loops: Remembered[LoopCloser]
     objects: Remembered[MovingObjects]
-    _last: Remembered[FrameResult | None]
+    _last: Remembered[FrameResult | None] = None  # of the last frame, for one that repeats it
 
     def __init__(
         self,
@@ -132,7 +115,6 @@ class Slam(SlamResults, Stateful):
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
-        self._last = None  # of the last frame, for one that repeats it
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live
@@ -146,11 +128,6 @@ class Slam(SlamResults, Stateful):
             self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.go_on_from(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
-
-    @property
-    def reference(self) -> TsdfVolume:
-        """Map that frames are registered to: the current one, or in a second pass that of the first."""
-        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
@@ -228,9 +205,10 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
+        unobserved, ambiguous = estimate.unobserved_motion, self.predictor.ambiguity(view, prediction, estimate)
+        uncertain = unobserved or ambiguous
         fuse = self._is_news(view, estimate, uncertain)
-        mask = self._dynamic_mask(view, estimate)
+        mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
@@ -313,7 +291,7 @@ class Slam(SlamResults, Stateful):
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
-            lambda tracking: not self.monitor.reason_to_doubt(tracking),
+            lambda tracking: not self.monitor.misfit_reason(tracking),
         )
         if found is None:
             return None
@@ -324,7 +302,9 @@ class Slam(SlamResults, Stateful):
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
-        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
+        self.relocalizer.lost(
+            view.timestamp, mostly_dynamic=self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
+        )
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):
@@ -333,7 +313,7 @@ class Slam(SlamResults, Stateful):
             self.relocalizer.found()
             self.redundancy.reset()
             return self._start_map(replace(view, blind=False))
-        return self._result(view, estimate, self._dynamic_mask(view, estimate), reason=reason)
+        return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
@@ -347,15 +327,6 @@ class Slam(SlamResults, Stateful):
         with view.timer("similarity"):
             known = view.blind or uncertain or self.localize
             return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
-
-    def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
-        """Dynamic pixels (H, W) of a frame."""
-        with view.timer("label"):
-            if estimate.labels is None:
-                mask = np.zeros(view.observation.depth.shape, dtype=bool)
-            else:
-                mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
-            return mask if view.known_dynamic is None else mask | view.known_dynamic
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -394,31 +365,24 @@ class Slam(SlamResults, Stateful):
         reason: str = "",
         T_world_camera: NDArray[np.float64] | None = None,
         fused: bool = False,
-        relocalized: bool = False,
-        corrected: bool = False,
-        find_movers: Callable[[], tuple[Mover, ...]] | None = None,
         uncertain: str = "",
-        calibrated: bool = False,
-        checks: Mapping[str, float] | None = None,
-        rejected: str = "",
+        **details: Any,  # noqa: ANN401 - further attributes of the result
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
-        labels = None if estimate is None else estimate.labels
+        labels, tracking = (None, None) if estimate is None else (estimate.labels, estimate.tracking)
         readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
-            T_world_camera=T_world_camera, fused=fused,
+            T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
-            relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,
-            blind=view.blind, uncertain=uncertain, calibrated=calibrated,
-            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
-            repeats=self.stream.repeats, rejected=rejected,
+            labels=labels, tracking=tracking, timings=view.timer.timings, submap=self.atlas.current, blind=view.blind,
+            unobservable=np.empty((0, 6)) if tracking is None else tracking.unobservable, repeats=self.stream.repeats,
+            **details,
         )  # fmt: skip
-        if not rejected:
+        if not result.rejected:
             self._last = result.without_details()
         return result
 

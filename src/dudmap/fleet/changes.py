@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, with_faces
 from dudmap.fleet.change_colors import SOLID, recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import LEAST_FIT, Body, Motion, motion_between
@@ -25,7 +25,6 @@ from dudmap.fleet.change_objects import (
 )
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 from dudmap.io.exporting.gravity import CONE, PARALLEL
-from dudmap.io.exporting.mesh_editing import with_faces
 
 Array = NDArray[np.float64]
 NEAR = 0.3
@@ -143,7 +142,7 @@ def _moved(
             things.append(joined([first, *parts]))
             taken[side][things[-1].vertices] = True
             pieces[side][:] = [p for p in left if p not in parts]
-        out.append(Change("moved", *things, motion.fit, T))
+        out.append(Change("moved", things[0], things[1], motion.fit, T))
     return out
 
 

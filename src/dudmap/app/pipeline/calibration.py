@@ -19,7 +19,7 @@ from dudmap.core.calibration.estimator import (
     Estimate,
     mask_of,
 )
-from dudmap.core.calibration.keyframes import KeyframeCollector, halvings_to
+from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.pyramid import HALVING_BAND
 from dudmap.core.geometry.calibration import PARAMETERS, Calibration
@@ -47,7 +47,7 @@ UNITS = {
 }
 """Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
 ASSUMED = "assumed as given, not tested"
-"""What is said of a colour camera that no image was asked about."""
+"""Finding on a colour camera that was not compared with any image."""
 
 START_FRAMES, MIN_FRAMES = 300, 90
 """Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
@@ -159,7 +159,7 @@ def calibrate_sequence(
     small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
     slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence))
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
-    collector, submap = KeyframeCollector(small.calibration, GAP * small.interval), 0
+    collector, submap, keyframes = KeyframeCollector(small.calibration, GAP * small.interval), 0, list[ColorKeyframe]()
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
         for number, (_, read, *_) in enumerate(frames, start=1):
             progress(number, len(small))
@@ -167,7 +167,7 @@ def calibrate_sequence(
                 continue
             result = slam.process(read.prepared)
             if result.submap != submap:
-                submap = result.submap
+                submap, keyframes = result.submap, max(keyframes, list(collector.keyframes), key=len)
                 collector.clear()
             if result.state == "repeated":
                 continue
@@ -176,10 +176,11 @@ def calibrate_sequence(
             else:
                 mask = slam.preprocess.mask(result.dynamic_mask)
                 collector.add(read.prepared.observation, result.T_world_camera, mask)
-    if len(collector.keyframes) < 2:
+    keyframes = max(keyframes, collector.keyframes, key=len)  # of the longest map: poses of others cannot be compared
+    if len(keyframes) < 2:
         raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
-    notice(f"calibration: comparing {len(collector.keyframes)} of them with each other")
-    estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(collector.keyframes)
+    notice(f"calibration: comparing {len(keyframes)} of them with each other")
+    estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(keyframes)
     return replace(estimate, calibration=_enlarged(estimate.calibration, given.camera, halvings))
 
 

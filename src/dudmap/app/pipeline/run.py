@@ -190,9 +190,8 @@ class Job:
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
-        stored = StoredRun.model_validate(reader.meta())
         with TreeReader(reader, store.database) as tree:
-            return RunState.read(tree, stored, self.options.config.device)
+            return RunState.read(tree, StoredRun.model_validate(reader.meta()), self.options.config.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""

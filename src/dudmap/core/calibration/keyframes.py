@@ -34,8 +34,8 @@ INTERVAL = 0.1
 """Time between two keyframes at the start, seconds."""
 MAX_KEYFRAMES = 60
 """Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
-MAX_GAP = 0.2
-"""Largest time between the two neighbours of a keyframe for its velocity to be known, seconds."""
+MAX_GAP = 0.45
+"""Largest time between the neighbours of a keyframe for its velocity to be known, seconds: two intervals at 5 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,16 +163,14 @@ class KeyframeCollector(Stateful):
 
     keyframes: Remembered[list[ColorKeyframe]]
     _interval: Remembered[float]
-    _before: Remembered[tuple[float, NDArray[np.float64]] | None]
-    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None]
+    _before: Remembered[tuple[float, NDArray[np.float64]] | None] = None
+    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None] = None
 
     def __init__(self, given: Calibration, max_gap: float = MAX_GAP) -> None:
         self.given = given
         self.max_gap = min(max_gap, MAX_GAP)
         self.keyframes = []
         self._interval = INTERVAL
-        self._before = None
-        self._pending = None
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]

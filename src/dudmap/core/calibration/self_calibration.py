@@ -37,25 +37,20 @@ class SelfCalibration(Stateful):
     last one that was finished; None before.
     """
 
-    estimate: Remembered[Estimate | None]
+    estimate: Remembered[Estimate | None] = None
     _collector: Remembered[KeyframeCollector]
     _attempts: Remembered[list[int]]
-    _frames: Remembered[int]
-    _submap: Remembered[int]
-    _running: Remembered[Future[Estimate] | None]
-    _due: Remembered[int]
+    _frames: Remembered[int] = 0
+    _submap: Remembered[int] = 0
+    _running: Remembered[Future[Estimate] | None] = None
+    _due: Remembered[int] = 0
 
     def __init__(self, given: Calibration, sensor: SensorConfig, *, live: bool = False) -> None:
         self.given = given
         self.sensor = sensor
         self.live = live
-        self.estimate = None
         self._collector = KeyframeCollector(given)
         self._attempts = list(ATTEMPTS)
-        self._frames = 0
-        self._submap = 0
-        self._running = None
-        self._due = 0
 
     @property
     def finished(self) -> bool:

@@ -35,11 +35,10 @@ class BackgroundModel(Stateful):
         config: ``settle_time``: background that has not been seen for longer is dropped.
     """
 
-    _background: Remembered[PointImage | None]
+    _background: Remembered[PointImage | None] = None
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._background = None
 
     def reset(self) -> None:
         """Drop the background: it belongs to another world, or the pose was lost."""

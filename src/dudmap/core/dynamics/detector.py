@@ -291,7 +291,7 @@ def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level,
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
     """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
     map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
-    return np.asarray(static_sigma.py_func(depth, sensor.sigma_base, sensor.sigma_scale, map_variance), np.float32)
+    return np.asarray(static_sigma.py_func(sensor.sigma(depth), map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:

@@ -97,23 +97,20 @@ class EgoMotionSegmenter(Stateful):
         active: Whether the next frame is to be compared with the last one.
     """
 
-    active: Remembered[bool]
+    active: Remembered[bool] = False
     _young_until: Remembered[float]
     _latest_end: Remembered[float]
     _started: Remembered[float]
     _last_timestamp: Remembered[float]
-    _last: Remembered[tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None]
+    _last: Remembered[tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None] = None
     _older: Remembered[deque[OlderImage]]
-    _compared: Remembered[tuple[float, DominantMotion | None] | None]
+    _compared: Remembered[tuple[float, DominantMotion | None] | None] = None  # time and result of the last comparison
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self.active = False
         self._young_until, self._latest_end = -np.inf, -np.inf
         self._started = self._last_timestamp = -np.inf
-        self._last = None
         self._older = deque()
-        self._compared = None  # time and result of the last comparison
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""

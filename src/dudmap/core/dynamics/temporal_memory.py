@@ -56,21 +56,18 @@ class TemporalMemory(Stateful):
         config: ``settle_time`` and ``start_seconds``.
     """
 
-    _last: Remembered[RememberedFrame | None]
+    _last: Remembered[RememberedFrame | None] = None
     _settle_frames: Remembered[deque[RememberedFrame]]
     _recent_frames: Remembered[deque[RememberedFrame]]
     _start_frames: Remembered[list[RememberedFrame]]
-    _imported: Remembered[bool]
-    _young_until: Remembered[float]
+    _imported: Remembered[bool] = False  # the frames of the first seconds come from another pass
+    _young_until: Remembered[float] = -np.inf
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._last = None
         self._settle_frames = deque()
         self._recent_frames = deque()
         self._start_frames = []
-        self._imported = False  # the frames of the first seconds come from another pass
-        self._young_until = -np.inf
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map, of this time in seconds."""
@@ -269,8 +266,7 @@ def _still(
         if unmarked and frame.dynamic.any():
             marked = chosen & _seen_marked(found, n)
             still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
-        if not stand_still(segments, chosen, found.gap[n], found.difference[n], still):
-            return np.zeros(chosen.shape, bool)
+    stand_still(segments, chosen, found.gap, found.difference, still)
     return chosen & still[labels]
 
 

@@ -58,27 +58,20 @@ class StreamCheck(Stateful):
     since its clock was set back, s; ``repeats`` what the last frame judged repeats of the frame before.
     """
 
-    clock_offset: Remembered[float]
-    repeats: Remembered[Repeats]
-    _last_stamp: Remembered[float | None]
+    clock_offset: Remembered[float] = 0.0
+    repeats: Remembered[Repeats] = ""
+    _last_stamp: Remembered[float | None] = None  # of the last frame with a valid stamp
     _contradicting: Remembered[list[float]]
     _intervals: Remembered[deque[float]]
-    _arrived: Remembered[float | None]
-    _before: Remembered[tuple[NDArray[np.float32], NDArray[np.uint8]] | None]
-    _compared: Remembered[tuple[float, NDArray[np.float32]] | None]
-    _unit: Remembered[float]
+    _arrived: Remembered[float | None] = None  # stamp of the last frame, valid or not
+    _before: Remembered[tuple[NDArray[np.float32], NDArray[np.uint8]] | None] = None  # depth, colour of the last frame
+    _compared: Remembered[tuple[float, NDArray[np.float32]] | None] = None  # stamp and depth of the last with readings
+    _unit: Remembered[float] = 0.0  # logarithm of the factor by which the unit has changed
 
     def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
-        self.clock_offset = 0.0
-        self.repeats = ""
-        self._last_stamp = None  # of the last frame with a valid stamp
         self._contradicting = []  # stamps of the frames since then
         self._intervals = deque(maxlen=INTERVALS)
-        self._arrived = None  # stamp of the last frame, valid or not
-        self._before = None  # depth, colour of the last frame
-        self._compared = None  # stamp and depth of the last with readings
-        self._unit = 0.0  # logarithm of the factor by which the unit has changed
 
     def restamped(self, observation: Observation) -> Observation:
         """The frame with its stamp on the clock of the first frames."""

@@ -32,7 +32,7 @@ class BlockWindow(Stateful):
     """
 
     near: Remembered[NDArray[np.int32]]
-    origin: Remembered[NDArray[np.int64] | None]
+    origin: Remembered[NDArray[np.int64] | None] = None
 
     def __init__(self, block_size: float, cells: int) -> None:
         size = 16 * int(np.ceil(cells / 16))
@@ -42,7 +42,6 @@ class BlockWindow(Stateful):
         self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)
-        self.origin = None
 
     def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
         """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks

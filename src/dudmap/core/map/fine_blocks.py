@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.adaptive_raycasting import FinerLevels
+from dudmap.core.backends.cpu.octree_field import FinerLevels
 from dudmap.core.backends.mirror import grown
 from dudmap.core.backends.parameters import VoxelGrid
 from dudmap.core.map.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
@@ -18,8 +18,6 @@ NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
 """Stand for a level that a map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
 """Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
-NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
-"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 
 
 class FineBlocks(Stateful):
@@ -219,12 +217,6 @@ class BlockTree:
             level.insert(parents, part, frame_number)
         for level, parents in zip(self.levels, self.parents, strict=True):
             level.make_room(parents)
-
-
-def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
-    coords = blocks.slot_coords[slots][:, None] + NEIGHBOURHOOD
-    return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:

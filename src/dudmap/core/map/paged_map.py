@@ -88,8 +88,9 @@ class PagedMap(Stateful):
 
     def page_out(self) -> None:
         """Have all blocks wait on disk, where the map may do so, until they are needed again."""
-        if self.pager is not None and self.blocks.num_entries:
-            self.pager.page_out(self.all_blocks, self._frame_number)
+        if self.pager is None or self.blocks.num_entries == 0:
+            return
+        if self.pager.page_out(self.all_blocks, self._frame_number):
             self._left = self._left if self.window.origin is None else self.window.origin
             self._empty()
 

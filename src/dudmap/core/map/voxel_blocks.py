@@ -18,6 +18,8 @@ COORDINATE_BITS = 18
 """Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
+"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
 LARGEST_TABLE = 2**26
@@ -85,7 +87,7 @@ class VoxelBlocks(Stateful):
     _released: Remembered[NDArray[np.int32]]
     table_size: Remembered[int]
 
-    def __init__(self, slots: int = 1 << 10) -> None:
+    def __init__(self, slots: int = 1 << 14) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
@@ -108,26 +110,17 @@ class VoxelBlocks(Stateful):
         return state | {name: state[name][:m] for name in ("entry_of", "slot_coords", "written", "fused")}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the index of other blocks; the voxels are empty.
-
-        Raises:
-            ValueError: Its parts do not fit each other.
-        """
-        room = len(self.entry_of)
+        """Take the index of other blocks; the voxels are empty. A ``ValueError`` if its parts do not fit each other."""
+        room = max(len(self.entry_of), len(state["entry_of"]))
         super().restore(state)
         n, m, owned = len(self.coords), len(self.entry_of), np.flatnonzero(self.entry_of >= 0)
-        if (
-            (len(self.free_count), len(self.slot_of)) != (n, n)
-            or (len(self.slot_coords), len(self.written), len(self.fused)) != (m, m, m)
-            or not np.array_equal(self.slot_of[self.entry_of[owned]], owned)
-            or not n <= MAX_LOAD * min(self.table_size, LARGEST_TABLE)
-            or self.table_size > LARGEST_TABLE
-        ):
+        sizes = [len(array) for array in (self.free_count, self.slot_of, self.slot_coords, self.written, self.fused)]
+        fitting = sizes == [n, n, m, m, m] and np.array_equal(self.slot_of[self.entry_of[owned]], owned)
+        if not (fitting and n / MAX_LOAD <= self.table_size <= LARGEST_TABLE):
             raise ValueError("the parts of the index of a map do not fit each other")
-        room, self.num_entries = max(room, m), n
-        self.entry_of = grown(self.entry_of, room, -1)
-        self.slot_coords, self.written = grown(self.slot_coords, room, 0), grown(self.written, room, 0)
-        self.fused = grown(self.fused, room, 0)
+        self.num_entries = n
+        for name, unused in (("entry_of", -1), ("slot_coords", 0), ("written", 0), ("fused", 0)):
+            setattr(self, name, grown(getattr(self, name), room, unused))
         self.geometry, self.colors = (np.zeros((room, BLOCK**3), np.int32) for _ in range(2))
         self.use_slots(m)
         self.table = np.full(self.table_size, hashing.EMPTY, dtype=np.int32)
@@ -318,13 +311,10 @@ class VoxelBlocks(Stateful):
         entries = hashing.find_all(self.table, self.coords, coords)
         return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
 
-    def neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
-        out = np.empty((len(slots), 8), dtype=np.int32)
-        for column in range(8):
-            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            out[:, column] = self.slots_at(self.slot_coords[slots] + offset)
-        return out
+    def neighbourhood(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+        coords = self.slot_coords[slots][:, None] + NEIGHBOURHOOD
+        return self.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
     @classmethod
     def restored(

@@ -104,14 +104,12 @@ class ObjectTracker(Stateful):
     """
 
     _tracks: Remembered[list[_Track]]
-    _last: Remembered[InstanceFrame | None]
-    _next_id: Remembered[int]
+    _last: Remembered[InstanceFrame | None] = None
+    _next_id: Remembered[int] = 1
 
     def __init__(self, config: MoversConfig) -> None:
         self.config = config
         self._tracks = []
-        self._last = None
-        self._next_id = 1
 
     def update(
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]

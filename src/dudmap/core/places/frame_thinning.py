@@ -31,14 +31,13 @@ class FrameThinning(Stateful):
 
     """
 
-    _stored: Remembered[int]
+    _stored: Remembered[int] = 0  # number of frames stored until the last call
 
     def __init__(self, config: Config, atlas: Atlas) -> None:
         self.atlas = atlas
         # an average capped at N readings has the variance of the mean of 2 N + 1: a / (2 - a) with a = 1 / (N + 1)
         held = 2 * min(config.volume.max_readings, config.volume.max_weight) + 1
         self._enough = config.similarity.threshold * held
-        self._stored = 0  # number of frames stored until the last call
 
     def thin(self) -> None:
         """Test the frames with the view of the newest one if that is new; call it with every frame."""

@@ -60,13 +60,13 @@ class LoopCloser(Stateful):
 
     corrector: Remembered[LoopCorrector]
     thinning: Remembered[FrameThinning]
-    closed: Remembered[int]
-    _frame: Remembered[int]
-    _next_search: Remembered[int]
-    _failures: Remembered[int]
-    _newest_keyframe: Remembered[float | None]
-    _search: Remembered[LoopSearch | None]
-    _pending: Remembered[tuple[int, NDArray[np.float64]] | None]
+    closed: Remembered[int] = 0
+    _frame: Remembered[int] = 0
+    _next_search: Remembered[int] = 0
+    _failures: Remembered[int] = 0
+    _newest_keyframe: Remembered[float | None] = None  # timestamp; their number ends at ``max_keyframes``
+    _search: Remembered[LoopSearch | None] = None
+    _pending: Remembered[tuple[int, NDArray[np.float64]] | None] = None
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
         self.config = config
@@ -74,15 +74,8 @@ class LoopCloser(Stateful):
         self.verifier = LoopVerifier(config, atlas, tracker)
         self.corrector = LoopCorrector(atlas)
         self.thinning = FrameThinning(config, atlas)
-        self.closed = 0
-        self._frame = 0
-        self._next_search = 0
-        self._failures = 0
-        self._newest_keyframe = None  # timestamp; their number ends at ``max_keyframes``
-        self._search = None
         self._executor: ThreadPoolExecutor | None = None
         # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
-        self._pending = None
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
-AT_ONCE = 24
+MAX_IMMEDIATE = 24
 """A map of at most this many stored frames is rebuilt at once, of a larger one those nearest to the present view."""
 PER_FRAME = 2
 """Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
 one is stored with a frame, so that the rebuilding ends."""
-SHOWN = 8
+MAX_ADDED = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
 """Depth of the point by which views are compared, metres: the middle of what a camera sees indoors."""
@@ -52,11 +52,9 @@ class MapRebuilding:
     start: int
 
     @classmethod
-    def of(
-        cls, history: FrameStore, submap: int, volume: TsdfVolume, fused: Iterable[int] = (), shown: Iterable[int] = ()
-    ) -> "MapRebuilding":
-        """A rebuilding that begins now, with some frames in the new and in the provisional map."""
-        return cls(history, submap, volume, set(fused), set(shown), len(history))
+    def of(cls, history: FrameStore, submap: int, volume: TsdfVolume, shown: Iterable[int] = ()) -> "MapRebuilding":
+        """A rebuilding that begins now, with some frames in the provisional map."""
+        return cls(history, submap, volume, set(), set(shown), len(history))
 
     @property
     def missing(self) -> list[int]:
@@ -70,10 +68,6 @@ class MapRebuilding:
             self.history.reintegrate(self.volume, [n])
             self.fused.add(n)
         return count is None or len(missing) <= count
-
-    def restarted(self, shown: Sequence[int]) -> "MapRebuilding":
-        """The same with another provisional map, which holds the stored frames of these numbers."""
-        return MapRebuilding.of(self.history, self.submap, self.volume, self.fused, shown)
 
     def add_shown(self, numbers: Sequence[int]) -> None:
         """Note that the provisional map holds stored frames of these numbers, too."""

@@ -39,13 +39,12 @@ class SimilarityTest(Stateful):
     when a comparison needs them, once per image. Not for concurrent calls.
     """
 
-    _reference: Remembered[NDArray[np.uint8] | None]
+    _reference: Remembered[NDArray[np.uint8] | None] = None
     _cache: Remembered[list[tuple[NDArray[np.uint8], NDArray[np.float32]]]]
 
     def __init__(self, config: SimilarityConfig | None = None) -> None:
         self.config = config or SimilarityConfig()
         self._sift = SiftExtractor(self.config.max_features)
-        self._reference = None
         # reduced images and the descriptors of their features: at most the reference and the latest frame
         self._cache = []
 
@@ -95,12 +94,11 @@ class RedundantViews(Stateful):
     """
 
     features: Remembered[SimilarityTest]
-    _place: Remembered[_Place | None]
+    _place: Remembered[_Place | None] = None
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.features = SimilarityTest(config.similarity)
-        self._place = None
         self._learnt = 2 * config.volume.free_after
 
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:

@@ -71,13 +71,12 @@ class ColorMotion(Stateful):
 
     given: Remembered[Calibration | None]
     calibration: Remembered[Calibration | None]
-    _first: Remembered[FrameView | None]
+    _first: Remembered[FrameView | None] = None
 
     def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
         self.motion = motion
         self.given = given
         self.calibration = given
-        self._first = None
 
     def start(self, view: FrameView) -> None:
         """Remember the frame that a map was made of, until its velocity is known."""

@@ -28,6 +28,11 @@ class StageTimer:
         self._stage = ""
         self._within = 0.0  # milliseconds of the stages that ran within the one that is running
 
+    @property
+    def stage(self) -> str:
+        """The stage that is running; empty outside of all."""
+        return "" if self._running is None else self._running[0]
+
     def __call__(self, stage: str) -> "StageTimer":
         """Context manager that measures a block of code; a block left by an exception is not counted."""
         self._stage = stage

@@ -45,7 +45,7 @@ class FrontEnd(Stateful):
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
     """
 
-    last_dynamic: Remembered[NDArray[np.bool_] | None]
+    last_dynamic: Remembered[NDArray[np.bool_] | None] = None
 
     def __init__(
         self,
@@ -64,7 +64,6 @@ class FrontEnd(Stateful):
         self.motion = motion
         self.monitor = monitor
         self.color_motion = color_motion
-        self.last_dynamic = None
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Pose and labels of a frame, from its predicted pose on.

@@ -33,19 +33,16 @@ class MotionModel(Stateful):
     """
 
     T_world_camera: Remembered[NDArray[np.float64]]
-    _timestamp: Remembered[float]
+    _timestamp: Remembered[float] = 0.0
     _velocity: Remembered[NDArray[np.float64]]
-    _initialized: Remembered[bool]
-    _observed: Remembered[float]
+    _initialized: Remembered[bool] = False
+    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
 
     def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
         self.config = config
         self.timed = timed
         self.T_world_camera = np.eye(4)
-        self._timestamp = 0.0
         self._velocity = np.zeros(6)  # twist per second, camera axes
-        self._initialized = False
-        self._observed = 0.0  # time of the last pose whose motion was seen in all directions
 
     @property
     def timestamp(self) -> float:

@@ -81,15 +81,13 @@ class ImageConsistency(Stateful):
         motion: Knows the pose of the last tracked frame.
     """
 
-    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None]
-    _gain: Remembered[float]
+    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None] = None  # coarsest level, dynamic pixels, blind
+    _gain: Remembered[float] = 1.0  # of the exposure of the last frame
 
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
         self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
-        self._last = None  # coarsest level, dynamic pixels, blind
-        self._gain = 1.0  # of the exposure of the last frame
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Compare the next frame with this one, whose pose is accepted."""
@@ -272,23 +270,25 @@ class QualityMonitor(Stateful):
                 "image_shift_px": seen.shift,
                 "confirmed_share": seen.share,
             }
-            crowded = bool(share > 0.5)
+            mostly_dynamic = bool(share > 0.5)
             evidence = {
-                "last frame": lambda: not crowded and seen.is_same_view,
+                "last frame": lambda: not mostly_dynamic and seen.is_same_view,
                 "corners": partial(self.images.supported, view, estimate, seen, image_pose),
             }
-            mode = "recovering" if self.recovering else "crowded" if crowded else "tracking"
-            return Verdict(first_failure(CHECKS, figures, self.limits(mode, crowded=crowded), evidence), figures)
+            mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
+            return Verdict(
+                first_failure(CHECKS, figures, self.limits(mode, mostly_dynamic=mostly_dynamic), evidence), figures
+            )
 
-    def reason_to_doubt(self, tracking: TrackingResult) -> str:
+    def misfit_reason(self, tracking: TrackingResult) -> str:
         """Reason why the registration of a frame at a recognised place is much worse than usual, empty if it is not."""
         return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
-    def limits(self, mode: str, *, crowded: bool = False) -> Limits:
+    def limits(self, mode: str, *, mostly_dynamic: bool = False) -> Limits:
         """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
         config, (residual, overlap, color) = self.config, self._usual
         share = config.dynamics.max_share
-        return Limits(config.tracker, config.sensor, share, mode, crowded, 1000 * residual, overlap, color)
+        return Limits(config.tracker, config.sensor, share, mode, mostly_dynamic, 1000 * residual, overlap, color)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""

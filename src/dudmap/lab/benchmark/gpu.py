@@ -1,54 +1,25 @@
-"""Time per frame and per kernel on a GPU, and on the CPU beside it.
-
-A list that cannot be understood is a ``ConfigError``.
-"""
+"""Time per frame and per kernel on a GPU, and on the CPU beside it."""
 
 import statistics
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping
 
 from dudmap.config import Config
 from dudmap.core.backends.device import obstacle, resolve
 from dudmap.core.slam import Slam
-from dudmap.errors import ConfigError, DeviceError, MapError
-from dudmap.io.sequences import Sequence, open_sequence
+from dudmap.errors import DeviceError, MapError
+from dudmap.io.sequences import Sequence
 from dudmap.lab.benchmark.measure import Row, grid
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
-from dudmap.lab.synthetic import sequence as synthetic_sequence
-from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 KERNELS_EVERY = 4
-"""Every so many frames the kernels are measured, and in the others the frames and their stages: events around each
-kernel take time."""
-
-
-def numbers(voxels: str, sizes: str) -> tuple[list[float], list[tuple[int, int]]]:
-    """Voxel sizes in metres, and image sizes, of comma-separated lists as the command line gives them."""
-    try:
-        shapes = [(int(width), int(height)) for width, height in (size.split("x") for size in sizes.split(",") if size)]
-        return [float(voxel) / 100 for voxel in voxels.split(",")], shapes
-    except ValueError:
-        raise ConfigError(
-            f"cannot understand --voxels {voxels!r} and --sizes {sizes!r}; expected centimetres, such as 2,1, and "
-            "pixels, such as 640x480,1280x720"
-        ) from None
-
-
-def recordings(sizes: Iterable[tuple[int, int]], frames: int, paths: Iterable[Path]) -> Iterable[tuple[str, Sequence]]:
-    """Names and recordings: the synthetic room in each size, then those of ``paths``."""
-    for width, height in sizes:
-        camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), height=height, cy=(height - 1) / 2)
-        yield f"room {width}x{height}", synthetic_sequence(frames=frames, camera=camera)
-    for path in paths:
-        recording = open_sequence(path)
-        yield f"{recording.name} {recording.camera.width}x{recording.camera.height}", recording
+"""In every fourth frame the kernels are measured, in the others the frame and its stages: events around each kernel
+take time."""
 
 
 def measure_devices(
-    content: Iterable[tuple[str, Sequence]],
-    voxels: list[float],
+    recordings: Mapping[str, Sequence],
+    voxels: Iterable[float],
     frames: int,
     wanted: str,
     announce: Callable[[str], None],
@@ -58,7 +29,7 @@ def measure_devices(
     ``announce`` is called with what is measured next.
     """
     device, rows = resolve(wanted), list[Row]()
-    for name, recording in content:
+    for name, recording in recordings.items():
         for voxel in voxels:
             for one in dict.fromkeys((device, "cpu")):
                 announce(f"{name}, {100 * voxel:g} cm, {one}")

@@ -41,9 +41,11 @@ def limits_table(rows: Collection[Row], systems: Collection[str]) -> str:
         for value in sweep["values"]:
             cells = [str(value)]
             for system in systems:
-                reached = "none"
-                for share in sorted(sweep["coverages"]):
-                    if not copes(found.get((name_of(sweep, value, share), system), {})):
+                named = [(share, name_of(sweep, value, share)) for share in sorted(sweep["coverages"])]
+                measured = [(share, found[name, system]) for share, name in named if (name, system) in found]
+                reached = "none" if measured else ""
+                for share, row in measured:
+                    if not copes(row):
                         break
                     reached = f"{100 * share:.0f} %"
                 cells.append(reached)

@@ -1,4 +1,4 @@
-"""Random worlds with random sensors: how often, and how badly, a system fails on what nobody chose."""
+"""Random worlds with random sensors: how often a system fails, how badly, and whether it says so."""
 
 import hashlib
 from collections.abc import Callable, Iterable

@@ -49,7 +49,7 @@ class FaultRun:
     flagged: NDArray[np.bool_]
 
     def wrong(self, clean: "FaultRun") -> tuple[int, int]:
-        """Poses that are wrong although the run calls them tracked: without a word, and those it calls doubtful."""
+        """Numbers of wrong poses that the run calls tracked: not flagged, and flagged as doubtful."""
         wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
         return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
@@ -72,12 +72,12 @@ class FaultRun:
         return "skipped and counted" if self.rejected else "handled"
 
 
-def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
-    """A synthetic scene with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+def default_room(frames: int, width: int, seed: int) -> Sequence:
+    """A synthetic room with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
 
     camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
-    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera)
+    return synthetic.sequence(frames=frames, seed=seed, camera=camera)
 
 
 def measure_stream_faults(

@@ -78,7 +78,7 @@ def local_entries(data: Path) -> list[Entry]:
 
 
 class Excerpt:
-    """The first frames of a recording, all without a number, each of which is read or rendered once."""
+    """The first ``frames`` frames of a recording (None: all), each of which is read or rendered once."""
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
@@ -103,12 +103,6 @@ class Excerpt:
         if index not in self._masks:
             self._masks[index] = self.recording.mask(index)
         return self._masks[index]
-
-    def load(self) -> "Excerpt":
-        """Read or render all frames and masks now, so that this falls into the time of nobody."""
-        for index in range(len(self)):
-            _ = self[index], self.mask(index)
-        return self
 
 
 DATA = tables("benchmark/suites.toml")

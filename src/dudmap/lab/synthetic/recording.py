@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, with_faces
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import FrameError
-from dudmap.io.exporting.mesh_editing import with_faces
 from dudmap.lab.synthetic.color_camera import ColorCamera, DepthFaults, compressed, exposure_gains, white_balance
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover, placed
