@@ -152,11 +152,10 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     ``up`` (3,) is the direction about which things turn most.
     """
     coarse, fine = (_Meeting(missing, new, count) for count in (COARSE, FINE))
-    starts = sorted(
-        _starts(*coarse.sources, up), key=lambda T: -coarse.share(T, max(0.1 * coarse.size, 3 * coarse.gate))
-    )
+    a, b = coarse.sources
+    starts = sorted(_starts(a, b, up), key=lambda T: -coarse.share(T, max(0.1 * coarse.size, 3 * coarse.gate)))
     centre = np.eye(4)
-    centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
+    centre[:3, 3] = a.points.mean(axis=0)
     first = [
         coarse.registered(T, 0.3 * coarse.size) for T in _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
     ]

@@ -142,7 +142,7 @@ def _moved(
             things.append(joined([first, *parts]))
             taken[side][things[-1].vertices] = True
             pieces[side][:] = [p for p in left if p not in parts]
-        out.append(Change("moved", *things, motion.fit, T))
+        out.append(Change("moved", things[0], things[1], motion.fit, T))
     return out
 
 
