@@ -99,7 +99,7 @@ class Scalar:
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         update_wrapper(self, function)
         self.py_func, self._options = function, options
-        inlined = {"cache": False, "forceinline": True, "no_cpython_wrapper": True}
+        inlined: dict[str, Any] = {"cache": False, "forceinline": True, "no_cpython_wrapper": True}
         self.inlined = njit(**(_OPTIONS | options | inlined))(function)
 
     @property
