@@ -15,6 +15,7 @@ from numba.core import event
 import dudmap
 from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import filtering
+from dudmap.lab import warmup
 
 PROGRAM = """
 import sys
@@ -28,10 +29,8 @@ recording = synthetic.sequence(frames=100, camera=camera, camera_path="handheld"
 run(recording, Config().override(["volume.voxel_size=0.02"]), sys.argv[1], calibrate=True, progress=False)
 """
 INTEGERS = {
-    "_block_at", "_cell", "_cell_key", "_changes_sign", "_corner_words", "_is_empty", "_known_leaf", "_mark",
-    "_may_cross", "_put", "_step_block", "_surrounded_words", "_voxel", "_words_at", "_yield_core", "announce",
-    "child_of", "done", "fill", "finest_level", "finish", "inside_window", "is_known", "load_corners",
-    "may_hold_surface", "place_of", "take", "wait_for_all", "wait_for_work",
+    "_cell", "_corner_words", "_voxel", "_yield_core", "announce", "block_at", "done", "finish", "inside_window",
+    "load_corners", "place_of", "take", "wait_for_all", "wait_for_work",
 }  # fmt: skip
 """Kernels whose arithmetic has no roundings: on integers, or by powers of two."""
 
@@ -61,15 +60,19 @@ def test_what_kernels_call_is_inlined():
     """A function that is not exists twice, with other roundings, and it depends on the cache which one is called."""
     kinds, calls = {}, set()
     for path in sorted(Path(dudmap.__file__).parent.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        modules = {name.name: (node.module or "").rpartition(".")[2] for node in imports for name in node.names}
+        for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):
                 kind = {one.id for one in node.decorator_list if isinstance(one, ast.Name)}
                 if kind & {"kernel", "scalar", "written_out", "exact", "exact_scalar"}:
-                    kinds[node.name] = kind
+                    kinds[path.stem, node.name] = kind
                     called = (one.func for one in ast.walk(node) if isinstance(one, ast.Call))
-                    calls |= {one.id for one in called if isinstance(one, ast.Name)}
-    assert "linearize_pair" in calls
-    assert {name for name in calls if kinds.get(name, set()) & {"kernel", "exact"}} == INTEGERS
+                    names = {one.id for one in called if isinstance(one, ast.Name)}
+                    calls |= {(modules.get(name, path.stem), name) for name in names}
+    assert ("color_pairs", "linearize_pair") in calls
+    assert {call[1] for call in calls if kinds.get(call, set()) & {"kernel", "exact"}} == INTEGERS
 
 
 def test_kernels_of_the_first_frames_do_not_compile_what_takes_seconds():
@@ -110,3 +113,32 @@ def test_garbage_is_collected_again_once_a_kernel_is_compiled():
             assert not gc.isenabled()
         assert not gc.isenabled()
     assert gc.isenabled()
+
+
+def test_a_formula_becomes_a_kernel_only_where_python_calls_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    @threads.scalar
+    def twice(value):
+        return 2 * value
+
+    @numba.njit
+    def four_times(value):
+        return twice(twice(value))
+
+    assert four_times(3) == 12
+    assert len(twice.inlined.signatures) == 1
+    assert not list(tmp_path.rglob("*twice*"))
+    assert twice(3) == twice.py_func(3) == 6
+    assert list(tmp_path.rglob("*twice*.nbi"))
+
+
+def test_two_processes_do_not_write_one_file_of_the_kernel_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    threads.kernel(filtering.intensities.py_func)(0, 1, np.ones((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
+    (data,) = tmp_path.rglob("*.nbc")
+    assert f".{os.getpid()}." in data.name
+
+
+def test_what_a_second_process_compiles_are_parts_of_the_system():
+    assert {*warmup.BESIDE, *warmup.BESIDE_RUN} <= {name for name, _ in warmup.steps()}

@@ -5,6 +5,7 @@ there, which is imported when the command is called, so that ``dudmap --help`` i
 sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C.
 """
 
+import ctypes
 import io
 import sys
 from importlib import import_module
@@ -111,6 +112,9 @@ def _placeholder() -> None:
     """Placeholder of a command in the help page; never called."""
 
 
+M_ARENA_MAX = -8
+"""Parameter of ``mallopt`` in glibc's malloc.h: the largest number of heaps."""
+
 app = typer.Typer(
     name="dudmap",
     cls=CommandGroup,
@@ -142,4 +146,13 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a character, as on Windows
+    _share_one_heap()
     app()
+
+
+def _share_one_heap() -> None:
+    """Have all threads allocate from one heap (glibc): an image that one thread makes and another frees would leave its
+    room to the first one alone."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(M_ARENA_MAX, 1)
