@@ -11,7 +11,6 @@ from dudmap.core.backends.cpu.evidence import (
     edge_tolerance,
     mixture_log_odds,
     noise_limit,
-    static_sigma,
 )
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.cpu.image_comparison import AGREEING_SIGMAS
@@ -32,7 +31,7 @@ from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
 
 def weighed(depth, sample, noise):
     """Standard deviations, tolerances, histogram of the residuals, and share of the readings in unknown space."""
-    sigma = static_sigma.py_func(depth, noise.base, noise.scale, noise.map_variance)
+    sigma = np.sqrt((noise.base + noise.scale * (depth * depth)) ** 2 + noise.map_variance)
     tolerance = edge_tolerance.py_func(sigma, depth, noise.edge_sigmas, noise.edge_slope)
     surface, valid = sample.occupancy == SURFACE, depth > 0
     residual = np.minimum(np.abs(sample.distance[surface]) / sigma[surface], LARGEST) * BINS_PER_SIGMA
@@ -126,7 +125,7 @@ def still(segments, dynamic, gap, difference):
 def compared(depth, intensity, moves, gap, difference, marks, noise):
     """Shift of two images, and readings: those that agree, all, and those of the older image."""
     agreeing = np.count_nonzero(np.abs(gap) < AGREEING_SIGMAS * (noise.base + noise.scale * depth**2))
-    sigma = static_sigma.py_func(depth, noise.base, noise.scale, np.float32(0))
+    sigma = noise.base + noise.scale * (depth * depth)
     tolerance = edge_tolerance.py_func(sigma, depth, noise.edge_sigmas, noise.edge_slope)
     common = (marks == 0) & ~moves & (np.abs(gap) < tolerance)
     gain, offset = fit_exposure(intensity, difference, common.astype(np.float32))

@@ -20,7 +20,6 @@ FAKED = {
         {"dudmap.fleet.change_benchmark.measure_changes": lambda *_: ([], "")},
     ),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
-    "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
     "benchmark consistency": None,  # tests/benchmark/test_consistency.py
     "benchmark gate": (
         ["benchmark", "gate"],
@@ -31,13 +30,6 @@ FAKED = {
             "dudmap.lab.benchmark.gate.compare": lambda *_: [],
         },
     ),
-    "benchmark sensors": (
-        ["benchmark", "sensors", "--only", "kinect_v1", "--out", "sensors"],
-        {
-            "dudmap.lab.benchmark.color_columns.measure_columns": lambda *_: [],
-            "dudmap.lab.benchmark.color_columns.color_table": lambda *_: "",
-        },
-    ),
     "benchmark random": (
         ["benchmark", "random", "--out", "."],
         {
@@ -45,17 +37,9 @@ FAKED = {
             "dudmap.lab.benchmark.random_worlds.report": lambda *_: "",
         },
     ),
-    "benchmark limits": (
-        ["benchmark", "limits", "--out", "limits"],
-        {
-            "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.lab.benchmark.limits.limits_table": lambda *_: "",
-            "dudmap.lab.benchmark.limits.cells_table": lambda *_: "",
-        },
-    ),
     "benchmark gpu": (
         ["benchmark", "gpu", "--out", "gpu"],
-        {"dudmap.lab.benchmark.gpu.recordings": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
+        {"dudmap.lab.benchmark.gpu.measure_devices": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
     ),
     "benchmark faults": (
         ["benchmark", "faults"],
@@ -68,30 +52,11 @@ FAKED = {
         ["benchmark", "speed", "--out", "speed"],
         {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
-    "benchmark roofline": (
-        ["benchmark", "roofline", "--out", "roofline"],
-        {"dudmap.lab.benchmark.roofline.roofline": lambda *_: ({}, "")},
-    ),
     "benchmark soak": (
         ["benchmark", "soak"],
         {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
     ),
-    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.roofline.count_calls": lambda *_: []}),
-    "benchmark bias": (
-        ["benchmark", "bias", "--seeds", 1],
-        {
-            "dudmap.lab.benchmark.bias.measure_pulls": lambda *_: {},
-            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
-        },
-    ),
-    "benchmark first-second": (
-        ["benchmark", "first-second", "--seeds", 1],
-        {
-            "dudmap.lab.benchmark.bias.measure_first_second": lambda *_: [],
-            "dudmap.lab.benchmark.bias.first_second_table": lambda _: "",
-            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
-        },
-    ),
+    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
     "study run": (
         ["study", "design.toml"],
         {

@@ -15,12 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dudmap import resume_system, save_system
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.evaluation.trajectory import ate
 from dudmap.io.sequences import is_recording, open_sequence
+from state_differences import differences
 
 DATA = os.environ.get("DUDMAP_DATA", "")
 FOLDERS = [path for path in sorted(Path(DATA).iterdir()) if path.is_dir() and is_recording(path)] if DATA else []
@@ -125,3 +128,25 @@ def test_preset_thesis_tracks(folder, tmp_path):
     config = Config.from_tree({"preset": "thesis"})
     metrics = run(open_sequence(folder), config, tmp_path, progress=False, save_map=False).metrics
     assert metrics["tracked"] >= TRACKED_BY_THESIS * metrics["frames"], metrics["lost_frames"][:3]
+
+
+def test_a_system_that_is_stored_while_it_calibrates_goes_on_the_same(tmp_path):
+    """Colours are late by what is given; saved while a better calibration is estimated, and once it is in use."""
+    sequence = open_sequence(Path(DATA) / "fr1_xyz_confusao")
+    given = replace(Calibration.registered(sequence.camera), delay=0.015)
+    slam, again = Slam(sequence.camera, Config(), calibration=given), None
+    for index in range(220):
+        result = slam.process(sequence[index])
+        if again is not None:
+            other = again.process(sequence[index])
+            np.testing.assert_array_equal(result.T_world_camera, other.T_world_camera)
+            np.testing.assert_array_equal(result.dynamic_mask, other.dynamic_mask)
+        if index in (130, 200):
+            if again is not None:
+                assert differences(slam, again) == []
+            save_system(slam, tmp_path / "state.db")
+            again = resume_system(tmp_path / "state.db")
+            assert differences(slam, again) == []
+    assert again.calibration.estimated
+    assert again.calibration.delay > 0
+    assert differences(slam, again) == []

@@ -26,6 +26,7 @@ SETTINGS = {
     "camera_frame": "",
     "saved_map": "",
     "localize": False,
+    "watch": False,
     "save_to": "dudmap_run",
     "surface_period": 5.0,
     "mesh_triangles": 50_000,
@@ -53,6 +54,7 @@ class DudmapNode(LifecycleNode):
         for name, value in (SETTINGS | self.keys).items():
             self.declare_parameter(name, value)
         self.session: Session | None = None
+        self.shown = 0
         self.inputs: list[Subscriber] = []
 
     def setting(self, name: str) -> Any:  # noqa: ANN401
@@ -65,15 +67,19 @@ class DudmapNode(LifecycleNode):
         """Read the parameters, create publishers and services."""
         try:
             config = config_of({key: self.setting(key) for key in self.keys})
-            self.session = Session(config, self.setting("saved_map") or None, self.setting("localize"))
+            self.session = Session(
+                config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch")
+            )
         except DudmapError as error:
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
+        self.shown = 0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.outputs = {
             "odometry": self.create_lifecycle_publisher(Odometry, "~/odometry", 10),
             "mask": self.create_lifecycle_publisher(Image, "~/mask", 2),
             "movers": self.create_lifecycle_publisher(MarkerArray, "~/movers", 10),
+            "changes": self.create_lifecycle_publisher(MarkerArray, "~/changes", latched),
             "path": self.create_lifecycle_publisher(Path, "~/path", latched),
             "points": self.create_lifecycle_publisher(PointCloud2, "~/points", latched),
             "mesh": self.create_lifecycle_publisher(Marker, "~/mesh", latched),
@@ -138,6 +144,10 @@ class DudmapNode(LifecycleNode):
         self.outputs["odometry"].publish(ros.odometry(TYPES, stamp, T, velocity, map_frame, frame))
         movers = [{"id": mover.id, "box": mover.box} for mover in result.movers]
         self.outputs["movers"].publish(ros.mover_markers(TYPES, stamp, movers, map_frame))
+        changes = self.session.watch.reported if self.session.watch is not None else []
+        if len(changes) > self.shown:
+            self.shown = len(changes)
+            self.outputs["changes"].publish(ros.mover_markers(TYPES, stamp, changes, map_frame))
 
     def publish_surface(self) -> None:
         """Publish path, points and mesh of the map so far."""
@@ -162,6 +172,7 @@ class DudmapNode(LifecycleNode):
 
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Begin a new map with the next images."""
+        self.shown = 0
         return self.answer(response, lambda: self.session.reset() or "the map is empty")
 
     def localize(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

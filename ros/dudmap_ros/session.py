@@ -11,6 +11,7 @@ from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.core.result import FrameResult
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DatasetError, MapError
+from dudmap.fleet.change_watch import ChangeWatch
 from dudmap.io.exporting import ros_messages as ros
 from dudmap.io.sequences.bag_messages import color_of, depth_of
 
@@ -51,27 +52,34 @@ class Session:
         config: All parameters.
         saved_map: Run folder to go on in, None for a new map.
         localize: Only find the camera in the saved map.
+        watch: Look for changes against the saved map.
 
     Attributes:
         slam: The system; None before the first pair.
+        watch: What changed against the saved map, None without one or before the first pair.
         processed, stale: Pairs that were processed, and pairs older than the one before, which were dropped.
 
     Raises:
-        ConfigError: ``localize`` without a saved map.
+        ConfigError: ``localize`` or ``watch`` without a saved map.
     """
 
-    def __init__(self, config: Config, saved_map: str | None = None, localize: bool = False) -> None:
+    def __init__(
+        self, config: Config, saved_map: str | None = None, localize: bool = False, watch: bool = False
+    ) -> None:
+        if watch and saved_map is None:
+            raise ConfigError("there is no earlier visit to compare with; set the parameter saved_map to a run folder")
         if localize and saved_map is None:
             raise ConfigError("there is nothing to localise in; set the parameter saved_map to a run folder")
         self.config = config
         self.saved_map = saved_map
-        self.localize = localize
+        self.localize, self.watching = localize, watch
         self.reset()
 
     def reset(self) -> None:
         """Forget the map; a saved map is loaded anew with the next pair, without one mapping begins again."""
         self.localize = self.localize and self.saved_map is not None
         self.slam: Slam | None = None
+        self.watch: ChangeWatch | None = None
         self.processed = self.stale = 0
         self._last = float("-inf")
 
@@ -110,7 +118,10 @@ class Session:
             self.slam = self._started(info)
         self._last = stamp
         self.processed += 1
-        return self.slam.process(frame)
+        result = self.slam.process(frame)
+        if self.watch is not None:
+            self.watch.look(self.processed - 1, frame, result)
+        return result
 
     def mesh(self) -> Mesh | None:
         """Static surface of the main map, None before there is one."""
@@ -147,4 +158,7 @@ class Session:
         saved = SavedMap.load(self.saved_map, self.config.volume.voxel_size)
         slam = Slam(camera, self.config, saved_map=saved)
         slam.localize = self.localize
+        if self.watching:
+            self.watch = ChangeWatch(SavedMap.load(self.saved_map))  # of its own: the run changes the other one
+            self.watch.start(slam, None, None)
         return slam

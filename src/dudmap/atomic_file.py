@@ -8,10 +8,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from dudmap.errors import DudmapError
 from dudmap.own_folder import OwnFolder
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = [
     "UNFINISHED",
@@ -95,6 +98,15 @@ def write_bytes(path: str | Path, content: bytes, *, sync: bool = True, own: boo
     """Write a file as ``atomic_file`` does."""
     with atomic_file(path, sync=sync, own=own) as file:
         file.write(content)
+
+
+def write_image(path: str | Path, image: "NDArray", *, sync: bool = True, own: bool = False) -> None:
+    """Write a PNG file of a grey or RGB image, or of a mask, whose True is 255."""
+    import cv2
+    import numpy as np
+
+    pixels = image[..., ::-1] if image.ndim == 3 else image.astype(np.uint8) * 255 if image.dtype == bool else image
+    write_bytes(path, cv2.imencode(".png", pixels)[1].tobytes(), sync=sync, own=own)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -14,10 +14,9 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
-from dudmap.lab.benchmark.limits import cells_table, limits_table
 from dudmap.lab.benchmark.measure import markdown
 from dudmap.lab.benchmark.report import published
-from dudmap.lab.benchmark.suites import ABLATION, SUITES, Entry, find_suite, systems
+from dudmap.lab.benchmark.suites import SUITES, USUAL, Entry, find_suite, systems
 from layout_images import pose
 from layouts import corbs, icl_nuim, volume_deform, write
 from recordings import write_recording
@@ -51,7 +50,7 @@ def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
     assert len(find_suite("synthetic", None).entries) >= 15
     assert len(find_suite("synthetic", None, quick=True).entries) == 3
     assert len(find_suite("ablation", None).entries) == 5
-    assert set(SUITES) == {*counts, "synthetic", "ablation", "local"}
+    assert set(SUITES) == {*counts, "synthetic", "ablation", "sensors", "limits", "local"}
 
 
 def test_recordings_are_found_one_folder_down(data):
@@ -103,7 +102,9 @@ def test_systems_are_configurations(tmp_path):
     assert found["threshold"].dynamics.method == "threshold"
     assert not found["em"].dynamics.free_space
     assert found["thesis"].preset == "thesis"
-    assert len({str(config) for config in systems(ABLATION).values()}) == 13  # two-passes has the default configuration
+    assert (
+        len({str(config) for config in systems(USUAL["ablation"]).values()}) == 13
+    )  # two-passes has the default configuration
     (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.05\n")
     assert systems(str(tmp_path / "mine.toml"))["mine"].tracker.huber == 0.05
     for text in ("", "dudmapp", "none,none"):
@@ -177,77 +178,36 @@ def test_a_process_that_dies_or_fails_is_an_error_of_its_row(capfd):
 # -- the limit of dynamics --------------------------------------------------------------------------------------------
 
 
-SWEEP = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.1, 0.3, 0.5))
+def ates_of(sweep, value, ates):
+    """Rows of one value of a sweep with these ATEs, metres, in the order of its shares."""
+    return [
+        {"sequence": limits.name_of(sweep, value, share), "system": "dudmap", "ate_rmse_m": ate, "lost": 0}
+        for share, ate in zip(sweep["coverages"], ates, strict=True)
+    ]
 
 
-def made_up(system, x, coverage, ate):
-    return {
-        "sweep": "speed", "system": system, "x": x, "coverage": coverage, "ate_rmse_m": ate, "lost": 0,
-        "lost_share": 0.0, "copes": ate is not None and ate <= limits.LARGEST_ATE,
-    }  # fmt: skip
+def test_the_limit_is_the_largest_share_below_the_first_failure():
+    sweep = limits.SWEEPS["speed"]
+    rows = ates_of(sweep, 0.1, (0.005, 0.03, 0.01, 0.01)) + ates_of(sweep, 1.0, (0.005, 0.006, 0.01, 0.02))
+    table = limits.limits_table(rows, ["dudmap", "none"])
+    assert "| 0.1 | 30 % |  |" in table  # the other system was not measured
+    assert "| 1.0 | 90 % |  |" in table
+    rows[-1]["ate_rmse_m"], rows[-2]["lost"] = 0.0201, 1
+    assert "| 1.0 | 50 % |  |" in limits.limits_table(rows, ["dudmap", "none"])
+    rows[4]["lost"] = 2
+    assert "| 1.0 | none |" in limits.limits_table(rows, ["dudmap"])
 
 
-@pytest.fixture
-def rows():
-    ates = {0.1: (0.005, 0.03, 0.01), 1.0: (0.005, 0.006, 0.01)}
-    return [made_up("dudmap", x, c, a) for x, line in ates.items() for c, a in zip(SWEEP.coverages, line, strict=True)]
-
-
-def test_the_limit_is_the_largest_coverage_below_the_first_failure(rows):
-    assert limits.limit(rows, "speed", "dudmap", 0.1) == 0.1
-    assert limits.limit(rows, "speed", "dudmap", 1.0) == 0.5
-    assert limits.limit(rows, "speed", "none", 1.0) is None
-    rows[0]["copes"] = False
-    assert limits.limit(rows, "speed", "dudmap", 0.1) is None
-    assert "| 0.1 | none |" in limits_table(rows, [SWEEP], ["dudmap"])
-    assert "| 1.0 | 50 % |" in limits_table(rows, [SWEEP], ["dudmap"])
-
-
-def test_the_table_of_cells_marks_what_is_coped_with(rows):
-    rows[1] |= {"lost": 3, "lost_share": 0.25}
-    lines = cells_table(rows, [SWEEP], ["dudmap", "none"]).splitlines()
-    assert "| 0.1 | 10 % | **5.0** |  |" in lines
-    assert "| 0.1 | 30 % | 30.0 (25 % lost) |  |" in lines
-    assert len(lines) == 3 + len(SWEEP.xs) * len(SWEEP.coverages)
-
-
-def test_the_grids_hold_what_is_asked_for():
-    cells = limits.grid_cells(limits.SWEEPS, 120)
-    assert len(set(cells)) == len(cells)
-    speeds = {cell.condition.speed for cell in cells if cell.sweep == "speed"}
-    assert min(speeds) <= 0.02
-    assert max(speeds) >= 3
-    assert {0.0, 0.9} <= {cell.condition.coverage for cell in cells if cell.sweep == "speed"}
-    assert {cell.condition.camera_path for cell in cells if cell.sweep == "camera"} >= {"still", "fast"}
-    assert {cell.condition.start_share for cell in cells if cell.sweep == "start"} >= {0.25, 1.0}
-    nobody = {cell.condition for cell in cells if cell.sweep == "speed" and not cell.condition.coverage}
-    assert len(nobody) == 1
-
-
-@pytest.mark.slow
-def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
-    sweep = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.0,))
-    cells = limits.grid_cells((sweep,), 6)
-    wanted = systems("none")
-    first = limits.measure_cells(cells, wanted, tmp_path, 1)
-    assert [row["x"] for row in first] == [0.1, 1.0]
-    assert first[0]["copes"]
-    assert first[0]["ate_rmse_m"] == first[1]["ate_rmse_m"]
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(measure, "in_own_process", lambda *_: pytest.fail("measured again"))
-    assert limits.measure_cells(cells, wanted, tmp_path, 1) == first
-    monkeypatch.setattr(measure, "in_own_process", lambda *_: {"error": "the process died"})
-    other = limits.measure_cells(cells, systems("em"), tmp_path, 2)
-    assert [row["error"] for row in other] == ["the process died"] * 2
-
-
-def test_people_who_leave_are_gone_afterwards():
-    sequence = limits.Condition(0.3, start_share=0.5, frames=6).sequence()
-    assert len(sequence) == 6
-    assert sequence.mask(2).mean() > 0.05
-    assert not sequence.mask(3).any()
-    twin = sequence[3]
-    assert twin.timestamp == sequence.timestamps[3]
+def test_the_worlds_hold_what_is_asked_for():
+    worlds = [Entry(name, parameters=world | {"frames": 2}) for name, world in limits.worlds().items()]
+    assert len(worlds) == 6 * 4 + 3 + 4 * 3
+    parameters = [world.parameters for world in worlds]
+    assert min(world["speed"] for world in parameters) <= 0.02
+    assert max(world["speed"] for world in parameters) >= 3
+    assert {world.get("camera_path") for world in parameters} >= {"still", "fast"}
+    assert max(world["coverage"] for world in parameters) == 0.9
+    at_start = Entry("x", parameters=limits.worlds()["start_dynamic-True-40"] | {"frames": 2}).open()
+    assert at_start.mask(0).mean() > 0.2
 
 
 def test_mistakes_are_one_sentence(tmp_path):

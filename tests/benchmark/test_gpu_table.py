@@ -1,11 +1,6 @@
 """The table of the GPU: what it measures on the machine at hand, and what it makes of a device's events."""
 
-import sys
-from pathlib import Path
-
-import pytest
-
-from dudmap.errors import ConfigError, DeviceError
+from dudmap.errors import DeviceError
 from dudmap.lab.benchmark import gpu
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
@@ -31,12 +26,6 @@ def test_kernels_are_listed_by_their_time():
     assert "Nothing was measured" not in text
 
 
-def test_lists_of_the_command_line():
-    assert gpu.numbers("2,0.5", "640x480,") == ([0.02, 0.005], [(640, 480)])
-    with pytest.raises(ConfigError, match="640 by 480"):
-        gpu.numbers("2", "640 by 480")
-
-
 def test_a_device_that_fails_gives_a_row_that_says_so(monkeypatch):
     def failing(*arguments):
         raise DeviceError("cuda:0 has too little free memory for the map")
@@ -45,18 +34,3 @@ def test_a_device_that_fails_gives_a_row_that_says_so(monkeypatch):
     room = sequence(frames=2, camera=DEFAULT_CAMERA.resized(160, 120))
     row = gpu.measure("room", room, 2, 0.01, "cuda:0")
     assert row["error"] == "cuda:0 has too little free memory for the map"
-
-
-def test_open3d_is_measured_in_a_program_of_its_own(monkeypatch):
-    """Open3D replaced by a program that prints the device it is asked for, and by one that fails."""
-    room = sequence(frames=3, camera=DEFAULT_CAMERA.resized(160, 120))
-    program = "import json, sys; print(json.dumps({'version': '0.20 ' + sys.argv[4], 'ms': [3.0] * 3, 'poses': []}))"
-    monkeypatch.setattr(Path, "read_text", lambda path, *_, **__: program)
-    rows = gpu.measure_open3d(sys.executable, "room", room, 3, [0.02, 0.01], "CUDA:0")
-    assert [(row["voxel"], row["device"], row["frame_ms"]) for row in rows] == [
-        (0.02, "Open3D 0.20 CUDA:0, CUDA:0", 3.0), (0.01, "Open3D 0.20 CUDA:0, CUDA:0", 3.0),
-    ]  # fmt: skip
-    monkeypatch.setattr(Path, "read_text", lambda path, *_, **__: "raise SystemExit('finds no GPU')")
-    (row,) = gpu.measure_open3d(sys.executable, "room", room, 3, [0.02], "CUDA:0")
-    assert "finds no GPU" in row["error"]
-    assert "room, 2 cm, Open3D, CUDA:0: " in gpu.table([row])

@@ -1,5 +1,3 @@
-import shlex
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -7,7 +5,7 @@ from typer.testing import CliRunner
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.lab.benchmark import measure, random_worlds
-from dudmap.lab.benchmark.random_worlds import DRAWN, draw_world, measure_worlds, report, synth_command
+from dudmap.lab.benchmark.random_worlds import DRAWN, draw_world, measure_worlds, report
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.synthetic import names
 
@@ -34,19 +32,6 @@ def test_worlds_are_varied_and_of_known_parts():
     assert {name for world in worlds for name in world.get("faults", {})} == set(DRAWN["faults"])
     faulty = [world for world in worlds if "faults" in world]
     assert len(faulty) / len(worlds) == pytest.approx(0.6, abs=0.1)
-
-
-@pytest.mark.parametrize("number", [0, 8, 32])
-def test_a_world_opens_and_its_command_writes_the_same(number, monkeypatch):
-    written = []
-    monkeypatch.setattr("dudmap.lab.synthetic.folder.write_folder", lambda sequence, out, **_: written.append(sequence))
-    world = draw_world(2, number) | {"frames": 2, "camera": (64, 48)}
-    recording = Entry("world", parameters=world).open()
-    made = CliRunner().invoke(app, [*shlex.split(synth_command(world))[1:], "--quiet"])
-    assert made.exit_code == 0, made.output
-    assert written[0].parameters == recording.parameters
-    assert written[0].camera == recording.camera
-    assert written[0].sensor_truth() == recording.sensor_truth()
 
 
 def test_every_fault_can_be_drawn_and_used():

@@ -1,12 +1,11 @@
-"""dudmap benchmark speed: the table, its failures, the passage of new space, and a map that outgrows its table."""
+"""dudmap benchmark speed: the table, its failures, and a map that outgrows its table."""
 
 import numpy as np
 import pytest
 
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark import roofline, speed
+from dudmap.lab.benchmark import speed
 from dudmap.lab.benchmark.soak import grown, measure_soak
-from dudmap.lab.benchmark.speed import LAP, passage
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
@@ -26,29 +25,6 @@ def test_programs_are_timed_and_a_failing_one_is_a_sentence():
     assert 0 < speed.program_seconds(["-c", "pass"], 1) < 5
     with pytest.raises(DudmapError, match="failed: nothing works"):
         speed.program_seconds(["-c", "import sys; sys.exit('nothing works')"], 1)
-
-
-def test_the_passage_is_new_space_all_along():
-    walk = passage(600)
-    positions = walk.ground_truth.Ts_world_camera[:, :3, 3]
-    assert positions[-1, 1] - positions[0, 1] == pytest.approx(0.3 * 599 / 30, abs=1e-6)
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    assert steps.max() < 0.02
-    walk.camera = DEFAULT_CAMERA.resized(80, 60)
-    for index in (0, 300, 599):
-        depth = walk.exact_depth(index)
-        assert (depth > 0.3).mean() > 0.99
-        assert np.median(depth) < 4.0
-        assert depth.std() > 0.2, "there must be something to see"
-
-
-def test_the_first_and_the_last_tenth_of_the_passage_see_the_same():
-    walk = passage(2000)
-    walk.camera = DEFAULT_CAMERA.resized(80, 60)
-    for index in (60, 150, 253):
-        early, late = walk.exact_depth(index), walk.exact_depth(index + 9 * LAP)
-        seen = (early < 6.0) | (late < 6.0)
-        assert (np.abs(early - late)[seen] < 1e-3).mean() > 0.99
 
 
 def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():
@@ -89,12 +65,12 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     import sys
     from pathlib import Path
 
-    from dudmap.lab.benchmark import gpu as interleaved
+    from dudmap.lab.benchmark.open3d_comparison import compare_with_open3d
     from dudmap.lab.benchmark.suites import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))
     entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (160, 120)})
-    result = interleaved.compare_with_open3d(sys.executable, entry, 50, rounds=1)
+    result = compare_with_open3d(Path(sys.executable), entry.open(), 50, rounds=1)
     assert result.frames == 12
     assert result.theirs_ms == 1e4
     assert 0 < result.ours_ms < 1e4
@@ -106,26 +82,17 @@ def _instead_of(read_text, name, text):
 
 
 def test_a_python_without_open3d_is_refused(tmp_path):
-    import sys
+    from dudmap.lab.benchmark.open3d_comparison import compare_with_open3d
+    from dudmap.lab.benchmark.suites import Entry
 
-    from dudmap.lab.benchmark.gpu import find_open3d
-
+    room = Entry("room-static", parameters={"movers": (), "frames": 2, "camera": (160, 120)}).open()
     with pytest.raises(DudmapError, match="cannot run"):
-        find_open3d(tmp_path / "nothing")
+        compare_with_open3d(tmp_path / "nothing", room, 2, rounds=1)
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'No module named open3d' >&2\nexit 1\n")
     program.chmod(0o755)
-    with pytest.raises(DudmapError, match="cannot import open3d: No module named open3d"):
-        find_open3d(program)
-    assert find_open3d(None) in (None, sys.executable)
-
-
-def test_the_roofline_counts_what_the_system_does():
-    measured, slam = roofline.counted(3, 0.04)
-    assert measured["iterations"] >= 3
-    assert measured["linearised"] >= 3 * 80 * 60
-    assert measured["blocks"] > 100
-    assert all(bytes_ > 0 and operations > 0 for _, bytes_, operations, _ in roofline.stages(measured, slam))
+    with pytest.raises(DudmapError, match="failed: No module named open3d"):
+        compare_with_open3d(program, room, 2, rounds=1)
 
 
 def test_a_short_soak_has_a_row_for_each_tenth():

@@ -9,12 +9,11 @@ import pytest
 
 from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
-from dudmap.core.backends.cpu.color_registration import color_pixels
 from dudmap.core.calibration.adjustment import Adjustment, Fit
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.core.calibration.keyframes import KeyframeCollector, keyframe
 from dudmap.core.calibration.pairs import Pair, PairSet
-from dudmap.core.frames.color_registration import color_projection
+from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
@@ -99,8 +98,9 @@ def estimate(frames: list[Frame]):
 def displacement(one: Calibration, other: Calibration) -> float:
     """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
     depth = record(Calibration.registered(CAMERA), 0).depth
+    images = np.meshgrid(np.arange(CAMERA.width, dtype=np.float32), np.arange(CAMERA.height, dtype=np.float32))
     (u, v), (p, q) = (
-        color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
+        [register_color(image, depth, CAMERA, color_projection(c, np.zeros(6), 0.0)) for image in images]
         for c in (one, other)
     )
     return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))

@@ -80,15 +80,6 @@ def test_the_real_driver_without_a_camera(name):
         open_camera(name)
 
 
-def test_openni_is_not_in_the_wheels_of_opencv():
-    import cv2
-
-    if cv2.CAP_OPENNI2 in cv2.videoio_registry.getCameraBackends():
-        pytest.skip("this OpenCV has OpenNI 2")
-    with pytest.raises(CameraError, match=r"built without OpenNI 2 here.*WITH_OPENNI2=ON"):
-        open_camera("openni")
-
-
 def test_without_a_name_all_are_tried_and_their_reasons_told(monkeypatch):
     tried = []
 
@@ -108,12 +99,12 @@ def test_without_a_name_all_are_tried_and_their_reasons_told(monkeypatch):
         monkeypatch.setattr(f"dudmap.io.cameras.{entry.replace(':', '.')}", Kind)
     assert open_camera() is tried[2]
     monkeypatch.setattr(Kind, "__init__", lambda self: (_ for _ in ()).throw(CameraError("it is not there")))
-    with pytest.raises(CameraError, match=r"no camera was found; realsense: it is not there; oak: .*; openni: it is"):
+    with pytest.raises(CameraError, match=r"no camera was found; realsense: it is not there; oak: .*; iphone: it is"):
         open_camera()
 
 
 def test_wrong_names_are_told():
-    with pytest.raises(CameraError, match="no camera 'webcam'; expected one of realsense, oak, orbbec, iphone, openni"):
+    with pytest.raises(CameraError, match="no camera 'webcam'; expected one of realsense, oak, orbbec, iphone, replay"):
         open_camera("webcam")
     with pytest.raises(CameraError, match="expected replay:PATH"):
         open_camera("replay")

@@ -221,8 +221,8 @@ def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
         monitor.accept(good)
     dragged = replace(good, residual=0.0045).figures
     assert not first_failure(RELATIVE, dragged, monitor.limits("tracking"))
-    assert "4.5 mm" in first_failure(RELATIVE, dragged, monitor.limits("crowded"))
-    assert not first_failure(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("crowded"))
+    assert "4.5 mm" in first_failure(RELATIVE, dragged, monitor.limits("mostly dynamic"))
+    assert not first_failure(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("mostly dynamic"))
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

@@ -111,14 +111,17 @@ def test_segments_that_move(scene):
 def test_segments_that_stand_still(scene):
     rng, depth, _, _ = scene
     segments = segments_of(rng, depth)
-    gap = (0.01 * smooth(rng, 4)).astype(np.float32)
-    gap[(depth <= 0) | (rng.random(SHAPE) < 0.1)] = np.nan
-    difference = np.where(np.isnan(gap), np.float32(np.nan), 0.01 * smooth(rng, 1))
+    gaps = np.array([(0.01 * smooth(rng, 4)).astype(np.float32) for _ in range(2)])
+    gaps[:, (depth <= 0) | (rng.random(SHAPE) < 0.1)] = np.nan
+    differences = np.where(np.isnan(gaps), np.float32(np.nan), 0.01 * smooth(rng, 1))
     dynamic, settled = depth > 0, np.ones(33, bool)
-    expected = label_oracle.still(segments, dynamic, gap, difference)
-    assert stand_still(segments, dynamic, gap, difference, settled) == expected.any()
+    first, second = (label_oracle.still(segments, dynamic, *older) for older in zip(gaps, differences, strict=True))
+    stand_still(segments, dynamic, gaps[:1], differences[:1], settled)
+    assert np.array_equal(settled[1:], first)
+    stand_still(segments, dynamic, gaps, differences, settled)
+    expected = first & second
     assert np.array_equal(settled[1:], expected)
-    assert 0 < expected.sum() < 32
+    assert 0 < expected.sum() < first.sum() < 32
 
 
 def test_an_older_image_is_compared(scene):

@@ -109,9 +109,7 @@ def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
     people, wall = rng.integers([5, 5], [190, 230], (200, 2)), rng.integers([210, 5], [310, 230], (100, 2))
     pixels = np.concatenate([people, wall])
     targets = pixels + np.where(np.arange(300)[:, None] < 200, [6.0, 0.0], 0.0)
-    monkeypatch.setattr(
-        dominant, "track_forward_backward", lambda *_: (pixels, targets, np.zeros(300), np.ones(300, bool))
-    )
+    monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: (targets, np.zeros(300), np.ones(300, bool)))
     monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
     points = CAMERA.points(*pixels.T, level.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64))
     view = SimpleNamespace(fine=level, grey=None, corners=pixels, corner_points=points, labelled=level)

@@ -5,7 +5,7 @@ import pytest
 
 from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.segment_motion import classify_segments, counts_in, split_mixed_segments
-from dudmap.core.dynamics.segments import segment
+from dudmap.core.dynamics.segments import intensity_gradient, segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
@@ -257,3 +257,14 @@ def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
     for share, whole in ((0.5, False), (0.9, True)):
         evidence = np.array([[0.0] * 5, [5000, 1, share, 3, 1], [15000, 1, 0, 0.1, 0.05]])
         assert classify_segments(evidence, np.zeros(3), 60.0).tolist() == [False, whole, False]
+
+
+def test_the_gradient_does_not_depend_on_where_the_memory_lies():
+    """Some functions of OpenCV round otherwise in the last bit where an array begins at another address."""
+    rng = np.random.default_rng(0)
+    image = level(np.ones((120, 160), np.float32), rng.random((120, 160), np.float32))
+    kept, found = [], set()
+    for number in range(60):
+        kept += [np.empty(16 * number + 8, np.uint8), intensity_gradient(image)]
+        found.add(kept[-1].tobytes())
+    assert len(found) == 1

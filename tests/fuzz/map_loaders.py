@@ -1,13 +1,15 @@
 """Maps, the stored state of a run and keyframes, each with a writer of a small valid one."""
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 
-def volume(content=True):
-    """A small map of a wall, or an empty one."""
+def volume():
+    """A small map of a wall."""
     from dudmap.config import SensorConfig, VolumeConfig
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.camera import Camera
@@ -15,8 +17,7 @@ def volume(content=True):
 
     made = TsdfVolume(Camera(20, 20, 15.5, 11.5, 32, 24), VolumeConfig(voxel_size=0.1), SensorConfig(), 3.0)
     frame = Frame(0.0, np.full((24, 32), 1.5, np.float32), np.full((24, 32, 3), 90, np.uint8))
-    if content:
-        made.integrate(frame, np.eye(4), np.ones((24, 32), bool))
+    made.integrate(frame, np.eye(4), np.ones((24, 32), bool))
     return made
 
 
@@ -50,23 +51,41 @@ def load_map(path):
     loaded.raycast(np.eye(4), loaded.camera)
 
 
-def parts(content=True):
-    """A state with values of all kinds that a tree has; its map is empty without ``content``."""
+def parts():
+    """A state with values of all kinds that a tree has, and their annotations by name."""
     from collections import deque
 
     from dudmap.config import Config
     from dudmap.core.geometry.camera import Camera
+    from dudmap.core.map.volume import TsdfVolume
     from dudmap.core.places.atlas import TimedPose
     from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
+    from dudmap.core.tracking.motion_model import MotionModel
 
     rng = np.random.default_rng(0)
     features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
-    keyframe, numbers = Keyframe(1.0, np.eye(4), features), np.arange(100.0)
-    return {
-        "volume": volume(content), "numbers": numbers, "again": [numbers, keyframe], "keyframe": keyframe, "rng": rng,
-        "config": Config(), "camera": Camera(20, 20, 15.5, 11.5, 32, 24), "last": deque([1.5, None, "a"], 5),
-        "poses": [TimedPose(0.1 * k, np.eye(4), 0) for k in range(40)], "seen": {1, 2}, "pair": (1, np.float32(0.5)),
-    }  # fmt: skip
+    keyframe = Keyframe(1.0, np.eye(4), features)
+
+    @dataclass
+    class Everything:
+        numbers: NDArray[np.float64]
+        again: list[Keyframe]
+        keyframe: Keyframe
+        generator: np.random.Generator
+        config: Config
+        camera: Camera
+        last: deque[float | str | None]
+        poses: list[TimedPose]
+        seen: set[int]
+        pair: tuple[int, float]
+
+    numbers, poses = np.arange(100.0), [TimedPose(0.1 * k, np.eye(4), 0) for k in range(40)]
+    everything = Everything(
+        numbers, [keyframe, keyframe], keyframe, rng, Config(), Camera(20, 20, 15.5, 11.5, 32, 24),
+        deque([1.5, None, "a"], 5), poses, {1, 2}, (1, np.float32(0.5)),
+    )  # fmt: skip
+    made = {"volume": volume(), "everything": everything, "motion": MotionModel(Config().tracker)}
+    return made, {"volume": TsdfVolume, "everything": Everything, "motion": MotionModel}
 
 
 def state(folder):
@@ -74,28 +93,26 @@ def state(folder):
     from dudmap.app.state.system import take_snapshot
 
     database = StateDatabase(folder / "state.db")
-    database.write(take_snapshot(parts(), database), {"next": 1})
+    database.write(take_snapshot(parts()[0], database), {"next": 1})
     database.close()
     return folder / "state.db"
 
 
 def load_state(path):
     from dudmap.app.state.database import StateReader
-    from dudmap.app.state.system import restore
+    from dudmap.app.state.tree import TreeReader
 
     try:
         reader = StateReader(path)
         reader.meta()
-        like = parts(content=False)
-        kinds = {key: type(value) for key, value in like.items()}
-        found = restore(reader, like)
+        new, hints = parts()
+        tree = TreeReader(reader)
+        found = {name: tree.part(name, hint, new["motion"]) for name, hint in hints.items()}
         reader.close()
-        for key, value in found.items():
-            assert value is None or isinstance(value, kinds.get(key, object))
-        if found.get("keyframe") is not None:
-            assert found["keyframe"].features.points.dtype.kind in "fiu"
-        if found.get("volume") is not None:
-            found["volume"].extract_mesh()
+        everything = found["everything"]
+        assert everything.keyframe.features.points.dtype.kind in "fiu"
+        assert all(type(pose.submap) is int for pose in everything.poses)
+        found["volume"].extract_mesh()
     finally:
         for companion in ("-wal", "-shm"):  # SQLite makes them beside any database that is read while it may be written
             path.with_name(path.name + companion).unlink(missing_ok=True)

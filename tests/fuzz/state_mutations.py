@@ -7,31 +7,18 @@ import zlib
 from contextlib import closing
 from functools import lru_cache
 
-CLASSES = (
-    "dudmap.core.map.voxel_blocks:VoxelBlocks", "dudmap.core.map.volume:TsdfVolume",
-    "dudmap.core.places.place_recognition:Keyframe",
-    "dudmap.core.backends.parameters:VoxelGrid", "dudmap.config:Config", "dudmap.core.slam:Slam",
-    "dudmap.core.geometry.camera:Camera",
-    "dudmap.core.map.memory_limit:MemoryLimit", "subprocess:Popen", "os:system", "builtins:eval",
-    "dudmap.core.slam:np", 7,
-)  # fmt: skip
+TEXTS = "dudmap.core.slam:Slam", "subprocess:Popen", "os:system", "builtins:eval", "<f8", "|O", "{}", "{", 7
 VALUES = (
     None, True, -1, 0, 1, 7, 10**9, 10**40, 1.5, float("nan"), "", "x" * 50, [], {}, [[]], [None] * 40, {"a": 1},
-    {"same": 0}, {"same": 3}, {"same": 10**6}, {"same": "x"}, {"backend": 1}, {"array": 0, "id": 90},
-    {"array": 999, "id": 91},
-    {"array": -1, "id": 92}, {"list": [1, {"same": 93}], "id": 93}, {"list": {"numbers": 0}, "id": 94},
-    {"list": {"stack": 0}, "id": 95}, {"dict": [1], "values": [], "id": 96},
-    {"deque": [1, 2], "limit": 10**30, "id": 97},
-    {"deque": [1], "limit": "x", "id": 98}, {"scalar": "<U999999999", "value": "a"}, {"scalar": "|O", "value": 1},
-    {"scalar": "<f8", "value": "1"}, {"scalar": "nonsense", "value": 1},
-    {"random": {"bit_generator": "MT19937"}, "id": 99},
-    {"random": 3, "id": 100}, {"set": [[]], "id": 101}, {"frozenset": [1, 1], "id": 102}, {"result": 3, "id": 103},
-    {"tuple": [10**9], "class": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 104}, {"records": 0}, {"call": 3},
-    {"object": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 105, "attributes": {"table": 3}},
-    {"list": {"columns": "dudmap.core.places.atlas:TimedPose", "names": ["a"], "values": [[1]], "count": 1}, "id": 106},
-    {"model": "dudmap.config:Config", "json": "{", "id": 107},
-    {"model": "dudmap.core.slam:Slam", "json": "{}", "id": 108},
-    {"map": 0, "blocks": 3, "object": "dudmap.core.map.volume:TsdfVolume", "id": 109, "attributes": {}},
+    {"same": 0}, {"same": 3}, {"same": 10**6}, {"same": "x"}, {"array": 0, "id": 90}, {"array": 999, "id": 91},
+    {"array": -1, "id": 92}, {"items": [1, {"same": 93}], "id": 93}, {"items": {"stack": 0}, "id": 94},
+    {"items": {"lines": 0}, "id": 95}, {"keys": [1], "items": [], "id": 96}, {"stack": 0}, {"stack": 1}, {"lines": 1},
+    {"items": [1, 2], "limit": 10**30, "id": 97}, {"items": [1], "limit": "x", "id": 98},
+    {"scalar": "<U999999999", "value": "a"}, {"scalar": "|O", "value": 1}, {"scalar": "<f8", "value": "1"},
+    {"scalar": "nonsense", "value": 1}, {"random": {"bit_generator": "MT19937"}, "id": 99}, {"random": 3, "id": 100},
+    {"result": 3, "id": 103}, {"fields": {}, "id": 104}, {"fields": {"T_world_camera": 3}, "id": 105},
+    {"columns": {"timestamp": [1.0]}, "first": 1}, {"json": "{", "id": 107}, {"state": {}, "id": 108},
+    {"map": 0, "settings": 3, "state": {}, "id": 109}, {"store": 3, "state": {}, "id": 110},
 )  # fmt: skip
 
 
@@ -47,7 +34,7 @@ def state_parts(data):
 
 
 def state_tree(rng, data):
-    """A database whose tree is another one: other types, references, counts, cycles, attributes and classes."""
+    """A database whose tree is another one: other types, references, counts, cycles and attributes."""
     text = state_parts(data)
     if text is None:
         return data
@@ -88,9 +75,9 @@ def change_node(rng, tree):
         other = rng.choice(keys)
         node[key], node[other] = node[other], node[key]
     elif change < 0.8 and isinstance(node, dict):
-        node[rng.choice(("__class__", "__dict__", "forgotten", "attributes", "class", "map", "store"))] = node[key]
+        node[rng.choice(("__class__", "__dict__", "forgotten", "fields", "state", "map", "store"))] = node[key]
     elif change < 0.9:
-        node[key] = rng.choice(CLASSES) if isinstance(node[key], str) else copy.deepcopy(rng.choice(above))
+        node[key] = rng.choice(TEXTS) if isinstance(node[key], str) else copy.deepcopy(rng.choice(above))
     elif isinstance(node, list):
         node.extend(copy.deepcopy(node[:1]) * rng.choice((1, 3, 40)))
     elif isinstance(node[key], int):

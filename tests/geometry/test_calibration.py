@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from dudmap.core.backends.cpu.color_registration import color_pixels
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
@@ -18,6 +17,13 @@ TWIST = np.array([0.4, -0.3, 0.2, 0.8, -1.0, 0.9])
 
 def calibration(**changes) -> Calibration:
     return Calibration(COLOR, T_COLOR_DEPTH, **({"delay": 0.02, "readout": 0.025} | changes))
+
+
+def color_pixels(depth, projection, *, camera=DEPTH, color=COLOR):
+    """Coordinates u, v (h, w) in the colour image of the pixels of a depth image, moved to its border where they lie
+    outside of it: what they show in two images of these coordinates."""
+    images = np.meshgrid(np.arange(color.width, dtype=np.float32), np.arange(color.height, dtype=np.float32))
+    return [register_color(image, depth, camera, projection) for image in images]
 
 
 def seen_by_color(points, camera, tau):
@@ -42,13 +48,16 @@ def test_each_depth_pixel_is_found_where_the_colour_camera_saw_it():
     rng = np.random.default_rng(1)
     depth = rng.uniform(0.8, 3.0, DEPTH.shape).astype(np.float32)
     offset = 0.004
-    us, vs = color_pixels(depth, DEPTH.intrinsics, color_projection(calibration(), TWIST, offset), 1.0, 0, DEPTH.height)
+    us, vs = color_pixels(depth, color_projection(calibration(), TWIST, offset))
     points = DEPTH.backproject(depth).reshape(-1, 3).astype(np.float64)
     tau = np.full(len(points), offset + 0.02)
     for _ in range(6):  # the row gives the time, and the time the row
         found = seen_by_color(points, COLOR, tau)
         tau = offset + 0.02 + 0.025 * ((np.clip(found[:, 1], 0, COLOR.height) + 0.5) / COLOR.height - 0.5)
+    found = np.clip(found, 0, [COLOR.width - 1, COLOR.height - 1])
     error = np.hypot(us.ravel() - found[:, 0], vs.ravel() - found[:, 1])
+    inside = np.all((found > 0) & (found < [COLOR.width - 1, COLOR.height - 1]), axis=1)
+    assert inside.mean() > 0.7
     # the kernel stops after one such step, leaves the lens out of the row's time, and expands to the second order
     assert error.max() < 0.06
 
@@ -58,9 +67,26 @@ def test_pixels_without_a_reading_take_the_depth_of_a_neighbour_in_their_row():
     holes = depth.copy()
     holes[10, 30:60] = holes[20, :40] = holes[30, 50:] = holes[40] = 0
     projection = color_projection(calibration(delay=0.0, readout=0.0), np.zeros(6), 0.0)
-    full, filled = (color_pixels(d, DEPTH.intrinsics, projection, 2.0, 0, DEPTH.height) for d in (depth, holes))
+    full, filled = (color_pixels(d, projection) for d in (depth, holes))
     assert np.array_equal(full[0], filled[0])
     assert np.array_equal(full[1], filled[1])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_colours_are_interpolated_between_four_pixels(dtype):
+    rng = np.random.default_rng(2)
+    depth = rng.uniform(0.8, 3.0, DEPTH.shape).astype(np.float32)
+    color = rng.uniform(0, 255, (*COLOR.shape, 3) if dtype == np.uint8 else COLOR.shape).astype(dtype)
+    projection = color_projection(calibration(), TWIST, 0.0)
+    us, vs = (at.astype(np.float64)[..., *[None] * (color.ndim - 2)] for at in color_pixels(depth, projection))
+    u0, v0 = np.minimum(us, COLOR.width - 2).astype(int), np.minimum(vs, COLOR.height - 2).astype(int)
+    a, d = us - u0, vs - v0
+    if color.ndim == 3:
+        u0, v0 = u0[..., 0], v0[..., 0]
+    (top_left, top), (left, below) = ((color[v0 + n, u0], color[v0 + n, u0 + 1]) for n in (0, 1))
+    expected = (1 - d) * ((1 - a) * top_left + a * top) + d * ((1 - a) * left + a * below)
+    registered = register_color(color, depth, DEPTH, projection)
+    assert np.abs(registered - expected).max() < (0.51 if dtype == np.uint8 else 0.01)
 
 
 def test_a_plane_seen_by_two_cameras_has_one_colour():

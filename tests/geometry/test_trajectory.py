@@ -33,13 +33,13 @@ def test_interpolation_lies_on_the_screw_between_neighbours():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "no pose"),
-        ("# only a comment\n", "no pose"),
+        ("", "lists nothing"),
+        ("# only a comment\n", "lists nothing"),
         ("1 2 3\n", "line 1"),
         ("0 0 0 0 0 0 0 1\n1 0 0 nan 0 0 0 1\n", "line 2"),
         ("0 0 0 0 0 0 0 0\n", "non-zero quaternion"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "not strictly increasing"),
-        ("hello\n", "eight finite numbers"),
+        ("hello\n", "expected .timestamp tx ty tz"),
     ],
 )
 def test_bad_text_is_refused_with_a_sentence(tmp_path, text, says):

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from dudmap.config import Config
 from dudmap.core.backends.cpu.filtering import intensity
 from dudmap.core.backends.device import make_backend
-from dudmap.core.backends.parameters import RegistrationParameters
+from dudmap.core.backends.parameters import LevelImage, RegistrationParameters
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
@@ -32,8 +32,8 @@ def linearized(volume, recording, tukey=0.0, index=4):
     depth, shade = frame.depth.astype(np.float32), intensity(np.ascontiguousarray(frame.color))
     weights = np.linspace(0, 1, depth.size, dtype=np.float32).reshape(depth.shape)
     volume.look_at(T)
-    images = depth, shade, weights, CAMERA.intrinsics
-    return volume.backend.register(volume.grid, *images, T, None, NO_STEP, registration(volume, tukey)).equations
+    image = LevelImage(depth, shade, weights, CAMERA.intrinsics)
+    return volume.backend.register(volume.grid, image, T, None, NO_STEP, registration(volume, tukey)).equations
 
 
 def test_maps_have_the_same_blocks_and_voxels(maps):

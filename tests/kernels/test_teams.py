@@ -8,7 +8,7 @@ from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.registration import write_lattice
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, run_team, take, wait_for_all, wait_for_work
 from dudmap.core.backends.descent import descend
-from dudmap.core.backends.parameters import to_lattice
+from dudmap.core.backends.parameters import LevelImage, to_lattice
 from dudmap.core.backends.threads import kernel
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -79,8 +79,8 @@ def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, column
     rules = tracker._rules(8, finest=False)._replace(basis=np.eye(6)[:, :columns].copy())
     first = tracker.linearize(volume, level, T, weights) if known else None
     parameters = tracker.parameters(volume.band)
-    images = level.depth, level.intensity, weights, level.camera.intrinsics
-    found = volume.backend.register(volume.grid, *images, T, first, rules, parameters)
+    image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
+    found = volume.backend.register(volume.grid, image, T, first, rules, parameters)
     expected = descend(lambda at: tracker.linearize(volume, level, at, weights), T, first, rules)
     assert found.iterations == expected.iterations > 2
     assert found.settled == expected.settled
@@ -89,7 +89,7 @@ def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, column
     np.testing.assert_allclose(found.T_world_camera, expected.T_world_camera, atol=1e-6)
     np.testing.assert_allclose(found.equations.H, expected.equations.H, atol=1e-4 * np.abs(expected.equations.H).max())
     np.testing.assert_allclose(found.equations.residuals, expected.equations.residuals, atol=1e-4)
-    again = volume.backend.register(volume.grid, *images, T, first, rules, parameters)
+    again = volume.backend.register(volume.grid, image, T, first, rules, parameters)
     np.testing.assert_array_equal(found.T_world_camera, again.T_world_camera)
 
 

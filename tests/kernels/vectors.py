@@ -32,9 +32,8 @@ def counts(kernel, signature, source=None):
         namespace = dict(function.__globals__) | {"kernel": lambda plain: plain, "scalar": lambda plain: plain}
         exec(compile(source, "<variant>", "exec"), namespace)
         function = namespace[function.__name__]
-    options = {
-        name: value for name, value in kernel.targetoptions.items() if name in ("nogil", "fastmath", "error_model")
-    }
+    given = getattr(kernel, "inlined", kernel).targetoptions
+    options = {name: value for name, value in given.items() if name in ("nogil", "fastmath", "error_model")}
     compiled = njit(**options)(function)
     compiled.compile(signature)
     (assembly,) = compiled.inspect_asm().values()

@@ -201,7 +201,7 @@ def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, sh
     motion = motion_of(moving_share=moving_share, share=share)
     monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: motion)
     subject = relocalizer()
-    subject.lost(0.0, crowded=crowded)
+    subject.lost(0.0, mostly_dynamic=crowded)
     assert not subject.wants_new_submap(lost_view(0.5))
     assert subject.wants_new_submap(lost_view(10.0)) == wanted
 
@@ -227,7 +227,7 @@ def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeyp
 def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monkeypatch, crowded):
     monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: None)
     subject = relocalizer()
-    subject.lost(0.0, crowded=crowded)
+    subject.lost(0.0, mostly_dynamic=crowded)
     assert subject.wants_new_submap(lost_view(10.0)) != crowded
 
 

@@ -162,6 +162,30 @@ def test_the_node_maps_publishes_saves_and_ends(node_class, recording, tmp_path)
     assert node.alive == []
 
 
+def test_what_appeared_since_the_saved_map_is_published(node_class, recording, tmp_path):  # noqa: F811
+    node = node_class()
+    node.parameters |= {"volume.voxel_size": 0.04, "save_to": str(tmp_path / "run")}
+    node.on_configure(None)
+    node.on_activate(None)
+    for index in range(20):
+        node.process(*messages(recording, index))
+    assert node.published["changes"] == []
+    node.save(None, answer())
+    node = node_class()
+    node.parameters |= {"volume.voxel_size": 0.04, "saved_map": str(tmp_path / "run"), "watch": True, "localize": True}
+    node.on_configure(None)
+    node.on_activate(None)
+    for index in range(20):
+        depth, color, info = messages(recording, index, offset=50 + 0.1 * index)
+        if index > 2:
+            z = depth.data.view(np.uint16).reshape(depth.height, depth.width).copy()
+            z[45:80, 60:95] = 2000  # a plate in the air
+            depth.data = z.view(np.uint8).reshape(-1)
+        node.process(depth, color, info)
+    shown = [len(message.markers) - 1 for message in node.published["changes"]]  # the first marker removes old ones
+    assert shown == [1]
+
+
 def test_a_wrong_parameter_is_said_and_refused(node_class):
     node = node_class()
     node.parameters["volume.voxel_size"] = -1.0

@@ -71,6 +71,8 @@ def test_a_session_maps_saves_localizes_and_resets(recording, tmp_path):
     assert not session.localize
     with pytest.raises(ConfigError, match="nothing to localise in; set the parameter saved_map"):
         Session(COARSE, localize=True)
+    with pytest.raises(ConfigError, match="no earlier visit to compare with; set the parameter saved_map"):
+        Session(COARSE, watch=True)
 
     later = Session(COARSE, saved_map=str(folder), localize=True)
     found = later.process(*messages(recording, 11, offset=50.0))

@@ -8,14 +8,28 @@ import sqlite3
 import threading
 import time
 import zlib
+from collections import deque
+from collections.abc import Callable
 from contextlib import closing
+from typing import get_args
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
-from dudmap.app.state import database, schema
+from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.state import database
+from dudmap.app.state.annotations import RECORD, content_type, fields_of
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.system import restore, take_snapshot
+from dudmap.app.state.system import parts_of, read_system, take_snapshot
+from dudmap.app.state.tree import TreeReader
+from dudmap.config import Config
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.slam import Slam
+from dudmap.core.state import Stateful, remembered
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.errors import StateError
 
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x AS key, 'a' AS value FROM n"
@@ -83,7 +97,7 @@ def test_a_tree_that_is_a_bomb(path):
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE state SET crc = ?, tree = ?", (zlib.crc32(packed), packed))
     with pytest.raises(StateError, match="unpack to more than"):
-        restore(StateReader(path), {})
+        TreeReader(StateReader(path))
 
 
 def test_a_journal_is_not_played_back(path, tmp_path):
@@ -114,41 +128,59 @@ def store(path, tree, arrays=()):
         connection.execute("UPDATE state SET crc = ?, tree = ?", (zlib.crc32(packed), packed))
 
 
-CALLED = {"tuple": [10**9], "class": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 1}
-LIST = {"list": [1, 2], "id": 1}
-
-
 def camera(**changes):
     values = {"fx": 30.0, "fy": 30.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30, "depth_scale": 1000.0,
-              "distortion": {"tuple": [], "id": 2}} | changes  # fmt: skip
-    attributes = {key: value for key, value in values.items() if value != "left out"}
-    return {"object": "dudmap.core.geometry.camera:Camera", "id": 1, "attributes": attributes}
+              "distortion": {"items": [], "id": 2}} | changes  # fmt: skip
+    return {"fields": {key: value for key, value in values.items() if value != "left out"}, "id": 1}
 
 
 @pytest.mark.parametrize(("node", "match"), [
-    (CALLED, r"at state\[0\]: VoxelBlocks is no tuple of 1 values"),
-    (LIST, r"at state\[0\]: found list; expected Camera|found values of other types"),
-    (camera(fx={"dict": [], "values": [], "id": 3}), r"at state\[0\]\.fx: found dict; expected float"),
-    (camera(width="left out"), r"at state\[0\]: found the attributes .* of Camera; expected"),
+    ({"items": [1, 2], "id": 1}, "at part: KeyError 'fields'"),
+    (camera(fx={"keys": [], "items": [], "id": 3}), r"at part\.fx: found a value of the kind .*; expected .*float"),
+    (camera(fx="wide"), r"at part\.fx: found str; expected float"),
+    (camera(width=40.5), r"at part\.width: found float; expected int"),
+    (camera(width="left out"), r"at part: found the attributes .* of Camera; expected"),
     (camera(__class__=1), r"found the attributes \['__class__', "),
-    ({"object": "dudmap.core.map.volume:TsdfVolume", "id": 1, "attributes": {}}, "of other types|TsdfVolume"),
-    ({"object": "os:system", "id": 1, "attributes": {}}, "which this version does not know"),
-    ({"scalar": "<U999999999", "value": "a"}, "not understood|expected a number"),
-    ({"deque": [], "limit": "x", "id": 1}, "TypeError"),
-    ({"same": 77}, "KeyError 77"),
+    (camera(distortion={"items": [{"same": 77}], "id": 2}), r"at part\.distortion\[0\]: KeyError 77"),
+    (camera(distortion={"items": [0.1, "a"], "id": 2}), r"at part\.distortion\[1\]: found str; expected float"),
+    (camera(fx={"scalar": "<U999999999", "value": "a"}), "not understood|expected a number"),
     (camera(width=10**9), "camera image is 1000000000x30"),
-    ({"model": "dudmap.core.slam:Slam", "json": "{}", "id": 1}, "Slam is no configuration"),
+    ({"object": "os:system", "id": 1, "attributes": {}}, "KeyError 'fields'"),
+    (None, "found NoneType; expected Camera"),
+    ("os.system", "found str; expected Camera"),
 ])  # fmt: skip
 def test_a_tree_of_another_type_is_refused_with_its_place(node, match, path):
     from dudmap.core.geometry.camera import Camera
 
-    like = {"camera": Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)}
-    store(path, {"dict": ["camera"], "values": [camera()], "id": 0})
-    assert restore(StateReader(path), dict(like))["camera"] == Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)
-    store(path, {"dict": ["camera"], "values": [node], "id": 0})
+    store(path, {"part": camera()})
+    found = TreeReader(StateReader(path)).part("part", Camera)
+    assert found == Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)
+    store(path, {"part": node})
     with pytest.raises(StateError, match="damaged or not of this program") as error:
-        restore(StateReader(path), dict(like))
+        TreeReader(StateReader(path)).part("part", Camera)
     assert re.search(match, str(error.value)), error.value
+
+
+@pytest.mark.parametrize(("hint", "node", "match"), [
+    (deque[float], {"items": [], "limit": "x", "id": 1}, "TypeError"),
+    (tuple[int, str], {"items": [1], "id": 1}, "found 1 values; expected 2"),
+    (MotionModel, {"state": {}, "id": 1}, "found a MotionModel, which a new object of this kind does not have"),
+    (Config, {"json": "{}", "__class__": 1, "id": 1}, ""),
+    (Config, {"json": '{"no such section": 1}', "id": 1}, "ValidationError"),
+    (list[str], {"items": {"stack": 0}, "id": 1}, "found other values than"),
+    (Callable[[], str], {"result": 1, "id": 1}, "found int; expected str"),
+    (TsdfVolume, {"map": 0, "state": {}, "id": 1}, "KeyError 'settings'"),
+])  # fmt: skip
+def test_what_does_not_fit_its_annotation_is_refused(hint, node, match, path):
+    with closing(sqlite3.connect(path)) as connection:
+        key = connection.execute("SELECT key FROM chunks").fetchone()[0].hex()
+    store(path, {"part": node}, [{"dtype": "<f8", "shape": [100], "transposed": False, "chunks": [key]}])
+    tree = TreeReader(StateReader(path))
+    if not match:
+        assert tree.part("part", hint) == Config()
+        return
+    with pytest.raises(StateError, match=match):
+        tree.part("part", hint)
 
 
 @pytest.mark.parametrize("array", [
@@ -161,7 +193,7 @@ def test_a_tree_of_another_type_is_refused_with_its_place(node, match, path):
 def test_arrays_have_the_size_of_what_is_stored(array, path):
     store(path, None, [array])
     with pytest.raises(StateError, match=r"is damaged: .*(array|data type)"):
-        restore(StateReader(path), None)
+        TreeReader(StateReader(path))
 
 
 def test_one_part_that_stands_in_many_arrays(path):
@@ -170,25 +202,36 @@ def test_one_part_that_stands_in_many_arrays(path):
         key = connection.execute("SELECT key FROM chunks").fetchone()[0].hex()
     store(path, None, [{"dtype": "<f8", "shape": [10**7], "transposed": False, "chunks": [key] * 100_000}])
     with pytest.raises(StateError, match="its arrays have 80000000 bytes, and 800 are stored"):
-        restore(StateReader(path), None)
+        TreeReader(StateReader(path))
 
 
-def test_what_is_missing_in_the_state_of_a_run(tmp_path):
+def test_what_is_missing_in_the_state_of_a_run(path):
     """A tree that is one, but not that of a run."""
-    from dudmap.app.pipeline.metrics import RunRecord
-    from dudmap.app.pipeline.storing import RunState
-
-    made = StateDatabase(tmp_path / "state.db")
-    made.write(take_snapshot({"numbers": np.arange(10.0)}, made), {"next": 1})
-    with pytest.raises(StateError, match="found dict; expected RunState"):
-        restore(StateReader(tmp_path / "state.db"), RunState(None, RunRecord()))
+    with pytest.raises(StateError, match="at arguments: KeyError 'arguments'"):
+        read_system(TreeReader(StateReader(path)), None)
 
 
-def test_the_annotations_of_all_classes_of_a_state_are_known():
-    """A dataclass whose annotations cannot be evaluated would be read without a look at its types."""
-    from dataclasses import is_dataclass
+def reachable(*hints):
+    """All classes that the annotations of a class lead to."""
+    found, todo = set(), list(hints)
+    while todo:
+        kind, parts = content_type(todo.pop())
+        if kind in found or kind in (object, np.ndarray):
+            continue
+        assert isinstance(kind, type) or kind is Callable
+        found.add(kind) if not parts else None
+        todo += [part for part in parts if part is not ... and (kind, parts) != (dict, get_args(RECORD))]
+        if isinstance(kind, type):
+            todo += (remembered(kind) if issubclass(kind, Stateful) else fields_of(kind)).values()
+    return found
 
-    classes = [schema.class_of(name) for name in schema._table()]
-    assert len(classes) > 100
-    unknown = [cls.__name__ for cls in classes if is_dataclass(cls) and not schema._hints(cls)]
-    assert unknown == []
+
+def test_a_state_leads_to_classes_of_this_program_alone():
+    """Whatever is stored, nothing else can be made of it; and every annotation says what it is."""
+    slam = Slam(Camera(30.0, 30.0, 20.0, 15.0, 40, 30))
+    found = reachable(*map(type, parts_of(slam).values()), RunRecord, Calibration)
+    ours = {kind for kind in found if kind.__module__.startswith("dudmap.")}
+    assert found - ours == {np.random.Generator}
+    assert len(ours) > 70
+    stateless = [kind for kind in ours if not issubclass(kind, Stateful | BaseModel) and not fields_of(kind)]
+    assert stateless == []

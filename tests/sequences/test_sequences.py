@@ -323,7 +323,7 @@ def test_a_bad_mask_and_a_bad_ground_truth(recording):
     with pytest.raises(FrameError, match=r"mask/0\.png does not exist"):
         open_sequence(recording).mask(0)
     (recording / "groundtruth.txt").write_text("100 1 2 3\n")
-    with pytest.raises(DatasetError, match="expected eight finite numbers"):
+    with pytest.raises(DatasetError, match="expected 'timestamp tx ty tz"):
         open_sequence(recording)
 
 

@@ -17,7 +17,7 @@ class NoDatabase:
         pass
 
 
-STATE = RunState(slam=None, record=SimpleNamespace(settle=lambda: None))
+STATE = RunState(SimpleNamespace(first_pass=None, arguments=None), SimpleNamespace(settle=lambda: None))
 
 
 def store_of(folder, every, notice):

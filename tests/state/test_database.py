@@ -1,19 +1,27 @@
 """The database: keys, whole checkpoints or none, readers beside a writer, damage, writes that fail."""
 
 import sqlite3
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import closing
-from types import SimpleNamespace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.system import restore, take_snapshot
+from dudmap.app.state.system import take_snapshot
+from dudmap.app.state.tree import NotSettledError, TreeReader
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.pose_graph import Edge
 from dudmap.errors import DudmapError, StateError
 from state_differences import differences
+from state_parts import restore
 
 TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=31.5, width=80, height=64)
 
@@ -29,21 +37,24 @@ def moved(x):
     return T
 
 
+HINTS = {"volume": TsdfVolume, "numbers": np.ndarray}
+
+
 class Grown:
     """A map that grows, and arrays beside it, as a state that is stored again and again."""
 
     def __init__(self, path):
-        self.volume, self.value = TsdfVolume(TINY), {"numbers": np.arange(40_000.0)}
+        self.volume, self.numbers = TsdfVolume(TINY), np.arange(40_000.0)
         self.database = StateDatabase(path)
         self.steps = 0
 
     @property
     def state(self):
-        return {"volume": self.volume, **self.value}
+        return {"volume": self.volume, "numbers": self.numbers}
 
     def grow(self):
         self.volume.integrate(wall(1.0 + 0.01 * self.steps), moved(0.3 * self.steps))
-        self.value["numbers"][self.steps] = -1
+        self.numbers[self.steps] = -1
         self.steps += 1
 
     def store(self):
@@ -52,15 +63,7 @@ class Grown:
 
 def read(path):
     reader = StateReader(path)
-    return restore(reader, {"volume": TsdfVolume(TINY)}), reader.meta()
-
-
-def assert_same(tmp_path, a, b):
-    snapshots = []
-    for n, state in enumerate((a, b)):
-        (tmp_path / f"compare{n}").unlink(missing_ok=True)
-        snapshots.append(take_snapshot(state, StateDatabase(tmp_path / f"compare{n}")))
-    assert differences(*snapshots) == []
+    return restore(reader, HINTS), reader.meta()
 
 
 def test_only_changed_blocks_and_parts_of_arrays_are_written(tmp_path):
@@ -79,7 +82,7 @@ def test_only_changed_blocks_and_parts_of_arrays_are_written(tmp_path):
     assert len(grown.database._execute("SELECT * FROM chunks").fetchall()) <= chunks + 8
     found, meta = read(tmp_path / "state.db")
     assert meta == {"steps": 5}
-    assert_same(tmp_path, grown.state, found)
+    assert differences(grown.state, found) == []
     np.testing.assert_array_equal(found["volume"].extract_mesh().vertices, grown.volume.extract_mesh().vertices)
 
 
@@ -98,11 +101,11 @@ def test_a_block_that_is_gone_leaves_the_database(tmp_path):
     assert places == set(map(tuple, rows))
     assert len(grown.volume.blocks._released) > 0
     assert before
-    assert_same(tmp_path, grown.state, read(tmp_path / "state.db")[0])
+    assert differences(grown.state, read(tmp_path / "state.db")[0]) == []
     grown.volume.clear()
     grown.grow()
     grown.store()
-    assert_same(tmp_path, grown.state, read(tmp_path / "state.db")[0])
+    assert differences(grown.state, read(tmp_path / "state.db")[0]) == []
     assert grown.database._execute("SELECT count(*) FROM blocks").fetchone()[0] == grown.volume.num_blocks
 
 
@@ -115,7 +118,7 @@ def test_others_read_while_it_is_written(tmp_path):
     grown.grow()
     grown.store()
     assert reader.meta() == {"steps": 1}
-    old = restore(reader, {"volume": TsdfVolume(TINY)})  # of one checkpoint, although another was written in between
+    old = restore(reader, HINTS)  # of one checkpoint, although another was written in between
     assert old["volume"].num_integrated == 1
     assert read(tmp_path / "state.db")[0]["volume"].num_integrated == 2
 
@@ -159,10 +162,10 @@ def test_every_statement_that_fails_leaves_the_checkpoint_before(tmp_path):
             break
         assert not real.in_transaction
         if read(path)[1] == {"steps": 1}:
-            assert_same(tmp_path, before, read(path)[0])
+            assert differences(before, read(path)[0]) == []
         grown.grow()
         grown.store()
-        assert_same(tmp_path, grown.state, read(path)[0])
+        assert differences(grown.state, read(path)[0]) == []
     assert 8 < number < 99
 
 
@@ -187,7 +190,7 @@ def test_a_damaged_database_is_refused_in_one_sentence_or_read_as_it_was(tmp_pat
         except DudmapError as error:
             sentences.append(str(error))
         else:
-            np.testing.assert_array_equal(found["numbers"], grown.value["numbers"])
+            np.testing.assert_array_equal(found["numbers"], grown.numbers)
             np.testing.assert_array_equal(found["volume"].blocks.geometry, grown.volume.blocks.geometry[: len(
                 found["volume"].blocks.geometry)])  # fmt: skip
     assert len(sentences) > 75
@@ -223,81 +226,87 @@ def test_what_is_no_state_is_named(tmp_path):
         StateReader(tmp_path / "other.db")
     database = StateDatabase(tmp_path / "new.db")
     database._execute("PRAGMA user_version = 99")
-    with pytest.raises(StateError, match="version 99 of the format; this version reads 3"):
+    with pytest.raises(StateError, match="version 99 of the format; this version reads 4"):
         StateReader(tmp_path / "new.db")
     StateDatabase(tmp_path / "empty.db")
     with pytest.raises(StateError, match="holds no checkpoint yet"):
-        restore(StateReader(tmp_path / "empty.db"), None)
+        TreeReader(StateReader(tmp_path / "empty.db"))
 
 
-def test_what_cannot_be_stored_is_an_error_that_names_it(tmp_path):
-    database = StateDatabase(tmp_path / "state.db")
-    volume = TsdfVolume(TINY)
-    volume.forgotten = open(__file__)
-    with volume.forgotten, pytest.raises(StateError, match=r"state\[0\].forgotten is a _io.TextIOWrapper"):
-        take_snapshot([volume], database)
-    volume.forgotten = lambda: 1
-    with pytest.raises(StateError, match=r"forgotten is a builtins\.function"):
-        take_snapshot([volume], database)
-    volume.forgotten = np.array([object()])
-    with pytest.raises(StateError, match="forgotten is an array of objects"):
-        take_snapshot([volume], database)
+@dataclass(eq=False)
+class Kinds:
+    """Values of the kinds that a state has."""
+
+    array: NDArray[np.float64]
+    number: float
+    both: list[int]
+    again: list[NDArray[np.float64]]
+    same: list[int]
+    far: NDArray[np.float64]
+    empty: NDArray[np.float64]
+    nan: float
+    big: int
+    numbers: list[int]
+    generator: np.random.Generator
+    seen: set[int]
+    by_time: dict[float, NDArray[np.float64]]
+    edges: list[Edge]
+    later: Callable[[], Edge]
+    running: "Future[Edge]"
+    last: deque[float]
+    rows: list[dict[str, Any]]
+    texts: tuple[str, ...]
 
 
-def test_an_attribute_that_is_not_restored_is_noticed(tmp_path):
-    a, b = TsdfVolume(TINY), TsdfVolume(TINY)
-    a.integrate(wall(), np.eye(4))
-    b.integrate(wall(), np.eye(4))
-    assert_same(tmp_path, a, b)
-    a.added_later = 1.0
-    with pytest.raises(AssertionError, match="added_later"):
-        assert_same(tmp_path, a, b)
-    b.added_later = 2.0
-    with pytest.raises(AssertionError, match=r"added_later: 1\.0 and 2\.0"):
-        assert_same(tmp_path, a, b)
-
-
-def test_no_class_from_elsewhere_is_made():
-    from dudmap.app.state.tree import TreeReader
-
-    for name in (
-        "subprocess:Popen",
-        "builtins:object",
-        "dudmap.app.pipeline.run:Job",
-        "dudmap.core.slam:np",
-        "os:system",
-    ):
-        reader = SimpleNamespace(state=lambda name=name: ({"object": name, "id": 0, "attributes": {}}, []))
-        with pytest.raises(StateError, match="does not know"):
-            TreeReader(reader).restore(None)
+def kinds():
+    array, both, edges = np.arange(3.0), [1, 2], [Edge(n, n + 1, np.eye(4) * n, 0.1, 0.2) for n in range(40)]
+    running: Future[Edge] = Future()
+    running.set_result(edges[3])
+    return Kinds(
+        array, np.float32(0.1), both, [array], both, np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+        np.empty((0, 3)), float("nan"), 1 << 70, list(range(100)), np.random.default_rng(5), {3, 1},
+        {0.5 * n: np.eye(4) * n for n in range(40)}, edges, lambda: edges[7], running, deque([0.5], 7),
+        [{"a": 1, "b": [None, "x"]}], ("a", "b"),
+    )  # fmt: skip
 
 
 def test_what_is_shared_stays_shared_and_numbers_keep_their_type(tmp_path):
-    array, number, both = np.arange(3.0), np.float32(0.1), [1, 2]
-    itself: list = []
-    itself.append(itself)
-    far = np.asfortranarray(np.arange(12.0).reshape(3, 4))
-    state = {
-        "a": [array, number, both],
-        "b": (array, number, both),
-        "itself": itself,
-        "far": far,
-        "empty": np.empty((0, 3)),
-    }
-    state |= {"nan": float("nan"), "big": 1 << 70, "numbers": list(range(100)), "random": np.random.default_rng(5)}
-    state |= {"set": {3, 1}, "keys": {0.5 * n: np.eye(4) * n for n in range(40)}}
-    state["random"].normal(size=3)
+    state = kinds()
+    state.generator.normal(size=3)
     database = StateDatabase(tmp_path / "state.db")
-    database.write(take_snapshot(state, database), {})
-    found = restore(StateReader(tmp_path / "state.db"), {})
-    assert found["a"][0] is found["b"][0]
-    assert found["a"][2] is found["b"][2]
-    assert type(found["b"][1]) is np.float32
-    assert found["itself"][0] is found["itself"]
-    assert found["far"].flags.f_contiguous
-    assert found["nan"] != found["nan"]
-    assert found["random"].normal() == state["random"].normal()
-    np.testing.assert_array_equal(found["keys"][7.5], np.eye(4) * 15)
-    for key in ("big", "numbers", "set"):
-        assert found[key] == state[key]
-    assert found["empty"].shape == (0, 3)
+    database.write(take_snapshot({"kinds": state}, database), {})
+    found = restore(StateReader(tmp_path / "state.db"), {"kinds": Kinds})["kinds"]
+    assert found.again[0] is found.array
+    assert found.same is found.both
+    assert found.later() is found.edges[7]
+    assert found.running.result() is found.edges[3]
+    assert found.far.flags.f_contiguous
+    assert found.last.maxlen == 7
+    found.later = state.later
+    assert differences(state, found) == []
+    assert found.generator.normal() == state.generator.normal()
+
+
+def test_what_cannot_be_stored_is_an_error_that_names_it(tmp_path):
+    database, state = StateDatabase(tmp_path / "state.db"), kinds()
+    with open(__file__) as file:
+        state.array = file
+        with pytest.raises(StateError, match=r"kinds.array is a _io.TextIOWrapper; expected "):
+            take_snapshot({"kinds": state}, database)
+    state.array = np.array([object()])
+    with pytest.raises(StateError, match="array is an array of objects"):
+        take_snapshot({"kinds": state}, database)
+    state.array, state.running = np.zeros(3), Future()
+    with pytest.raises(NotSettledError):
+        take_snapshot({"kinds": state}, database, wait=False)
+
+
+def test_nothing_is_stored_without_an_annotation_that_says_what_it_is(tmp_path):
+    @dataclass
+    class Vague:
+        anything: Any
+        either: "list[int] | dict[int, int]"
+
+    for value, match in ((Vague([1], [1]), "allows for anything"), (Vague(1, [1]), "is ambiguous")):
+        with pytest.raises(StateError, match=match):
+            take_snapshot({"vague": value}, StateDatabase(tmp_path / "state.db"))

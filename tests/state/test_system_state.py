@@ -1,5 +1,6 @@
 """A system that was stored and read again is the same, attribute by attribute, and goes on with the same results."""
 
+import zlib
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from delayed_color import DELAY, FAULTS, find_early
 from dudmap import resume_system, save_system
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.system import take_snapshot
+from dudmap.app.state.system import parts_of, take_snapshot
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -25,11 +26,6 @@ SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 def scene(movers=("person",), frames=27):
     sequence = synthetic.sequence("room", movers=movers, frames=frames, camera=SMALL, noise="kinect")
     return sequence, [sequence[index] for index in range(frames)]
-
-
-def whole(slam, tmp_path, name):
-    """Snapshot of everything, as into a new database."""
-    return take_snapshot(slam, StateDatabase(tmp_path / name))
 
 
 def assert_same_results(a, b):
@@ -73,7 +69,7 @@ def test_a_stored_system_is_the_same_and_goes_on_the_same(tmp_path, case):
         assert slam.volume.levels[0].blocks.num_voxel_blocks > 100
     save_system(slam, tmp_path / "state.db")
     again = resume_system(tmp_path / "state.db")
-    assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
+    assert differences(slam, again) == []
     for frame in frames[stop:]:
         assert_same_results(slam.process(frame), again.process(frame))
     mesh, other = slam.volume.extract_mesh(), again.volume.extract_mesh()
@@ -101,14 +97,29 @@ def test_a_system_that_calibrates_itself_is_stored_after_every_frame(tmp_path, m
         assert (result.state == "lost", result.calibrated) == (index in (9, 10), index == 6)
         save_system(slam, tmp_path / "state.db")
         again = resume_system(tmp_path / "state.db")
-        assert differences(whole(slam, tmp_path, f"a{index}"), whole(again, tmp_path, f"b{index}")) == []
+        assert differences(slam, again) == []
     assert slam.calibration.delay == DELAY
+
+
+@pytest.mark.parametrize("settings", [["movers.meshes=true", "movers.enabled=true"], ["preset=thesis"]])
+def test_what_a_snapshot_does_not_copy_never_changes(tmp_path, settings):
+    """Arrays of frozen classes are written by another thread while the next frames are processed."""
+    sequence = synthetic.sequence("room", movers=("person", "ball"), frames=20, camera=SMALL, camera_path="fast",
+                                  faults=FAULTS)  # fmt: skip
+    config = Config().override([*settings, "volume.voxel_size=0.02", "submaps.patience=0.2"])
+    slam, database, taken = Slam(sequence.camera, config), StateDatabase(tmp_path / "state.db"), []
+    for index in range(len(sequence)):
+        slam.process(dark(sequence[index]) if 12 <= index < 15 else sequence[index])
+        snapshot = take_snapshot(parts_of(slam), database)
+        taken += [(array, zlib.crc32(array.copy())) for array in map(snapshot.arrays.__getitem__, snapshot.constant)]
+    assert len(taken) > 1000
+    assert all(zlib.crc32(array.copy()) == before for array, before in taken)
 
 
 def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch):
     """A loop says that the camera is 3 mm farther; the map of the 18 frames stored is rebuilt over the next 14."""
     for module in ("atlas", "loop_correction"):
-        monkeypatch.setattr(f"dudmap.core.places.{module}.AT_ONCE", 4)
+        monkeypatch.setattr(f"dudmap.core.places.{module}.MAX_IMMEDIATE", 4)
     monkeypatch.setattr(
         "dudmap.core.places.loop_correction._is_worse", lambda after, before: False
     )  # there was no loop
@@ -129,7 +140,7 @@ def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch
     assert len(slam.atlas.rebuildings[0].missing) > 6
     save_system(slam, tmp_path / "state.db")
     again = resume_system(tmp_path / "state.db")
-    assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
+    assert differences(slam, again) == []
     for frame in frames[22:]:
         assert_same_results(slam.process(frame), again.process(frame))
     assert not slam.atlas.rebuildings

@@ -70,7 +70,7 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"factors": {}}, "no factors"),
         ({"factors": {"tracker.huber": {"range": [0.01, 0.02]}}}, "needs levels, but tracker.huber has a range"),
         ({"design": "hexagonal"}, "kind of the design is 'hexagonal'; expected one of full-factorial"),
-        ({"design": "box-behnken"}, "three factors"),
+        ({"design": "central-composite", "factors": {"tracker.huber": {"range": [0.01, 0.1]}}}, "two factors"),
         ({"design": {"sample": 5}}, "unknown key 'sample' of the design"),
         ({"design": {"samples": "many"}}, "samples of the design is 'many'"),
         ({"sequences": []}, "no sequences"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap.lab.study.effects import anova, interactions, main_effects
-from dudmap.lab.study.response_surface import carried_by, lack_of_fit, predict_optimum
+from dudmap.lab.study.response_surface import predict_optimum
 from dudmap.lab.study.responses import Scale
 from dudmap.lab.study.study import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
 
@@ -85,20 +85,14 @@ def test_the_model_is_that_of_a_plain_least_squares_fit(table, predicted):
     A, y = np.column_stack(terms), 1000 * table["ate_rmse_m"].to_numpy()
     fit = A @ np.linalg.lstsq(A, y, rcond=None)[0]
     np.testing.assert_allclose(predicted.surface.predict(x), fit, atol=1e-9)
-    leverage = np.diag(A @ np.linalg.pinv(A))
-    residuals = y - fit
-    variance = residuals @ residuals / (81 - 15)
-    distances = residuals**2 / (15 * variance) * leverage / (1 - leverage) ** 2  # Cook 1977
-    assert f"Cook's distance of {distances.max():.2f}" in carried_by(predicted.surface)
 
 
 def test_it_says_why_the_optimum_must_not_be_believed(predicted):
     surface = predicted.surface
     assert surface.r2 == pytest.approx(0.36, abs=0.005)
     assert surface.residual_sd == pytest.approx(29, abs=0.5)
-    assert lack_of_fit(surface) is None  # no point was repeated
     reasons = " ".join(predicted.reasons)
-    for words in ("R2 = 0.36", "29.2", "One value carries the model: 365 mm", "below everything observed (80 mm)"):
+    for words in ("R2 = 0.36", "29.2", "below everything observed (80 mm)"):
         assert words in reasons
 
 

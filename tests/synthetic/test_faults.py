@@ -12,10 +12,8 @@ from dudmap.lab.synthetic import SensorFaults
 from dudmap.lab.synthetic.color_camera import (
     LARGEST_GAIN,
     TARGET_LEVEL,
-    WAVE_NUMBER,
     exposure_gains,
     with_flying_pixels,
-    with_multipath,
 )
 from dudmap.lab.synthetic.faults import LIMITS, parse_faults
 from dudmap.lab.synthetic.folder import write_folder
@@ -255,38 +253,6 @@ def test_flying_pixels_lie_between_two_surfaces():
     assert np.all((mixed[changed] > 1) & (mixed[changed] < 3))
 
 
-def test_multipath_of_a_corner_is_the_integral_over_the_other_wall():
-    """Two walls meet at a right angle, 2 m in front of the camera; the integral is computed here, on the walls."""
-    x, y = (axis[..., 0] for axis in np.split(rays(SMALL)[..., :2], 2, axis=-1))
-    depth = 2 / (1 + np.abs(x))  # walls z = 2 - |x z| in camera coordinates: x + z = 2 and z - x = 2
-    measured = with_multipath(depth.astype(np.float32), SMALL, 0.4)
-    pixel = (60, 110)
-    point = np.array([x[pixel], y[pixel], 1]) * depth[pixel]
-    normal = np.array([-1, 0, -1]) / np.sqrt(2)
-    other = np.array([1, 0, -1]) / np.sqrt(2)
-    s = np.linspace(0, 1, 801)[1:] - 1 / 1600  # the part of the left wall that the image shows
-    left = np.concatenate(
-        [
-            np.stack([np.full(300, -2 * a), t, np.full(300, 2 - 2 * a)], axis=1)
-            for a in s * (np.abs(x).max() / (1 + np.abs(x).max()))
-            for t in [np.linspace(-1, 1, 301)[1:] - 1 / 300]
-        ]
-    )
-    left = left[np.abs(left[:, 1]) < left[:, 2] * np.abs(y).max()]
-    area = (2 * np.abs(x).max() / (1 + np.abs(x).max()) / 800) * np.sqrt(2) * (2 / 300)
-    dq, dp = np.linalg.norm(left, axis=1), np.linalg.norm(point)
-    r = np.linalg.norm(left - point, axis=1)
-    irradiance = (-(left @ other) / dq) / dq**2 / ((-(point @ normal) / dp) / dp**2)
-    form = ((left - point) @ normal / r) * ((point - left) @ other / r) / (np.pi * r**2)
-    share = 0.4 * irradiance * np.maximum(form, 0) * area
-    phase = np.angle(1 + np.sum(share * np.exp(1j * WAVE_NUMBER * (dq + r - dp))))
-    expected = depth[pixel] * phase / (2 * WAVE_NUMBER * dp)
-    assert 0.005 < expected < 0.1
-    assert measured[pixel] - depth[pixel] == pytest.approx(expected, rel=0.15)
-    flat = np.full((120, 160), 2.0, np.float32)
-    assert np.abs(with_multipath(flat, SMALL, 0.9) - flat).max() < 1e-6
-
-
 @pytest.mark.parametrize("noise", ["kinect_v2", "l515", "iphone"])
 def test_noise_of_time_of_flight_has_the_stated_deviation(noise):
     model = SENSORS[noise]
@@ -333,11 +299,11 @@ def test_command_line_of_sensors(tmp_path):
     from dudmap.cli import application_of
 
     arguments = [str(tmp_path / "out"), "--scene", "box", "--size", "64x48", "--max-frames", "2", "--quiet"]
-    chosen = ["--sensor", "kinect_v2", "--fault", "color_delay=0.03", "--fault", "multipath=0"]
+    chosen = ["--sensor", "kinect_v2", "--fault", "color_delay=0.03", "--fault", "depth_offset=0"]
     result = CliRunner().invoke(application_of("synth"), [*arguments, *chosen])
     assert result.exit_code == 0, result.output
     faults = json.loads((tmp_path / "out" / "sensor_truth.json").read_text())["faults"]
-    assert (faults["color_delay"], faults["multipath"], faults["flying_pixels"]) == (0.03, 0, 0.5)
+    assert (faults["color_delay"], faults["depth_offset"], faults["flying_pixels"]) == (0.03, 0, 0.5)
     assert json.loads((tmp_path / "out" / "scene.json").read_text())["noise"] == "kinect_v2"
     wrong = CliRunner().invoke(application_of("synth"), [*arguments[:1], "--sensor", "eye"])
     assert isinstance(wrong.exception, ConfigError)

@@ -26,7 +26,7 @@ def wallpaper(points):
 @pytest.mark.parametrize("seed", range(4))
 def test_faint_wallpaper_shows_the_motion_along_a_wall(seed, monkeypatch):
     assert registered(wall, wallpaper, (0, 0, 0.01), seed).unobservable.shape == (0, 6)
-    monkeypatch.setattr(tracker_module, "SHOWN", 2.0)
+    monkeypatch.setattr(tracker_module, "MIN_AGREEMENT", 2.0)
     assert len(registered(wall, wallpaper, (0, 0, 0.01), seed).unobservable) > 0  # H alone does not tell it from noise
 
 

@@ -14,7 +14,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
+from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, unobserved_motion
 from dudmap.core.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
@@ -172,8 +172,8 @@ def test_noise_is_the_sum_over_the_readings(robust):
 
 
 def test_sentence_names_the_directions():
-    assert sentence(np.empty((0, 6))) == ""
-    assert "forwards" in sentence(np.eye(6)[[2]])
+    assert unobserved_motion(np.empty((0, 6))) == ""
+    assert "forwards" in unobserved_motion(np.eye(6)[[2]])
 
 
 def test_a_predicted_pose_is_not_trusted_for_long():

@@ -216,23 +216,6 @@ def test_the_slider_of_the_window_moves_the_camera(live, window):
     assert "/movers/4/box" in window._handles
 
 
-def test_the_map_of_the_window_can_be_hidden(live, window):
-    before = live.picture()
-    live.page.get_by_label("map", exact=True).uncheck()
-    until(lambda: np.abs(live.picture() - before).mean() > 3)
-    live.page.get_by_label("map", exact=True).check()
-    until(lambda: np.abs(live.picture() - before).mean() < 1)
-
-
-def test_clicks_in_the_window_measure(live, window):
-    box = live.page.locator("canvas").first.bounding_box()
-    x, y = box["x"] + box["width"] / 3, box["y"] + box["height"] / 2
-    live.page.mouse.click(x, y)
-    until(lambda: "z 2.0" in window._point.content)
-    live.page.mouse.click(x + 40, y)
-    until(lambda: "from the one before" in window._point.content)
-
-
 def test_a_live_window_grows(browser, window):
     """New frames appear on an open page without a reload."""
     from dudmap.app.viewing.snapshot import FrameFigures

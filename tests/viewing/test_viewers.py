@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 from dudmap.app.viewing.live_view import LiveView
 from dudmap.app.viewing.mesh_feed import MeshFeed
 from dudmap.app.viewing.snapshot import RESIDUAL_RANGE, FrameImages, depth_colors, mask_overlay, residual_colors
-from dudmap.app.viewing.window import Window, first_hit
+from dudmap.app.viewing.window import Window
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
 from fake_slam import FakeResult
 from growing_map import GrowingMap, read
 from recordings import write_recording
-from run_folders import wall, write_run
+from run_folders import write_run
 
 
 class Recorder:
@@ -27,6 +27,8 @@ class Recorder:
 
     def __init__(self):
         self.frames, self.images, self.parts, self.poses, self.cleared = [], [], {}, None, 0
+        self.show_change = lambda change: self.changes.append(change)
+        self.changes = []
         self.gate = threading.Event()
         self.gate.set()
 
@@ -57,8 +59,12 @@ def test_a_live_view_shows_every_frame_and_the_whole_map(tmp_path):
     view.start(slam, tmp_path, 20)
     for k in range(20):
         view.frame(k, read(k), slam.step(k), 12.0)
+    change = {"id": 1, "kind": "appeared", "box": [[0, 0, 1], [0.2, 0.2, 1.2]]}
+    view.event("change", **change)
+    view.event("calibration", estimated=[])
     view.finish(tmp_path)
     view.close()
+    assert window.changes == [change]
     assert [frame.timestamp for frame in window.frames] == list(range(20))
     assert window.cleared == 1
     area = sum(mesh.area() for mesh in window.parts.values() if mesh is not None)
@@ -117,15 +123,6 @@ def test_a_new_map_replaces_the_old_one():
     changes = feed.changes(second.volume, now=True)
     assert changes.reset
     assert any(mesh is not None for mesh in changes.chunks.values())
-
-
-def test_the_point_under_the_pointer():
-    mesh = wall()
-    hit = first_hit(np.array([0.3, 0.2, 0.0]), np.array([0.0, 0.1, 2.0]), [mesh, mesh])
-    np.testing.assert_allclose(hit, [0.3, 0.3, 2.0], atol=1e-6)
-    assert first_hit(np.zeros(3), np.array([0.0, 0.0, -1.0]), [mesh]) is None
-    assert first_hit(np.zeros(3), np.array([1.0, 0.0, 0.5]), [mesh]) is None
-    assert first_hit(np.zeros(3), np.array([0.0, 0.0, 1.0]), []) is None
 
 
 def test_the_colours_of_the_images():

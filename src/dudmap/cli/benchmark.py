@@ -1,17 +1,15 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
-from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from dudmap.app.terminal import counted, say
+from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.benchmark_changes import changes
-from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, roofline, soak, speed
+from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
 
@@ -25,8 +23,8 @@ SystemsOption = Annotated[
     str,
     Option(
         "--systems",
-        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of the suite ablation, the "
-        "default with one part switched off at a time.",
+        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of ablation and sensors, "
+        "those that they compare.",
     ),
 ]
 
@@ -53,19 +51,18 @@ def suite_command(
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.lab.benchmark.report import named_folders, run_suite
-    from dudmap.lab.benchmark.suites import ABLATION, find_suite
+    from dudmap.lab.benchmark.suites import USUAL, find_suite
     from dudmap.lab.benchmark.suites import systems as find_systems
 
     name = str(context.info_name)
-    usual = ABLATION if name == "ablation" else "dudmap"
-    wanted, others = find_systems(systems or usual), named_folders(score or [])
+    wanted, others = find_systems(systems or USUAL.get(name, "dudmap")), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or RUNS / name
     tree, text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
     answer(tree, text, as_json=as_json, out=out)
 
 
-for _command in (changes, speed, gpu, roofline, soak):
+for _command in (changes, speed, gpu, soak):
     app.command()(_command)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
@@ -74,31 +71,6 @@ for _name, _help in SUITES.items():
 def _print_outcome(row: dict[str, Any]) -> None:
     outcome = row.get("error") or f"{row.get('tracked', row.get('frames'))} of {row.get('frames')} frames"
     say(f"{row['sequence']}, {row['system']}: {outcome}", err=True)
-
-
-@app.command()
-def sensors(
-    out: Annotated[Path, Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
-    only: Annotated[str, Option(help="Comma-separated sensors; default: all.")] = "",
-    data: DataOption = None,
-    jobs: o.JobsOption = 1,
-    quick: QuickOption = False,
-    assignments: o.SetOption = None,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Measure the same synthetic room with faulty sensors and named cameras, with colour, without it, and by default.
-
-    The default must be within 5 % of the better of the other two columns.
-    """
-    from dudmap.lab.benchmark.color_columns import color_table, measure_columns
-    from dudmap.lab.benchmark.measure import save
-    from dudmap.lab.benchmark.suites import local_entries, sensor_entries
-
-    names = [name for name in only.split(",") if name]
-    entries = sensor_entries(names, quick=quick) if data is None else local_entries(data)
-    rows = measure_columns(entries, o.read_config(None, None, assignments), jobs, _print_outcome)
-    text = color_table(rows)
-    answer(save(rows, text, out, "sensors"), text, as_json=as_json, out=out)
 
 
 @app.command()
@@ -135,72 +107,23 @@ def _print_world(row: dict[str, Any]) -> None:
 
 
 @app.command()
-def bias(
-    recording: Annotated[
-        Path | None, Argument(help="Static recording with true poses; default: exact synthetic rooms.")
-    ] = None,
-    stride: Annotated[int, Option(min=1, help="Register every so many frames.")] = 4,
-    seeds: Annotated[int, Option(min=1, help="Number of synthetic rooms.")] = 3,
-    assignments: o.SetOption = None,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Measure how far each term of the registration pulls a frame from its true pose."""
-    from dudmap.io.sequences import open_sequence
-    from dudmap.lab import synthetic
-    from dudmap.lab.benchmark.bias import bias_table, measure_pulls
-
-    config = o.read_config(None, None, assignments)
-    worlds = [(scene, seed) for scene in ("room", "corridor") for seed in range(seeds)]
-    exact = partial(synthetic.sequence, movers=(), frames=120, noise="none")
-    sources = {f"{scene}, seed {seed}, exact": partial(exact, scene, seed=seed) for scene, seed in worlds}
-    found = {}
-    for name, opened in ({recording.name: partial(open_sequence, recording)} if recording else sources).items():
-        pulls = measure_pulls(opened(), config, stride)
-        found[name] = [
-            {"term": term, "mean": pull.mean(axis=0), "spread": pull.std(axis=0)} for term, pull in pulls.items()
-        ]
-        say(f"{name}:\n\n{bias_table(pulls)}", err=as_json)
-    if as_json:
-        answer({"corrections_mm_deg": found}, "", as_json=True)
-
-
-@app.command("first-second")
-def first_second(
-    seeds: Annotated[int, Option(min=1, help="Number of worlds of each scene.")] = 3,
-    assignments: o.SetOption = None,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
-    from dudmap.lab import synthetic
-    from dudmap.lab.benchmark.bias import FRAMES, first_second_table, measure_first_second
-
-    config = o.read_config(None, None, assignments)
-    exact = partial(synthetic.sequence, movers=(), frames=FRAMES + 1, noise="none")
-    runs = {
-        f"{scene}, seed {seed}": measure_first_second(exact(scene, seed=seed), config)
-        for scene in ("room", "corridor", "box")
-        for seed in range(seeds)
-    }
-    tree = {name: [run._asdict() for run in found] for name, found in runs.items()}
-    answer(tree, first_second_table(list(runs.values())), as_json=as_json)
-
-
-@app.command()
 def calls(
     recording: Annotated[Path | None, Argument(help="Recording; default: a synthetic room with a person.")] = None,
-    max_frames: Annotated[int, Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    max_frames: Annotated[int, Option(min=44, help="Number of frames; the first 40 are not counted.")] = 60,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
+    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame, and time its stages."""
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.roofline import count_calls, summary
+    from dudmap.lab.benchmark.calls import count_calls, stage_table, summary
     from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
     source = room.open() if recording is None else open_sequence(recording)
-    tree = summary(count_calls(source, o.read_config(None, None, assignments), max_frames))
-    answer(tree, ", ".join(f"{value:.0f} {name}" for name, value in tree.items()), as_json=as_json)
+    costs = count_calls(source, o.read_config(None, None, assignments), max_frames)
+    tree = summary(costs)
+    text = ", ".join(f"{value:.0f} {name}" for name, value in tree.items())
+    answer(tree, f"{text}\n{stage_table(costs)}", as_json=as_json)
 
 
 @app.command()
@@ -240,34 +163,6 @@ def faults(
         raise typer.Exit(1)
 
 
-@app.command("wrong-input")
-def wrong_input(
-    recording: Annotated[
-        Path | None, Argument(help="Recording with true poses; default: a synthetic desk and room.")
-    ] = None,
-    max_frames: Annotated[int, Option(min=4, help="Number of frames from the start.")] = 40,
-    width: Annotated[int, Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
-    from dudmap.config import Config
-    from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark import stream_faults as spoiling
-
-    if recording is not None:
-        sources = [(open_sequence(recording), list(spoiling.SPOILT))]
-    else:  # too small a scale shows at a desk, too large a one in a room
-        at_desk = [name for name in spoiling.SPOILT if name != spoiling.LARGE]
-        desk, room = (spoiling.default_room(max_frames, width, 0, scene) for scene in ("desk", "room"))
-        sources = [(desk, at_desk), (room, [spoiling.LARGE])]
-    runs = [run for each, names in sources for run in spoiling.measure_wrong_input(each, Config(), names, max_frames)]
-    failed = [run["name"] for run in runs if spoiling.fails(run)]
-    answer({"runs": runs, "failed": failed}, spoiling.spoilt_table(runs), as_json=as_json)
-    if failed:
-        say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
-        raise typer.Exit(1)
-
-
 @app.command()
 def gate(
     figures: Annotated[Path, Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
@@ -294,35 +189,6 @@ def gate(
     if failed:
         say(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
         raise typer.Exit(1)
-
-
-@app.command()
-def limits(
-    systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
-    jobs: o.JobsOption = 1,
-    quick: QuickOption = False,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
-
-    The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements
-    of the same code in the same folder are reused, so that an interrupted sweep continues.
-    """
-    from dudmap.lab.benchmark import limits as found
-    from dudmap.lab.benchmark.measure import save
-    from dudmap.lab.benchmark.suites import systems as find_systems
-
-    wanted, sweeps = find_systems(systems), found.QUICK_SWEEPS if quick else found.SWEEPS
-    cells = found.grid_cells(sweeps, found.QUICK_FRAMES if quick else found.FRAMES)
-    total, finished = len({cell.condition for cell in cells}), count(1)
-    with counted("conditions", quiet=as_json) as progress:
-        rows = found.measure_cells(cells, wanted, out, jobs, lambda _: progress(next(finished), total))
-    text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
-    text += found.limits_table(rows, sweeps, list(wanted))
-    text += "\nATE RMSE in mm and share of lost frames; bold where the system copes:\n"
-    text += found.cells_table(rows, sweeps, list(wanted))
-    answer(save(rows, text, out, "limits"), text, as_json=as_json, out=out)
 
 
 @app.command()

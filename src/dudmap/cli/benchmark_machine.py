@@ -1,4 +1,4 @@
-"""``dudmap benchmark speed | gpu | roofline | soak``: time and memory of the machine at hand."""
+"""``dudmap benchmark speed | gpu | soak``: time and memory of the machine at hand."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,14 +24,9 @@ def gpu(
     device: Annotated[str, Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")] = "auto",
     max_frames: Annotated[int, Option(min=2, help="Number of frames of each run.")] = 120,
     voxels: Annotated[str, Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
-    sizes: Annotated[
-        str, Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
-    ] = "640x480,1280x720",
     sequence: Annotated[
-        list[Path] | None, Option(help="Also measure this recording; repeatable.", metavar="SEQUENCE")
-    ] = None,
-    open3d: Annotated[
-        Path | None, Option(metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured.")
+        list[Path] | None,
+        Option(help="Recording; repeatable; default: a synthetic room in two sizes.", metavar="SEQUENCE"),
     ] = None,
     out: Annotated[Path, Option(help="Output folder for gpu.md and gpu.json.")] = RUNS / "gpu",
     quick: QuickOption = False,
@@ -41,23 +36,24 @@ def gpu(
 
     Without a GPU, only the CPU is measured, and the table says why.
     """
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab import synthetic
     from dudmap.lab.benchmark import gpu as measurements
     from dudmap.lab.benchmark.measure import save
 
-    steps, shapes = measurements.numbers(voxels, sizes)
+    steps, sizes = [size / 100 for size in o.numbers(voxels, None, "--voxels")], [(640, 480), (1280, 960)]
     if quick:
-        steps, shapes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
-    content, python = measurements.recordings(shapes, max_frames, sequence or []), measurements.find_open3d(open3d)
-    rows = measurements.measure_devices(content, steps, max_frames, device, python, _announced)
+        steps, sizes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
+    rooms = {f"room {w}x{h}": {"frames": max_frames, "camera": (w, h)} for w, h in sizes}
+    found = {name: synthetic.sequence(**world) for name, world in rooms.items()} if not sequence else {}
+    found |= {f"{path.name}": open_sequence(path) for path in sequence or []}
+    rows = measurements.measure_devices(found, steps, max_frames, device, _announced)
     text = measurements.table(rows)
     answer(save(None, text, out, "gpu", {"rows": rows}), text, as_json=as_json, out=out)
 
 
 def speed(
     out: Annotated[Path, Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
-    long: Annotated[
-        bool, Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
-    ] = False,
     open3d: Annotated[
         Path | None, Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM.")
     ] = None,
@@ -68,29 +64,12 @@ def speed(
     as_json: o.JsonOption = False,
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
-    from dudmap.lab.benchmark.gpu import find_open3d
     from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.speed import markdown, speed_figures
 
-    frames, long_frames = (20, 60) if quick else (300, 2000 if long else 0)
-    python = find_open3d(open3d)
-    figures = speed_figures(frames, long_frames, _announced, python, sequence)
+    figures = speed_figures(20 if quick else 300, _announced, open3d, sequence)
     text, tree = markdown(figures), {"figures": [figure._asdict() for figure in figures]}
     answer(save(None, text, out, "speed", tree), text, as_json=as_json, out=out)
-
-
-def roofline(
-    max_frames: Annotated[int, Option(min=2, help="Number of frames.")] = 60,
-    voxel: Annotated[float, Option(help="Voxel size, metres.")] = 0.01,
-    out: Annotated[Path, Option(help="Output folder for roofline.md and roofline.json.")] = RUNS / "roofline",
-    as_json: o.JsonOption = False,
-) -> None:
-    """Compare the time of each stage with what its bytes and operations need at least on this machine."""
-    from dudmap.lab.benchmark import roofline as measurements
-    from dudmap.lab.benchmark.measure import save
-
-    figures, text = measurements.roofline(max_frames, voxel)
-    answer(save(None, text, out, "roofline", figures), text, as_json=as_json, out=out)
 
 
 def soak(

@@ -18,7 +18,7 @@ def live(
     camera: Annotated[
         str | None,
         Argument(
-            help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
+            help="realsense, oak, orbbec, iphone, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="CAMERA",
             autocompletion=o.camera_names,
@@ -42,11 +42,12 @@ def live(
     from dudmap.app.pipeline.run import run
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.cameras import open_camera
+    from dudmap.lab.warmup import run_compiled_beside
 
     config, saved_map = run_parameters(parameters, mapped, out)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
-    with observers(watching) as watchers:
+    with observers(watching) as watchers, run_compiled_beside():
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),
             max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,

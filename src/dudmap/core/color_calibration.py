@@ -9,11 +9,12 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.frame_view import FrameView
 
 
-class ColorCalibration:
+class ColorCalibration(Stateful):
     """Calibrates the colour camera while frames are tracked, and repaints the maps with what is found.
 
     Args:
@@ -25,6 +26,8 @@ class ColorCalibration:
         color_motion: Registers the colours of the frames.
         live: A calibration is used as soon as it is found, and not at a fixed frame.
     """
+
+    _estimation: Remembered[SelfCalibration | None]
 
     def __init__(
         self,
@@ -40,7 +43,7 @@ class ColorCalibration:
         self._start = start or Calibration.registered(camera)
         self._atlas = atlas
         self._color_motion = color_motion
-        self._estimation: SelfCalibration | None = None
+        self._estimation = None
         if atlas.history is None:  # nothing to repaint with
             return
         atlas.history.registered = self._registered

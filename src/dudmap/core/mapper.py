@@ -16,6 +16,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
@@ -45,7 +46,7 @@ class StartFrame:
     fused: bool
 
 
-class Bootstrap:
+class Bootstrap(Stateful):
     """Knows the first frames of a map, and what of them must be taken back.
 
     A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
@@ -59,15 +60,18 @@ class Bootstrap:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
 
+    textureless: Remembered[bool] = False
+    _frames: Remembered[list[StartFrame]]
+    _window: Remembered[list[StartFrame]]
+    _num_fused: Remembered[int] = 0
+
     def __init__(self) -> None:
-        self.textureless = False
-        self._frames: list[StartFrame] = []
-        self._window: list[StartFrame] = []
-        self._num_fused = 0
+        self._frames = []
+        self._window = []
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:
-        """Sentence on why a frame cannot start a map, empty if it can."""
+        """Reason why a frame cannot start a map, empty if it can."""
         depth = view.observation.depth
         enough = np.count_nonzero(depth[~dynamic_mask]) >= MIN_READINGS * depth.size
         return "" if enough else "the depth image holds hardly any readings"
@@ -266,7 +270,7 @@ class Mapper:
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask, observation.depth)
-            if self._predictor.slow_crowd and estimate.unverified_mask is not None:
+            if self._predictor.mostly_slow and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded

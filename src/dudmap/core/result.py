@@ -21,7 +21,7 @@ class FrameResult:
         timestamp: Time of the depth image, seconds; on the clock of the first frames, if it was set back since.
         state: "tracked", "lost", or "repeated" for a frame whose images, or whose depth image, are those of the frame
             before.
-        lost_reason: Sentence on the check that failed; empty for a tracked frame.
+        lost_reason: Names the check that failed; empty for a tracked frame.
         rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
             else empty.
         T_world_camera: Camera pose (4, 4); None if lost. That of a frame that repeats the one before is the same; where
@@ -41,7 +41,7 @@ class FrameResult:
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
-        uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
+        uncertain: Reason why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
         unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
             predicted one; see ``core/tracking/observability.py``. The frame is ``uncertain`` then.
         repeats: What is bit for bit that of the frame before: the whole ``frame``, its ``depth`` or its ``color``. A

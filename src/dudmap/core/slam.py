@@ -1,9 +1,8 @@
 """The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
 
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.masks import full_mask
 from dudmap.core.frames.frame import Frame, FrameArrays
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -24,7 +22,6 @@ from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.mapper import Bootstrap, Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
-from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.loop_closing import LoopCloser
 from dudmap.core.places.loop_verification import LoopQuery
@@ -32,21 +29,21 @@ from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult
-from dudmap.core.slam_results import SlamResults
+from dudmap.core.slam_results import SlamArguments, SlamResults
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.observability import sentence as unobserved
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import ConfigError
 
 
-class Slam(SlamResults):
+class Slam(SlamResults, Stateful):
     """Dense RGB-D SLAM in scenes where things move.
 
     Args:
@@ -66,6 +63,22 @@ class Slam(SlamResults):
         timed: Whether the times of the frames are those of a clock; False where they are invented.
     """
 
+    stream: Remembered[StreamCheck]
+    motion: Remembered[MotionModel]
+    color_motion: Remembered[ColorMotion]
+    detector: Remembered[DynamicDetector]
+    monitor: Remembered[QualityMonitor]
+    front_end: Remembered[FrontEnd]
+    predictor: Remembered[PosePredictor]
+    atlas: Remembered[Atlas]
+    color_calibration: Remembered[ColorCalibration]
+    bootstrap: Remembered[Bootstrap]
+    relocalizer: Remembered[Relocalizer]
+    redundancy: Remembered[RedundantViews]
+    loops: Remembered[LoopCloser]
+    objects: Remembered[MovingObjects]
+    _last: Remembered[FrameResult | None] = None  # of the last frame, for one that repeats it
+
     def __init__(
         self,
         camera: Camera,
@@ -79,15 +92,15 @@ class Slam(SlamResults):
         *,
         timed: bool = True,
     ) -> None:
-        self.max_blocks = max_blocks
         self.config = config = config or Config()
+        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed)
+        self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
         self.preprocess = Preprocessor(camera, config.preprocess, given)
         self.camera = self.preprocess.camera
-        self.first_camera = camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
@@ -102,7 +115,6 @@ class Slam(SlamResults):
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
-        self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live
@@ -114,13 +126,8 @@ class Slam(SlamResults):
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
             self.atlas.go_on_in(saved_map, self.camera, max_blocks)
-            self.monitor.restore(saved_map.registrations)
+            self.monitor.go_on_from(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
-
-    @property
-    def reference(self) -> TsdfVolume:
-        """Map that frames are registered to: the current one, or in a second pass that of the first."""
-        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
@@ -198,9 +205,10 @@ class Slam(SlamResults):
         view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
+        unobserved, ambiguous = estimate.unobserved_motion, self.predictor.ambiguity(view, prediction, estimate)
+        uncertain = unobserved or ambiguous
         fuse = self._is_news(view, estimate, uncertain)
-        mask = self._dynamic_mask(view, estimate)
+        mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
@@ -283,7 +291,7 @@ class Slam(SlamResults):
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
-            lambda tracking: not self.monitor.reason_to_doubt(tracking),
+            lambda tracking: not self.monitor.misfit_reason(tracking),
         )
         if found is None:
             return None
@@ -294,7 +302,9 @@ class Slam(SlamResults):
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
-        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
+        self.relocalizer.lost(
+            view.timestamp, mostly_dynamic=self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
+        )
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):
@@ -303,7 +313,7 @@ class Slam(SlamResults):
             self.relocalizer.found()
             self.redundancy.reset()
             return self._start_map(replace(view, blind=False))
-        return self._result(view, estimate, self._dynamic_mask(view, estimate), reason=reason)
+        return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
@@ -317,15 +327,6 @@ class Slam(SlamResults):
         with view.timer("similarity"):
             known = view.blind or uncertain or self.localize
             return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
-
-    def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
-        """Dynamic pixels (H, W) of a frame."""
-        with view.timer("label"):
-            if estimate.labels is None:
-                mask = np.zeros(view.observation.depth.shape, dtype=bool)
-            else:
-                mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
-            return mask if view.known_dynamic is None else mask | view.known_dynamic
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -364,36 +365,34 @@ class Slam(SlamResults):
         reason: str = "",
         T_world_camera: NDArray[np.float64] | None = None,
         fused: bool = False,
-        relocalized: bool = False,
-        corrected: bool = False,
-        find_movers: Callable[[], tuple[Mover, ...]] | None = None,
         uncertain: str = "",
-        calibrated: bool = False,
-        checks: Mapping[str, float] | None = None,
-        rejected: str = "",
+        **details: Any,  # noqa: ANN401 - further attributes of the result
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
-        labels = None if estimate is None else estimate.labels
+        labels, tracking = (None, None) if estimate is None else (estimate.labels, estimate.tracking)
         readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
-            T_world_camera=T_world_camera, fused=fused,
+            T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
-            relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,
-            blind=view.blind, uncertain=uncertain, calibrated=calibrated,
-            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
-            repeats=self.stream.repeats, rejected=rejected,
+            labels=labels, tracking=tracking, timings=view.timer.timings, submap=self.atlas.current, blind=view.blind,
+            unobservable=np.empty((0, 6)) if tracking is None else tracking.unobservable, repeats=self.stream.repeats,
+            **details,
         )  # fmt: skip
-        if not rejected:
+        if not result.rejected:
             self._last = result.without_details()
         return result
 
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.device)
         return make_volume(
-            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
+            self.camera,
+            config.volume,
+            config.sensor,
+            config.preprocess.depth_max,
+            backend,
+            self.arguments.max_blocks,
         )

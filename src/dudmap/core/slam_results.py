@@ -1,6 +1,6 @@
 """What a system has found so far: maps, trajectories and calibration."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from dudmap.config import Config
 from dudmap.core.color_calibration import ColorCalibration
@@ -8,12 +8,26 @@ from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.quality_monitor import QualityMonitor
+
+
+@dataclass(frozen=True, eq=False)
+class SlamArguments:
+    """Arguments of ``Slam``, except a first pass and a saved map, of which the state holds what is used."""
+
+    camera: Camera
+    config: Config
+    calibration: Calibration | None
+    live: bool
+    localize: bool
+    max_blocks: int | MemoryLimit | None
+    timed: bool
 
 
 class SlamResults:
@@ -26,6 +40,7 @@ class SlamResults:
         color_calibration: Calibration of the colour camera.
         objects: The moving objects.
         detector: Knows what has moved.
+        prior_map: In a second pass the map of the first, else None.
     """
 
     config: Config
@@ -35,6 +50,12 @@ class SlamResults:
     color_calibration: ColorCalibration
     objects: MovingObjects
     detector: DynamicDetector
+    prior_map: PriorMap | None
+
+    @property
+    def reference(self) -> TsdfVolume:
+        """Map that frames are registered to: the current one, or in a second pass that of the first."""
+        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     @property
     def volume(self) -> TsdfVolume:

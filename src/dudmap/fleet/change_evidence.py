@@ -50,7 +50,7 @@ class Evidence:
     Attributes:
         mesh: Surface in the common frame.
         state: (V,) uint8.
-        sdf: (V,) float32, distance to the surface of the other map, metres; NaN where it is unknown.
+        gap: (V,) float32, distance to the nearest surface of the other map, metres; 0 where it is within the noise.
         tolerance: (V,) distance that noise explains, metres.
         blur: (V,) width of a depth edge, metres: two pixels of the camera, two voxels at least, and the noise.
         weight: (V,) float32, of the own map there.
@@ -61,7 +61,7 @@ class Evidence:
 
     mesh: Mesh
     state: NDArray[np.uint8]
-    sdf: NDArray[np.float32]
+    gap: NDArray[np.float32]
     tolerance: NDArray[np.float32]
     blur: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -135,17 +135,19 @@ def evidence(own: Visit, other: Visit) -> Evidence:
     state = np.full(len(points), UNKNOWN, np.uint8)
     state[sdf >= -tolerance] = CONFIRMED
     state[sdf < -tolerance] = BEHIND
-    seen = samples.weight >= READINGS * other.volume.config.carve_rate
+    gap = np.zeros(len(points), np.float32)
     away = np.flatnonzero((sdf > tolerance) | (samples.state == EMPTY) | np.isnan(sdf))
-    away = away[surface_tree(other.mesh.vertices).query(points[away], workers=-1)[0] > tolerance[away]]
-    state[away] = np.where((seen & ~np.isnan(sdf))[away], DENIED, UNKNOWN)
-    doubtful = away[state[away] == UNKNOWN]
+    gap[away] = surface_tree(other.mesh.vertices).query(points[away], workers=-1)[0]
+    away = away[gap[away] > tolerance[away]]
+    free = ~np.isnan(sdf[away]) & (samples.weight[away] >= READINGS * other.volume.config.carve_rate)
+    state[away] = np.where(free, DENIED, UNKNOWN)
+    doubtful = away[~free]
     state[doubtful[times_seen_through(other, points[doubtful], tolerance[doubtful]) >= VIEWS]] = DENIED
     blur = (EDGE_PIXELS * np.maximum(near / own.volume.camera.fx, voxel) + noise).astype(np.float32)
     color = np.where((state == CONFIRMED)[:, None], samples.color, 0)
     weight = own.sample(points).weight
     cameras = own.views[:, :3, 3]
-    return Evidence(own.mesh, state, sdf, tolerance, blur, weight, own.volume.config.min_weight, color, cameras)
+    return Evidence(own.mesh, state, gap, tolerance, blur, weight, own.volume.config.min_weight, color, cameras)
 
 
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:

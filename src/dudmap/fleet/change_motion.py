@@ -1,8 +1,8 @@
 """Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
 
-Both surfaces are brought together from several turns by the iterative closest point method (to planes; Chen and Medioni
-1992), the best few poses are refined on the distances and intensities of both maps (``align_maps``), and the result is
-a motion if each surface lies on the other, has its colours, and nothing of it would hang in seen free space.
+Motions that bring a point onto one of like colour and slope, turned about the vertical, are refined by the iterative
+closest point method in both directions (to planes, Chen and Medioni 1992; by colours, Johnson and Kang 1997). The best
+is the motion if each surface lies on the other, has its colours, and nothing of it would hang in seen free space.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.alignment import agree
 from dudmap.fleet.change_evidence import CONFIRMED, Evidence, Visit
 from dudmap.fleet.change_objects import Piece
-from dudmap.fleet.map_samples import EMPTY, OBSERVED, SurfacePoints, transformed
-from dudmap.fleet.sdf_alignment import align_maps
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 
 Array = NDArray[np.float64]
-TURNS = 16
-"""Turns about the vertical from which the surfaces are brought together."""
+PAIRS, STARTS, TRIED = 20_000, 400, 12
+"""Pairs of points that are drawn, those of a like colour and slope that give a motion, and the best motions that are
+registered."""
 COARSE, FINE, REFINED = 300, 1500, 4
 """Points of a surface in the first step and when a pose is judged, and poses that are refined."""
 ICP_ROUNDS, STOP = 25, 1e-3
@@ -107,14 +107,6 @@ class Body:
             return self
         return self.chosen(np.sort(np.random.default_rng(1).choice(len(self.points), count, replace=False)))
 
-    def surface(self, T_map_common: Array) -> SurfacePoints:
-        """For ``align_maps``, in the world of its map."""
-        grey = (self.colors @ (0.299, 0.587, 0.114) / 255).astype(np.float32)
-        n = len(grey)
-        return SurfacePoints(
-            transformed(T_map_common, self.points), grey, self.colors.astype(np.float32), np.ones(n, bool), 1.0
-        )
-
 
 def _planes(points: Array, normals: Array, margin: float) -> list[tuple[Array, float]]:
     """Normals (3,) and offsets of up to three planes that hold a share of some surface (n, 3)."""
@@ -159,56 +151,97 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
 
     ``up`` (3,) is the direction about which things turn most.
     """
-    poses = _brought_together(missing.sample(COARSE), new.sample(COARSE), up)
-    best: Motion | None = None
-    T_a, T_b = before.T_common_map, after.T_common_map
-    surfaces = new.sample(4000).surface(se3.inverse(T_b)), missing.sample(4000).surface(se3.inverse(T_a))
-    for _, T in [found for found in poses[:REFINED] if found[0] > LEAST_SEEN / 2]:
-        start = se3.inverse(T_b) @ T @ T_a
-        aligned = align_maps(after.volume, before.volume, *surfaces, start, MIN_POINTS, changed=True)
-        for candidate in (T_b @ aligned.T_a_b @ se3.inverse(T_a), T):
-            motion = _judged(before, after, missing, new, candidate)
-            if motion is not None and (best is None or motion.explained > best.explained):
-                best = motion
-    return best
+    coarse, fine = (_Meeting(missing, new, count) for count in (COARSE, FINE))
+    a, b = coarse.sources
+    starts = sorted(_starts(a, b, up), key=lambda T: -coarse.share(T, max(0.1 * coarse.size, 3 * coarse.gate)))
+    centre = np.eye(4)
+    centre[:3, 3] = a.points.mean(axis=0)
+    first = [
+        coarse.registered(T, 0.3 * coarse.size) for T in _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
+    ]
+    first = [T for T in first if coarse.share(T, coarse.gate) > LEAST_SEEN / 2]
+    first = _different(sorted(first, key=lambda T: -coarse.share(T, coarse.gate)), centre, 0.05, 10.0)
+    motions = [_judged(before, after, missing, new, fine.registered(T, 3 * fine.gate)) for T in first[:REFINED]]
+    return max((one for one in motions if one is not None), key=lambda one: one.explained, default=None)
 
 
-def _brought_together(a: Body, b: Body, up: Array) -> list[tuple[float, Array]]:
-    """Shares of the points that meet, and different motions (4, 4) from a to b, the best first."""
-    out: list[tuple[float, Array]] = []
-    size = float(np.linalg.norm(np.ptp(b.points, axis=0)))
-    shade = COLOR_LENGTH * size / 255
-    tree = KDTree(np.hstack([b.points, shade * b.colors]))
-    middles = [(body.points.min(axis=0) + body.points.max(axis=0)) / 2 for body in (a, b)]
+class _Meeting:
+    """Points of two bodies that lie on each other after a motion from the first to the second.
 
-    def met(T: Array, gate: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
-        points, normals = transformed(T, a.points), a.normals @ T[:3, :3].T
-        near = np.asarray(tree.query(np.hstack([points, shade * a.colors]))[1])
-        close = np.linalg.norm(points - b.points[near], axis=1) < gate
-        return points, near, close & ((normals * b.normals[near]).sum(axis=1) > 0.5)
+    Args:
+        a, b: The bodies.
+        count: Points of the denied surface of each that are looked for on the other, at most.
+    """
 
-    for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
-        T = np.eye(4)
-        T[:3, :3] = se3.exp_rotation(up * turn)
-        T[:3, 3] = middles[1] - T[:3, :3] @ middles[0]
-        for count in range(ICP_ROUNDS):
-            points, near, use = met(T, max(0.3 * size * 0.85**count, 3 * b.tolerance))
-            if use.sum() < 10:
+    def __init__(self, a: Body, b: Body, count: int) -> None:
+        self.sources = [body.chosen(body.denied).sample(count) for body in (a, b)]
+        self.size = max(float(np.linalg.norm(np.ptp(source.points, axis=0))) for source in self.sources)
+        self.gate, self.shade = max(a.tolerance, b.tolerance), COLOR_LENGTH * self.size / 255
+        self.others = b, a
+        self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
+
+    def pairs(self, T: Array, gate: float) -> tuple[Array, Array, Array, Array]:
+        """Points (n, 3) of a after a motion (4, 4), those of b that they meet within a gate (m) and the normals there;
+        and the shares of both sources whose points meet any of a like colour."""
+        rows, shares = [], []
+        for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
+            points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
+            near = np.asarray(tree.query(np.hstack([points, self.shade * own.colors]))[1])
+            use = np.linalg.norm(points - other.points[near], axis=1) < gate
+            use &= (normals * other.normals[near]).sum(axis=1) > 0.5
+            shares.append((use & (np.abs(own.colors - other.colors[near]).max(axis=1) < COLOR_GATE)).mean())
+            met = other.points[near[use]]
+            ends = (transformed(T, met), own.points[use], own.normals[use]) if rows else (
+                points[use], met, other.normals[near[use]],
+            )  # fmt: skip
+            rows.append(ends)
+        p, q, n = (np.concatenate(part) for part in zip(*rows, strict=True))
+        return p, q, n, np.array(shares)
+
+    def share(self, T: Array, gate: float) -> float:
+        """Mean share of both surfaces that meet the other."""
+        return float(self.pairs(T, gate)[3].mean())
+
+    def registered(self, T: Array, gate: float) -> Array:
+        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks."""
+        for _ in range(ICP_ROUNDS):
+            p, q, n, _ = self.pairs(T, max(gate, self.gate))
+            if len(p) < 10:
                 break
-            step = _icp_step(points[use], b.points[near[use]], b.normals[near[use]])
-            T = se3.exp(step) @ T
+            step = _icp_step(p, q, n)
+            T, gate = se3.exp(step) @ T, 0.85 * gate
             if np.linalg.norm(step) < STOP:
                 break
-        _, near, use = met(T, 3 * b.tolerance)
-        alike = np.abs(a.colors - b.colors[near]).max(axis=1) < COLOR_GATE
-        out.append((float((use & alike).mean()), T))
-    out.sort(key=lambda found: -found[0])
-    centre = np.eye(4)
-    centre[:3, 3] = middles[0]
-    kept: list[tuple[float, Array]] = []
-    for share, T in out:
-        if not any(agree(T @ centre, other @ centre, 0.05, 10.0) for _, other in kept):
-            kept.append((share, T))
+        return T
+
+
+def _starts(a: Body, b: Body, up: Array) -> list[Array]:
+    """Motions (4, 4) that bring a point of a onto one of b with a like colour: the turn about the vertical is that
+    between their normals, and any where these are vertical."""
+    rng = np.random.default_rng(1)
+    rows, columns = rng.integers(len(a.points), size=PAIRS), rng.integers(len(b.points), size=PAIRS)
+    like = np.abs(a.colors[rows] - b.colors[columns]).max(axis=1) < COLOR_GATE
+    rises = a.normals[rows] @ up, b.normals[columns] @ up
+    use = np.flatnonzero(like & (np.abs(rises[0] - rises[1]) < 0.3))[:STARTS]
+    out = []
+    for row, column, rise in zip(rows[use], columns[use], rises[0][use], strict=True):
+        n, m = a.normals[row], b.normals[column]
+        turn = np.arctan2(up @ np.cross(n, m), n @ m - (up @ n) * (up @ m))
+        if abs(rise) > 0.9:
+            turn = rng.uniform(-np.pi, np.pi)
+        T = np.eye(4)
+        T[:3, :3] = se3.exp_rotation(up * turn)
+        T[:3, 3] = b.points[column] - T[:3, :3] @ a.points[row]
+        out.append(T)
+    return out
+
+
+def _different(poses: list[Array], centre: Array, distance: float, angle_deg: float) -> list[Array]:
+    """The first of all poses (4, 4) that bring a centre (4, 4) to about the same place."""
+    kept: list[Array] = []
+    for T in poses:
+        if not any(agree(T @ centre, other @ centre, distance, angle_deg) for other in kept):
+            kept.append(T)
     return kept
 
 

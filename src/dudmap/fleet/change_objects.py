@@ -22,6 +22,9 @@ LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 LEAST_FACING = 0.1
 """Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
+CLEAR = 2.0
+"""Median gap between a change and any surface of the other map, in what noise explains: a map that is bent shifts
+surface by more than the noise, not by a multiple of it."""
 CERTAIN = 3
 """A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
 
@@ -51,10 +54,10 @@ class Piece:
         return float(np.linalg.norm(self.box[1] - self.box[0]))
 
 
-def denied_pieces(found: Evidence, own: Visit, voxel_size: float, min_size: float) -> list[Piece]:
+def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
     """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
     pieces = connected(found.mesh, opened(found, found.state == DENIED), LINK * voxel_size)
-    return assembled([piece for piece in pieces if piece.area > LEAST_FACE * min_size**2], own, 0.0)
+    return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
 def assembled(pieces: list[Piece], own: Visit, reach: float = REACH) -> list[Piece]:
@@ -88,6 +91,8 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
     """Whether a piece is large enough, wider than the depth edges there, and was seen often enough, from its front."""
     if piece.area < LEAST_FACE * min_size**2 or np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
+        return False
+    if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
         return False
     if np.median(_facing(found, piece.vertices[:: max(1, len(piece.vertices) // 500)])) < LEAST_FACING:
         return False

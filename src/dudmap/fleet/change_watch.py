@@ -93,23 +93,29 @@ class ChangeWatch(RunObserver):
         self._file: TextIO | None = None
         self._slam: Slam | None = None
 
-    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """A pass begins."""
+    def start(self, slam: "Slam", out: Path | None, count: int | None) -> None:
+        """A pass begins; without a folder no file is written."""
         self._slam, self.reported = slam, []
         self._cells = self._fresh()
         self._close()
-        self._file = (out / WATCH_FILE).open("w", encoding="utf-8", buffering=1)
+        if out is not None:
+            self._file = (out / WATCH_FILE).open("w", encoding="utf-8", buffering=1)
 
     def _fresh(self) -> dict[str, _Cells]:
         return {"appeared": _Cells(np.empty(0, np.int64)), "disappeared": _Cells(self._codes)}
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Count what a tracked frame shows, and report what has become certain."""
-        T, frame = result.T_world_camera, read.frame
-        if T is None or result.submap != 0 or result.state != "tracked" or not isinstance(frame, Frame):
+        """A frame was read and processed."""
+        if isinstance(read.frame, Frame):
+            self.look(index, read.frame, result)
+
+    def look(self, index: int, frame: Frame, result: "FrameResult") -> None:
+        """Count what a frame shows, if it was tracked, and report what has become certain."""
+        T = result.T_world_camera
+        if T is None or result.submap != 0 or result.state != "tracked":
             return
         kind = KINDS[index % 2]
-        self._look(kind, frame, T)
+        self._count(kind, frame, T)
         if index % 8 < 2:
             self._report(kind, index, frame.timestamp)
 
@@ -122,7 +128,7 @@ class ChangeWatch(RunObserver):
             self._file.close()
             self._file = None
 
-    def _look(self, kind: str, frame: Frame, T: NDArray[np.float64]) -> None:
+    def _count(self, kind: str, frame: Frame, T: NDArray[np.float64]) -> None:
         assert self._slam is not None
         camera, cells, sensor = self._slam.camera, self._cells[kind], self.volume.sensor
         if kind == "appeared":
@@ -181,8 +187,8 @@ class ChangeWatch(RunObserver):
                 "centre": box.mean(axis=0).round(3).tolist(), "box": box.round(3).tolist(),
             }  # fmt: skip
             self.reported.append(row)
-            assert self._file is not None
-            self._file.write(json.dumps(row) + "\n")
+            if self._file is not None:
+                self._file.write(json.dumps(row) + "\n")
             for observer in self.others:
                 observer.event("change", **row)
 

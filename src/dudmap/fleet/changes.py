@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, with_faces
 from dudmap.fleet.change_colors import SOLID, recolored_pieces
 from dudmap.fleet.change_evidence import UNKNOWN, Evidence, Visit, evidence, surface_tree
 from dudmap.fleet.change_motion import LEAST_FIT, Body, Motion, motion_between
@@ -25,7 +25,6 @@ from dudmap.fleet.change_objects import (
 )
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 from dudmap.io.exporting.gravity import CONE, PARALLEL
-from dudmap.io.exporting.mesh_editing import with_faces
 
 Array = NDArray[np.float64]
 NEAR = 0.3
@@ -88,8 +87,8 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     """All changes of at least a size (m), the largest first, then what is unknown; and the evidence of both visits."""
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
-    missing, new = (denied_pieces(one, own, voxel, min_size) for one, own in zip(found, (before, after), strict=True))
-    out = _moved(before, after, found, missing, new, min_size) if missing and new else []
+    missing, new = (denied_pieces(one, voxel, min_size) for one in found)
+    out = _moved((before, after), found, (missing, new), min_size) if missing and new else []
     for kind, pieces, one, own in (("disappeared", missing, found[0], before), ("appeared", new, found[1], after)):
         for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own):
             sides = (piece, None) if kind == "disappeared" else (None, piece)
@@ -108,54 +107,47 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
 
 
 def _moved(
-    before: Visit,
-    after: Visit,
-    found: tuple[Evidence, Evidence],
-    missing: list[Piece],
-    new: list[Piece],
-    min_size: float,
+    visits: tuple[Visit, Visit], found: tuple[Evidence, Evidence], pieces: tuple[list[Piece], list[Piece]], size: float
 ) -> list[Change]:
-    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists."""
-    motions: list[tuple[Motion, Piece, Piece]] = []
-    up = vertical(before)
-    certain = [
-        [is_certain(p, one, min_size) for p in pieces] for one, pieces in zip(found, (missing, new), strict=True)
-    ]
-    for old, old_certain in zip(missing, certain[0], strict=True):
-        for now, now_certain in zip(new, certain[1], strict=True):
-            motion = _motion(before, after, found, old, now, up) if old_certain or now_certain else None
+    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists.
+
+    Pieces between which something may be hidden are looked at apart and as one."""
+    offered = [
+        [(p, is_certain(p, one, size)) for p in side + [q for q in assembled(side, own, 0.0) if q not in side]]
+        for side, one, own in zip(pieces, found, visits, strict=True)
+    ]  # fmt: skip
+    up, motions = vertical(visits[0]), list[tuple[Motion, Piece, Piece]]()
+    for old, old_certain in offered[0]:
+        for now, now_certain in offered[1]:
+            near = gap_between(old, now) < max(old.length, now.length)  # a fragment may be of any thing farther off
+            tried = (old_certain and now_certain) or ((old_certain or now_certain) and near)
+            motion = _motion(visits, found, old, now, up) if tried else None
             if motion is not None:
                 motions.append((motion, old, now))
     out: list[Change] = []
-    surfaces = (surface_tree(after.mesh.vertices), surface_tree(before.mesh.vertices)) if motions else ()
-    for motion, old, now in sorted(motions, key=lambda row: -row[0].explained):
-        if old not in missing or now not in new:
+    surfaces = [surface_tree(visit.mesh.vertices) for visit in visits[::-1]] if motions else []
+    taken = [np.zeros(len(one.state), bool) for one in found]
+    for motion, *firsts in sorted(motions, key=lambda row: -row[0].explained):
+        if any(used[first.vertices].any() for used, first in zip(taken, firsts, strict=True)):
             continue
-        both, T, length = [], motion.T_after_before, max(old.length, now.length)
-        for pieces, first, one, own, there, T_there, tree in zip(
-            (missing, new),
-            (old, now),
-            found,
-            (before, after),
-            (after, before),
-            (T, se3.inverse(T)),
-            surfaces,
-            strict=True,
+        T, things, length = motion.T_after_before, list[Piece](), max(first.length for first in firsts)
+        for side, (first, one, own, there, tree) in enumerate(
+            zip(firsts, found, visits, visits[::-1], surfaces, strict=True)
         ):
-            parts = [
-                p for p in pieces
-                if p is first or (gap_between(p, first) < length and _goes_along(p, one, there, T_there, tree))
-            ]  # fmt: skip
-            thing = joined(parts)
-            parts += [p for p in pieces if p not in parts and p.area < thing.area and is_part(p, thing, own)]
-            pieces[:] = [p for p in pieces if p not in parts]
-            both.append(joined(parts))
-        out.append(Change("moved", both[0], both[1], motion.fit, T))
+            left = [p for p in pieces[side] if not np.isin(p.vertices[0], first.vertices)]
+            T_there = T if side == 0 else se3.inverse(T)
+            parts = [p for p in left if gap_between(p, first) < length and _goes_along(p, one, there, T_there, tree)]
+            thing = joined([first, *parts])
+            parts += [p for p in left if p not in parts and p.area < thing.area and is_part(p, thing, own)]
+            things.append(joined([first, *parts]))
+            taken[side][things[-1].vertices] = True
+            pieces[side][:] = [p for p in left if p not in parts]
+        out.append(Change("moved", things[0], things[1], motion.fit, T))
     return out
 
 
 def _motion(
-    before: Visit, after: Visit, found: tuple[Evidence, Evidence], old: Piece, now: Piece, up: Array
+    visits: tuple[Visit, Visit], found: tuple[Evidence, Evidence], old: Piece, now: Piece, up: Array
 ) -> Motion | None:
     """The motion from a missing piece to a new one, None if they are two things."""
     boxes = [(old.box, now.box)]
@@ -166,7 +158,7 @@ def _motion(
     length = max(old.length, now.length)
     for pair in boxes:
         bodies = [Body.of(one, piece, box, length) for one, piece, box in zip(found, (old, now), pair, strict=True)]
-        motion = motion_between(before, after, bodies[0], bodies[1], up)
+        motion = motion_between(*visits, bodies[0], bodies[1], up)
         if motion is not None and (best is None or motion.explained > best.explained):
             best = motion
     return best
@@ -195,8 +187,8 @@ def _goes_along(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDT
 
 def _confidence(piece: Piece, found: Evidence) -> float:
     """How far the surface lies off what noise explains: 1 less the squared tolerance over the distance."""
-    distance = np.maximum(np.nan_to_num(found.sdf[piece.vertices], nan=np.inf), 1e-6)
-    return float(np.clip(1 - np.median(found.tolerance[piece.vertices] / distance) ** 2, 0, 1))
+    share = found.tolerance[piece.vertices] / np.maximum(found.gap[piece.vertices], 1e-6)
+    return float(np.clip(1 - np.median(share) ** 2, 0, 1))
 
 
 def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:

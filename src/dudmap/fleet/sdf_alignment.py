@@ -60,7 +60,6 @@ def align_maps(
     of_a: SurfacePoints,
     of_b: SurfacePoints,
     T_a_b: NDArray[np.float64],
-    min_points: int = MIN_POINTS,
     changed: bool = False,
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
@@ -74,7 +73,7 @@ def align_maps(
     center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
-        if len(rows.distance) < min_points:
+        if len(rows.distance) < MIN_POINTS:
             return SdfAlignment(T_a_b, False, residual, 0.0, center)
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
         weights = 1 / np.square(1 + np.square(rows.distance / scale))

@@ -1,72 +1,145 @@
-"""The parts of the system that have kernels, run once on a small synthetic recording to compile them."""
+"""The parts of the system that have kernels, run once on a few small images to compile them.
 
-from collections.abc import Callable
+Two processes compile in about half the time of one, in which only one thread can compile: a second one goes through the
+parts in another order. Which of them compiles a kernel makes no difference; the other one loads it.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dudmap.app.doctor import compiled_kernels
+from dudmap.config import Config
+from dudmap.core.backends.threads import num_threads
+from dudmap.core.calibration.adjustment import Adjustment, Fit
+from dudmap.core.calibration.keyframes import keyframe
+from dudmap.core.calibration.pairs import Pair, PairSet
+from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.slam import Slam
+
+SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
+CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
+BESIDE = "labels", "several voxel sizes"
+"""Parts of all that a second process compiles, which take about as long as the others."""
+BESIDE_RUN = "labels", "mesh"
+"""Parts that it compiles while a run begins."""
+
+
+def room(count: int) -> list[Frame]:
+    """Images of a wall, at rest, and of a box in front of it that moves; drawn without a kernel."""
+    shade = np.random.default_rng(0).integers(40, 220, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    frames = []
+    for number in range(count):
+        box = (abs(u - 60 - 6 * number) < 25) & (abs(v - 60) < 30)
+        depth = np.where(box, 1.2, 2.0 + 0.004 * u + 0.2 * (v > 90)).astype(np.float32)
+        color = np.where(box[..., None], 255 - np.roll(shade, 6 * number, axis=1), shade).astype(np.uint8)
+        frames.append(Frame(number / 30, depth, color))
+    return frames
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of every part with kernels, in the order in which they must run."""
-    import tempfile
-    from pathlib import Path
+    """Name and action of every part with kernels."""
+    frames, start, registered = room(4), np.eye(4), Calibration.registered(CAMERA)
+    config = Config().override(SMALL)
 
-    import numpy as np
-
-    from dudmap.config import Config
-    from dudmap.core.calibration.adjustment import Adjustment, Fit
-    from dudmap.core.calibration.keyframes import keyframe
-    from dudmap.core.calibration.pairs import Pair, PairSet
-    from dudmap.core.geometry.calibration import Calibration
-    from dudmap.core.map.volume import TsdfVolume
-    from dudmap.core.slam import Slam
-    from dudmap.lab.synthetic import sequence
-    from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-
-    camera = DEFAULT_CAMERA.resized(160, 120)
-    recording = sequence(frames=4, camera=camera, start_dynamic=True)
-    poses = recording.ground_truth.Ts_world_camera
-    frames = []
-    small = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
-    slam = Slam(camera, Config().override(small))
-
-    def render() -> None:
-        frames.extend(recording[index] for index in range(len(recording)))
-
-    def process(system: Slam) -> None:
+    def process(*parameters: str, calibration: Calibration | None = None) -> Slam:
+        slam = Slam(CAMERA, config.override(list(parameters)), calibration=calibration)
         for frame in frames:
-            system.process(frame)
+            slam.process(frame)
+        return slam
 
-    def process_variants() -> None:
+    def variants() -> None:
         for variant in ("preset=thesis", "dynamics.method=threshold", "tracker.robust=tukey"):
-            process(Slam(camera, Config().override([variant, *small])))
+            slam = Slam(CAMERA, Config().override([variant, *SMALL]))
+            for frame in frames:
+                slam.process(frame)
 
-    def several_voxel_sizes() -> None:
-        adaptive = Slam(camera, Config().override(["volume.adaptive=true", "volume.adaptive_bend=0.05", *small]))
-        for frame, T_world_camera in zip(frames, poses, strict=True):
-            adaptive.volume.integrate(frame, T_world_camera)
-        adaptive.volume.extract_mesh()
-        adaptive.volume.raycast(poses[-1], camera)
+    def labels() -> None:
+        slam, detector = Slam(CAMERA, config), DynamicDetector(config.dynamics, config.sensor)
+        slam.reference.look_at(start)
+        for number, view in enumerate(map(slam.prepare, frames)):
+            if number == 0:
+                detector.start(view.timestamp, view.labelled, start)
+            found = detector.detect(slam.reference, view.labelled, start, view.timestamp, view.segmentation)
+            detector.update(view.timestamp, view.labelled, start, (1.0, 0.0), found)
 
     def color_camera() -> None:
-        registered = Calibration.registered(camera)
-        system = Slam(camera, Config().override(small), calibration=replace(registered, delay=0.01))
-        process(system)
-        static, still = np.zeros(camera.shape, bool), np.zeros(6)
-        first, second = (keyframe(slam.preprocess(frames[n]), registered, poses[n], still, static) for n in (0, -1))
-        pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, Config().sensor)
+        slam = process(calibration=replace(registered, delay=0.01))
+        static = np.zeros(CAMERA.shape, bool)
+        ends = slam.preprocess(frames[0]), slam.preprocess(frames[-1])
+        first, second = (keyframe(image, registered, start, np.zeros(6), static) for image in ends)
+        pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, config.sensor)
         adjustment.with_poses(pairs, Fit.tracked(pairs, registered), adjustment.levels)
+
+    def several_voxel_sizes() -> None:
+        adaptive = Slam(CAMERA, config.override(["volume.adaptive=true", "volume.adaptive_bend=0.05"]))
+        for frame in frames:
+            adaptive.volume.integrate(frame, start)
+        adaptive.volume.extract_mesh()
+        adaptive.volume.raycast(start, CAMERA)
+
+    def small_map() -> TsdfVolume:
+        slam = Slam(CAMERA, config)
+        slam.volume.integrate(frames[0], start)
+        return slam.volume
 
     def save_and_load() -> None:
         with tempfile.TemporaryDirectory() as folder:
-            slam.volume.save(Path(folder) / "map.npz")
+            small_map().save(Path(folder) / "map.npz")
             TsdfVolume.load(Path(folder) / "map.npz")
 
+    def synthetic_frames() -> None:
+        from dudmap.lab.synthetic import sequence
+
+        recording = sequence(frames=2, camera=CAMERA, start_dynamic=True)
+        _ = [recording[number] for number in range(len(recording))]
+
     return [
-        ("synthetic frames", render),
-        ("tracking, labels and map", lambda: process(slam)),
-        ("variants of the method", process_variants),
+        ("tracking, labels and map", process),
         ("colour camera", color_camera),
-        ("mesh", lambda: slam.volume.extract_mesh()),
-        ("view", lambda: slam.volume.raycast(slam.trajectory.Ts_world_camera[-1], camera)),
-        ("several voxel sizes", several_voxel_sizes),
+        ("mesh", lambda: small_map().extract_mesh()),
+        ("view", lambda: small_map().raycast(start, CAMERA)),
         ("map file", save_and_load),
+        ("variants of the method", variants),
+        ("synthetic frames", synthetic_frames),
+        ("labels", labels),
+        ("several voxel sizes", several_voxel_sizes),
     ]
+
+
+@contextmanager
+def compiled_beside(parts: tuple[str, ...]) -> Iterator[Callable[[], object]]:
+    """A second process compiles ``parts`` while this lasts, where there is a core for it; the function waits for it."""
+    if not parts or num_threads() < 2:
+        yield lambda: None
+        return
+    command, environment = [sys.executable, "-m", __name__, *parts], os.environ | {"DUDMAP_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
+    try:
+        yield process.wait
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def run_compiled_beside() -> AbstractContextManager[object]:
+    """``compiled_beside`` for the first run, which no kernel is compiled for."""
+    return compiled_beside(() if compiled_kernels() else BESIDE_RUN)
+
+
+if __name__ == "__main__":
+    actions = dict(steps())
+    for part in sys.argv[1:]:
+        actions[part]()

@@ -47,7 +47,7 @@ UNITS = {
 }
 """Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
 ASSUMED = "assumed as given, not tested"
-"""What is said of a colour camera that no image was asked about."""
+"""Finding on a colour camera that was not compared with any image."""
 
 START_FRAMES, MIN_FRAMES = 300, 90
 """Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the

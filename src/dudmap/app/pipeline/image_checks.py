@@ -26,7 +26,8 @@ POINTS = 500
 LEAST_POINTS, LEAST_PAIRS = 20, 6
 """Fewest matches of a pair, and fewest pairs that agree."""
 AGREEMENT, SHARE = 0.15, 0.6
-"""Pairs agree within this share of their median, and so many of all must, before the median says anything."""
+"""Largest deviation of a pair that agrees from the median of the pairs, as a share of it, and the least share of pairs
+that must agree."""
 WRONG = 0.2
 """Smallest error of a focal length that is said: that of right ones was up to 0.12 on five real recordings, and one
 that was 20 % too short on purpose was found 25 % too short."""
@@ -38,7 +39,7 @@ WIDTH = 160
 STEP, STEEPEST = 0.08, 4.0
 """Smallest depth edge, as a share of the depth, and largest colour edge, as a multiple of the mean gradient."""
 NEIGHBOURHOOD = 41
-"""Width of the neighbourhood whose mean is taken off both edge images, pixels, so that only places count."""
+"""Width of the neighbourhood whose mean is subtracted from both edge images, pixels."""
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
 """Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, SIGNIFICANT = 0.04, 4.0

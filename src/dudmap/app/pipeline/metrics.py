@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.atomic_file import atomic_file, write_text
 from dudmap.core.objects.moving_objects import MOST_WAITING
+from dudmap.core.result import FrameResult
+from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 
 if TYPE_CHECKING:
     from dudmap.core.objects.object_tracker import Mover
-    from dudmap.core.result import FrameResult
     from dudmap.errors import FrameError
 
 COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "uncertain")
@@ -58,13 +59,15 @@ class RunRecord:
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
-    postponed: "list[tuple[dict[str, Any], FrameResult]]" = field(default_factory=list)
+    postponed: list[tuple[dict[str, Any], FrameResult]] = field(default_factory=list, metadata=CACHE)
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
     spent: tuple[float, float] = (0.0, 0.0)
-    _since: tuple[float, float] = field(default_factory=lambda: (time.perf_counter(), time.process_time()))
+    _since: tuple[float, float] = field(
+        default_factory=lambda: (time.perf_counter(), time.process_time()), metadata=CACHE
+    )
 
     def elapsed(self) -> tuple[float, float]:
         """Seconds, and seconds of processor time, since the run began, without those between two processes of it."""
@@ -77,7 +80,7 @@ class RunRecord:
 
     def add(
         self,
-        result: "FrameResult",
+        result: FrameResult,
         total_ms: float,
         reading_ms: float,
         mask: NDArray[np.bool_] | None,

@@ -11,9 +11,9 @@ from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
-from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing
+from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
-from dudmap.app.state.system import restore
+from dudmap.app.state.tree import TreeReader
 from dudmap.app.terminal import counted
 from dudmap.config import Config
 from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
@@ -190,8 +190,8 @@ class Job:
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
-        current = RunState(self.system(), RunRecord(), first_slam=self.system(), first_record=RunRecord())
-        return restore(reader, current, store.database, current.slam.device)
+        with TreeReader(reader, store.database) as tree:
+            return RunState.read(tree, StoredRun.model_validate(reader.meta()), self.options.config.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
@@ -216,14 +216,14 @@ class Job:
                     total = dropped + len(state.record.rows) + len(state.record.unreadable)
                     display.note(f"live: {dropped} of {total} frames were dropped")
             except KeyboardInterrupt:
-                count, of_pass = len(state.record.rows), " of the second pass" if state.first_slam else ""
+                count, of_pass = len(state.record.rows), " of the second pass" if state.number else ""
                 if not isinstance(self.sequence, LiveCamera):
                     stopped = f"interrupted after {count} frames{of_pass}"
-                    raise KeyboardInterrupt(f"{stopped}; {_saved(state.first_slam)} in {out}") from None
+                    raise KeyboardInterrupt(f"{stopped}; {_saved(state)} in {out}") from None
                 display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
             except DudmapError as error:
                 stopped = str(error)
-                raise type(error)(f"{stopped}; {_saved(state.first_slam)} in {out}") from error
+                raise type(error)(f"{stopped}; {_saved(state)} in {out}") from error
             except BaseException as error:
                 stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
                 raise
@@ -243,7 +243,7 @@ class Job:
         options = self.options
         for number in range(state.number, options.passes):
             if number > state.number:
-                state.first_slam, state.first_record = state.slam, state.record
+                state.first_record = state.record
                 masked = state.record.masked and 0
                 state.slam = self._next_system(state, first_pass=state.slam)
                 spent, warnings = state.record.elapsed(), state.record.warnings
@@ -296,8 +296,8 @@ class Job:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
         self.display.working("writing")
         slam, record = state.slam, state.record
-        if stopped and state.first_slam is not None:  # the first pass is complete, the second is not
-            slam, record = state.first_slam, state.first_record or record
+        if stopped and state.number:  # the first pass is complete, the second is not
+            slam, record = slam.first_pass or slam, state.first_record or record
         complete = False
         try:
             config, save_map = self.options.config, self.options.save_map
@@ -331,8 +331,8 @@ def _repeats(record: RunRecord) -> str:
     return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
-def _saved(first_pass: object) -> str:
-    return f"the trajectory and the map {'of the first pass' if first_pass else 'up to there'} are"
+def _saved(state: RunState) -> str:
+    return f"the trajectory and the map {'of the first pass' if state.number else 'up to there'} are"
 
 
 def _finish_recording(recorder: Recorder, display: RunProgress) -> None:

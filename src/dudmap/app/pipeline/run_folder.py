@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
-from dudmap.atomic_file import UNFINISHED, write_bytes, write_text, writing
+from dudmap.atomic_file import UNFINISHED, write_image, write_text, writing
 from dudmap.config import Config
 from dudmap.core.geometry.mesh_pieces import save_pieces
 from dudmap.core.geometry.trajectory import Trajectory
@@ -133,9 +133,7 @@ class RunReport:
 
 def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
-    import cv2
-
-    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False, own=True)
+    write_image(path, mask, sync=False, own=True)
 
 
 @contextmanager

@@ -21,10 +21,12 @@ from dudmap.app.state.system import (
     code_fingerprint,
     frame_fingerprint,
     images_fingerprint,
+    parts_of,
+    read_system,
     recording_fingerprint,
     take_snapshot,
 )
-from dudmap.app.state.tree import NotSettledError, Snapshot
+from dudmap.app.state.tree import NotSettledError, Snapshot, TreeReader
 from dudmap.atomic_file import bring_to_disk
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
@@ -111,7 +113,7 @@ class RunState:
         calibration: Of the camera, as given.
         number: Number of the pass, from 0.
         next: Number of the frame that comes next.
-        first_slam, first_record: System and metrics of the first pass, during the second.
+        first_record: Metrics of the pass before, whose system is ``slam.first_pass``.
     """
 
     slam: "Slam"
@@ -119,8 +121,24 @@ class RunState:
     calibration: "Calibration | None" = None
     number: int = 0
     next: int = 0
-    first_slam: "Slam | None" = None
     first_record: RunRecord | None = None
+
+    def parts(self) -> dict[str, object]:
+        """Parts of the state that is stored; the numbers are in its ``StoredRun``."""
+        figures = {"record": self.record, "calibration": self.calibration, "first record": self.first_record}
+        return parts_of(self.slam) | figures
+
+    @classmethod
+    def read(cls, tree: TreeReader, stored: "StoredRun", device: str | None) -> "RunState":
+        """The state with these parts."""
+        from dudmap.core.geometry.calibration import Calibration
+
+        slam, record = read_system(tree, device), tree.part("record", RunRecord)
+        assert stored.number is not None
+        return cls(
+            slam, record, tree.part("calibration", Calibration | None), stored.number, stored.next,
+            tree.part("first record", RunRecord | None),
+        )  # fmt: skip
 
 
 class RunStore:
@@ -198,7 +216,7 @@ class RunStore:
         updated = datetime.now().isoformat(" ", "seconds")
         place = {"pass": state.number, "next": state.next, "frame": frame, "updated": updated}
         try:
-            snapshot = take_snapshot(state, self.database, wait=wait)
+            snapshot = take_snapshot(state.parts(), self.database, wait=wait)
         except NotSettledError:
             return
         except StateError as error:  # a defect of this program, which is no reason to end the run

@@ -40,7 +40,7 @@ from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
 """Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
-SCHEMA = 3
+SCHEMA = 4
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 STEPS, LIMIT = 10_000, 100_000
@@ -81,7 +81,7 @@ class StateDatabase:
         self.maps, self.frames = StoredMaps(), StoredFrames()
         with OwnFolder(path.parent, linked=True) as folder:
             folder.check(path.name, alone=True)  # it is written in place
-        self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
+        self._constants: dict[int, tuple[weakref.ref[NDArray], list[str]]] = {}  # chunks of arrays that never change
         self._chunks: set[str] = set()
         self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
         weakref.finalize(self, self._connection.close)
@@ -180,13 +180,13 @@ class StateDatabase:
         transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
         about = {"dtype": array.dtype.str, "shape": array.shape, "transposed": transposed}
         known = self._constants.get(id(array))
-        if constant and known is not None and known[0] is array:
+        if constant and known is not None and known[0]() is array:
             return about | {"chunks": known[1]}, {}
         data = np.ascontiguousarray(array.T if transposed else array).reshape(-1).view(np.uint8).data
         pieces = [data[start : start + CHUNK] for start in range(0, len(data), CHUNK)]
         keys = [hashlib.blake2b(piece, digest_size=16).hexdigest() for piece in pieces]
         if constant:
-            self._constants[id(array)] = array, keys
+            self._constants[id(array)] = weakref.ref(array), keys
         return about | {"chunks": keys}, {key: bytes(piece) for key, piece in zip(keys, pieces, strict=True)
                                           if key not in self._chunks}  # fmt: skip
 

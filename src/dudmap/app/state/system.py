@@ -1,7 +1,8 @@
 """A system and what belongs to it, from and into a database, and what a stored state fits."""
 
 import hashlib
-from dataclasses import asdict, astuple
+from collections.abc import Mapping
+from dataclasses import astuple, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -13,9 +14,7 @@ from dudmap.app.pipeline.environment import versions
 from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.tree import Snapshot, TreeReader, TreeWriter
 from dudmap.config import Config
-from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError, StateError
-from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -67,29 +66,34 @@ def images_fingerprint(frame: "Frame | Exception") -> str:
     return digest.hexdigest()
 
 
-def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) -> Snapshot:
-    """The state of a value, such as a system, without what the database, in which it will be written, holds already.
+def take_snapshot(parts: Mapping[str, object], database: StateDatabase, *, wait: bool = True) -> Snapshot:
+    """The state of some things by name, without what the database, in which it will be written, holds already.
 
     Without ``wait`` it raises ``NotSettledError`` while something is computed in the background.
 
     Raises:
         StateError: There is something that cannot be stored.
     """
-    return TreeWriter(database.maps, database.frames, wait=wait).take(value)
+    return TreeWriter(database.maps, database.frames, wait=wait).take(parts)
 
 
-def restore(reader: StateReader, current: object, database: StateDatabase | None = None, device: str = "cpu") -> Any:  # noqa: ANN401
-    """The value that was stored last, made of the objects of a new one of the same kind (``TreeReader.restore``).
+def parts_of(slam: "Slam") -> dict[str, object]:
+    """A system, and the first pass that it goes on from, as parts of a state."""
+    first = slam.first_pass
+    before = {} if first is None else {"first arguments": first.arguments, "first slam": first}
+    return before | {"arguments": slam.arguments, "slam": slam}
 
-    The reader stays open as long as the system lives: it reads stored frames when it needs them. Where the run goes on
-    in the same database, that takes note of what it holds. ``device`` is that of the maps that ``current`` lacks.
 
-    Raises:
-        StateError: The database is damaged or of another version, or holds no state yet.
-    """
-    value = TreeReader(reader, database, device).restore(current)
-    reader.release()
-    return value
+def read_system(tree: TreeReader, device: str | None, which: str = "") -> "Slam":
+    """The system with these parts, on another device if one is given; it is made first, and then gets its state."""
+    from dudmap.core.slam import Slam, SlamArguments
+
+    first = read_system(tree, device, "first ") if not which and "first slam" in tree else None
+    arguments = tree.part(f"{which}arguments", SlamArguments)
+    given = vars(replace(arguments, config=on_device(arguments.config, device)))
+    slam = Slam(first_pass=first, **given)
+    tree.device = slam.device
+    return tree.part(f"{which}slam", Slam, slam)
 
 
 def save_system(slam: "Slam", path: str | Path) -> None:
@@ -102,12 +106,12 @@ def save_system(slam: "Slam", path: str | Path) -> None:
 
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
-    about = {"camera": asdict(slam.first_camera), "config": slam.config.model_dump_json()}
     try:
         part.unlink(missing_ok=True)
         database = StateDatabase(part)
         try:
-            database.write(take_snapshot(slam, database), about | {"code": code_fingerprint(), "versions": versions()})
+            about = {"code": code_fingerprint(), "versions": versions()}
+            database.write(take_snapshot(parts_of(slam), database), about)
         finally:
             database.close()
         part.replace(path)
@@ -125,17 +129,11 @@ def resume_system(path: str | Path, device: str | None = None) -> "Slam":
     Raises:
         StateError: The file is missing, damaged, or was written by another version.
     """
-    from dudmap.core.slam import Slam
-
     path = Path(path)
     reader = StateReader(path)
-    meta = reader.meta()
-    check_code(meta, path)
-    with damaged(StateError, path):
-        camera = Camera(**meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])})
-        config = on_device(Config.model_validate_json(meta["config"]), device)
-    slam = Slam(camera, config)
-    return restore(reader, slam, device=slam.device)
+    check_code(reader.meta(), path)
+    with TreeReader(reader) as tree:
+        return read_system(tree, device)
 
 
 def on_device(config: Config, device: str | None) -> Config:

@@ -1,28 +1,30 @@
-"""The state of a system as a tree of plain values and arrays, and a system with the state of such a tree.
+"""State as a tree of plain values and arrays, and back, as the annotations of its classes say.
 
-The tree is found by walking through all attributes of all objects, so that no class needs to list what it remembers,
-and an attribute that is added later is stored without further work. What cannot be stored (a thread, an open file, a
-function) is an error unless ``schema.py`` says how it is made again. Nothing is executed when a tree is read: objects
-are made of the classes of a table only, without calling them, and receive the attributes that ``schema.py`` allows.
+What is stored names no class: the annotation of the attribute or field that holds a value says what is made of it, and
+a value that does not fit is refused. A ``Stateful`` object is filled in place, where its owner has made it; dataclasses
+and named tuples are made of their fields, and one that is stored twice is one again. Of functions without arguments
+and futures the result is stored.
 
-A node is a number, a text, None, or an object with one key that names its kind.
+A node is a number, a text, None, or an object with its ``id``, under which others refer to it.
 """
 
 from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, is_dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from dudmap.app.state import schema
-from dudmap.app.state.blocks import MapSnapshot, StoredMaps, restore_map
+from dudmap.app.state.annotations import PLAIN, RECORD, content_type, fields_of, fits, is_frozen, item_hints
+from dudmap.app.state.blocks import VOXELS, MapSettings, MapSnapshot, StoredMaps
 from dudmap.core.backends.device import make_backend
-from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.state import Stateful, remembered
 from dudmap.errors import DatasetError, StateError
 from dudmap.input_files import DAMAGE, parse_json
 
@@ -34,6 +36,8 @@ Node = Any
 """A tree of plain values, as JSON has them."""
 LONG = 32
 """Length from which on a list of equal things is stored as one array."""
+LARGEST_COUNT = 2**23
+"""Largest number of equal things that are stored as one array."""
 
 
 @dataclass(eq=False)
@@ -41,13 +45,13 @@ class Snapshot:
     """The state of a system at one moment, which no later change reaches.
 
     Attributes:
-        tree: The tree; ``arrays`` are referred to by number.
+        tree: The parts by name; ``arrays`` are referred to by number.
         arrays: Copies, except of what never changes; or lists of plain values.
-        constant: Numbers of the arrays that never change.
+        constant: Numbers of the arrays that never change: those of frozen dataclasses and named tuples.
         maps, frames: What changed in the maps and stored frames since the last checkpoint.
     """
 
-    tree: Node = None
+    tree: dict[str, Node] = field(default_factory=dict)
     arrays: list[NDArray | list[Any]] = field(default_factory=list)
     constant: set[int] = field(default_factory=set)
     maps: list[MapSnapshot] = field(default_factory=list)
@@ -67,13 +71,17 @@ class TreeWriter:
         self._maps, self._frames, self._wait = maps, frames, wait
         self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
 
-    def take(self, value: object) -> Snapshot:
-        """The snapshot of a value and everything that it refers to."""
-        self.snapshot.tree = self._node(value, "state")
+    def take(self, parts: Mapping[str, object]) -> Snapshot:
+        """The snapshot of the parts of a state."""
+        for name, value in parts.items():
+            try:
+                self.snapshot.tree[name] = self._node(value, type(value), name)
+            except (TypeError, NameError) as error:  # of the annotations
+                raise StateError(f"{name} cannot be stored: {error}") from error
         return self.snapshot
 
-    def _node(self, value: Any, place: str, *, constant: bool = False) -> Node:  # noqa: ANN401
-        if value is None or type(value) in (bool, int, float, str):
+    def _node(self, value: Any, hint: Any, place: str, *, constant: bool = False) -> Node:  # noqa: ANN401
+        if value is None or type(value) in PLAIN:
             return value
         if isinstance(value, np.generic):
             return {"scalar": value.dtype.str, "value": value.item()}
@@ -81,248 +89,241 @@ class TreeWriter:
             return {"same": self._seen[id(value)][0]}
         number = len(self._seen)
         self._seen[id(value)] = number, value
-        if type(value).__name__ in schema.BACKENDS:
-            return {"backend": number}
-        if isinstance(value, np.ndarray):
-            return {"array": self._array(value, place, constant=constant), "id": number}
-        if isinstance(value, BaseModel):
-            return {"model": _class_name(value, place), "json": value.model_dump_json(), "id": number}
-        if isinstance(value, np.random.Generator):
-            return {"random": value.bit_generator.state, "id": number}
-        if isinstance(value, Future):
-            return {"result": self._node(self._result(value), place), "id": number}
-        if isinstance(value, tuple):
-            items = [self._node(item, f"{place}[{n}]", constant=constant) for n, item in enumerate(value)]
-            node = {"tuple": items, "id": number}
-            return node | {"class": _class_name(value, place)} if type(value) is not tuple else node
-        if isinstance(value, list):
-            return {"list": self._items(value, place), "id": number}
-        if isinstance(value, deque):
-            return {"deque": self._items(list(value), place), "limit": value.maxlen, "id": number}
-        if isinstance(value, dict):
-            keys, content = list(value), list(value.values())
-            return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
-        if isinstance(value, set):
-            return {"set": self._items(sorted(value), place), "id": number}
-        return self._object(value, place, number)
+        kind, parts = content_type(hint)
+        if kind is Future and not (value.done() or self._wait):
+            raise NotSettledError
+        if kind in (Future, Callable):
+            result = value.result() if kind is Future else value()
+            return {"result": self._node(result, parts[0], place), "id": number}
+        if not isinstance(kind, type) or kind is object or not isinstance(value, kind):
+            raise StateError(f"{place} is a {type(value).__module__}.{type(value).__qualname__}; expected {hint}")
+        return self._content(value, kind, parts, place, constant) | {"id": number}
 
-    def _items(self, items: list[Any], place: str) -> Node:
-        """Items of a list: one by one, or as an array where they are many of one kind."""
+    def _content(self, value: Any, kind: type, parts: tuple[Any, ...], place: str, constant: bool) -> dict[str, Node]:  # noqa: ANN401
+        if kind is np.ndarray:
+            if value.dtype.hasobject:
+                raise StateError(f"{place} is an array of objects, which cannot be stored")
+            if constant:
+                self.snapshot.constant.add(len(self.snapshot.arrays))
+            return {"array": self._add(value if constant else value.copy(order="K"))}
+        if kind is np.random.Generator:
+            return {"random": value.bit_generator.state}
+        if issubclass(kind, BaseModel):
+            return {"json": value.model_dump_json()}
+        if issubclass(kind, Stateful):
+            return self._object(value, place)
+        if hints := fields_of(kind):
+            content = {name: getattr(value, name) for name in hints}
+            return {"fields": self._named(content, hints, place, is_frozen(kind))}
+        if issubclass(kind, Mapping):
+            columns = zip(("keys", "items"), (list(value), list(value.values())), parts, strict=True)
+            return {name: self._items(one, [hint] * len(one), place, constant) for name, one, hint in columns}
+        items = sorted(value) if kind is set else list(value)
+        node = {"items": self._items(items, item_hints(kind, parts, len(items)), place, constant)}
+        return node | {"limit": value.maxlen} if kind is deque else node
+
+    def _named(self, values: dict[str, Any], hints: dict[str, Any], place: str, constant: bool) -> dict[str, Node]:
+        return {
+            name: self._node(values[name], hint, f"{place}.{name}", constant=constant) for name, hint in hints.items()
+        }
+
+    def _items(self, items: list[Any], hints: Sequence[Any], place: str, constant: bool) -> Node:
+        """Items of a list: one by one, or together where they are many of one kind."""
         kinds = {type(item) for item in items} if len(items) >= LONG else set()
-        if len(kinds) == 1:
-            kind = kinds.pop()
-            if kind in (int, float) and not (kind is int and any(abs(item) >= 1 << 63 for item in items)):
-                return {"numbers": self._add(np.array(items, np.int64 if kind is int else np.float64))}
-            if kind is np.ndarray and items[0].size <= 64 and len({(a.shape, a.dtype) for a in items}) == 1:
-                return {"stack": self._add(np.stack(items))}
-            if kind.__name__ in schema.COLUMNS and schema.is_state_class(kind):
-                names = list(schema.attributes(items[0]))
-                columns = [self._items([getattr(item, name) for item in items], f"{place}.{name}") for name in names]
-                return {"columns": schema.name_of(kind), "names": names, "values": columns, "count": len(items)}
-        return [self._node(item, f"{place}[{n}]") for n, item in enumerate(items)]
+        kind = kinds.pop() if len(kinds) == 1 else None
+        if kind is str or hints[:1] == [RECORD]:
+            return {"lines": self._add(list(items))}
+        if kind is float or (kind is int and all(abs(item) < 1 << 63 for item in items)):
+            return {"stack": self._add(np.array(items, np.int64 if kind is int else np.float64))}
+        if kind is np.ndarray and items[0].size <= 64 and len({(one.shape, one.dtype) for one in items}) == 1:
+            return {"stack": self._add(np.stack(items))}
+        if kind is not None and kind is content_type(hints[0])[0] and fields_of(kind) and self._are_new(items):
+            first = len(self._seen)
+            self._seen |= {id(item): (first + n, item) for n, item in enumerate(items)}
+            columns = {}
+            for name, hint in fields_of(kind).items():
+                values, where = [getattr(item, name) for item in items], f"{place}.{name}"
+                columns[name] = self._items(values, [hint] * len(items), where, is_frozen(kind))
+            return {"columns": columns, "first": first}
+        pairs = enumerate(zip(items, hints, strict=True))
+        return [self._node(item, hint, f"{place}[{n}]", constant=constant) for n, (item, hint) in pairs]
 
-    def _object(self, value: object, place: str, number: int) -> Node:
-        cls = type(value)
-        if not schema.is_state_class(cls) or not hasattr(value, "__dict__"):
-            raise StateError(f"{place} is a {cls.__module__}.{cls.__qualname__}, which cannot be stored")
-        evaluated, records = schema.EVALUATED.get(cls.__name__, ()), schema.RECORDS.get(cls.__name__, ())
-        node: dict[str, Node] = {"object": schema.name_of(cls), "id": number}
+    def _are_new(self, items: list[Any]) -> bool:
+        return len({id(item) for item in items} - self._seen.keys()) == len(items)
+
+    def _object(self, value: Stateful, place: str) -> dict[str, Node]:
+        node: dict[str, Node] = {}
         if isinstance(value, TsdfVolume):
-            state, changed = self._maps.snapshot(value)
+            changed = self._maps.snapshot(value)
             self.snapshot.maps.append(changed)
-            node |= {"map": changed.number, "blocks": self._node(state, place)}
+            node = {"map": changed.number, "settings": self._node(MapSettings.of(value), MapSettings, place)}
         if isinstance(value, FrameStore):
-            changed = self._frames.snapshot(value)
-            self.snapshot.frames.append(changed)
-            node |= {"store": changed.number}
-        content = {}
-        for name, attribute in schema.attributes(value).items():
-            where = f"{place}.{name}"
-            if name in records:
-                content[name] = {"records": self._add(list(attribute))}
-            elif name in evaluated:
-                content[name] = {"call": self._node(attribute(), where)}
-            else:
-                content[name] = self._node(attribute, where, constant=cls.__name__ in schema.CONSTANT)
-        return node | {"attributes": content}
-
-    def _array(self, array: NDArray, place: str, *, constant: bool) -> int:
-        if array.dtype.hasobject:
-            raise StateError(f"{place} is an array of objects, which cannot be stored")
-        if constant:
-            self.snapshot.constant.add(len(self.snapshot.arrays))
-        return self._add(array if constant else array.copy(order="K"))
+            stored = self._frames.snapshot(value)
+            self.snapshot.frames.append(stored)
+            node = {"store": stored.number}
+        return node | {"state": self._named(value.state(), remembered(type(value)), place, False)}
 
     def _add(self, array: NDArray | list[Any]) -> int:
         self.snapshot.arrays.append(array)
         return len(self.snapshot.arrays) - 1
 
-    def _result(self, future: "Future[Any]") -> Any:  # noqa: ANN401
-        if not (future.done() or self._wait):
-            raise NotSettledError
-        return future.result()
-
 
 class TreeReader:
-    """Gives a system the state that a database holds; for the arguments see ``system.restore``."""
+    """Reads the parts of the state that a database holds, in the order in which they were written.
 
-    def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None, device: str = "cpu") -> None:
-        self._reader, self._database, self._device = reader, database, device
+    The ``reader`` stays open as long as a system that was filled lives: stored frames are read from it when they are
+    needed. Where the run goes on in the same ``database``, that takes note of what it holds. ``device`` is that of
+    the maps to come.
+
+    Raises:
+        StateError: There is no state yet; by all methods: it is damaged or of another version.
+    """
+
+    def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None) -> None:
+        self._reader, self._database, self.device = reader, database, "cpu"
         stored = reader.state()
         if stored is None:
             raise StateError(f"{reader.path} holds no checkpoint yet")
         self._tree, self._arrays = stored
         self._made: dict[int, Any] = {}
         self._at: list[str] = []  # where the tree is being read, which an error names
-        self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
-        self._taken: set[int] = set()  # identities of the objects of the given system that are in use
 
-    def restore(self, current: object) -> Any:  # noqa: ANN401
-        """The value that was stored last.
+    def __contains__(self, name: str) -> bool:
+        return name in self._tree
 
-        The objects of ``current``, a new value of the same kind, are used, so that they stay connected.
+    def __enter__(self) -> Self:
+        return self
 
-        Raises:
-            StateError: The state is damaged or of another version.
-        """
+    def __exit__(self, *_: object) -> None:
+        self._reader.release()
+
+    def part(self, name: str, hint: Any, current: Any = None) -> Any:  # noqa: ANN401
+        """The part of a name, as an annotation says; a ``Stateful`` object is read into ``current``, a new one."""
+        self._at = [name]
         try:
-            value = self._value(self._tree, current)
-            if not schema.is_alike(value, current):
-                raise ValueError(f"found {type(value).__name__}; expected {type(current).__name__}")
-            return value
+            return self._value(self._tree[name], hint, current)
         except (*DAMAGE, DatasetError, MemoryError) as error:
-            place = "".join(["state", *self._at])
             what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
+            place = "".join(self._at)
             raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
 
-    def _value(self, node: Node, current: Any = None) -> Any:  # noqa: ANN401
-        if not isinstance(node, dict):
-            return node
-        match node:
-            case {"same": number}:
-                return self._made[number]
-            case {"backend": number}:
-                usable = type(current).__name__ in schema.BACKENDS and id(current) not in self._taken
-                return self._use(number, current if usable else make_backend(self._device))
-            case {"scalar": name, "value": value}:
-                kind = np.dtype(name)
-                if kind.kind not in "biuf" or not isinstance(value, bool | int | float):
-                    raise ValueError(f"found a {kind} of {type(value).__name__}; expected a number")
-                return kind.type(value)
-            case {"records": number}:
-                lines = self._arrays[number].tobytes().decode().splitlines()
-                return [parse_json(line, exact=True) for line in lines]
-            case {"call": result}:
-                made = self._value(result)
-                return lambda: made
-            case {"object": _}:
-                return self._object(node, current)
-            case {"array": number}:
-                value = self._arrays[number]
-            case {"model": name, "json": text}:
-                cls = schema.class_of(name)
-                if not issubclass(cls, BaseModel):
-                    raise ValueError(f"{cls.__name__} is no configuration")
-                value = cls.model_validate_json(text)
-            case {"random": state}:
-                value = np.random.default_rng(0)
-                value.bit_generator.state = state
-            case {"result": result}:
-                value = Future()
-                value.set_result(self._value(result))
-            case {"tuple": items}:
-                value = self._tuple(self._items(items), node.get("class"))
-            case {"set": items}:
-                value = set(self._items(items))
-            case {"list": items, "id": number}:  # this and the next may be part of their own content
-                value = self._made[number] = []
-                value += self._items(items, current)
-            case {"deque": items, "limit": limit, "id": number}:
-                value = self._made[number] = deque(maxlen=limit)
-                value.extend(self._items(items))
-            case {"dict": names, "values": items, "id": number}:
-                value = self._made[number] = {}
-                keys = self._items(names)
-                known = [current.get(key) for key in keys] if isinstance(current, dict) else []
-                content = self._items(items, known)
-                if not all(map(schema.is_alike, content, known or content)):
-                    raise ValueError(f"found values of other types than those of {keys}")
-                value.update(zip(keys, content, strict=True))
-            case _:
-                raise ValueError(f"found a value of the kind {sorted(node)}")
-        self._made[node["id"]] = value
+    def _value(self, node: Node, hint: Any, current: Any = None) -> Any:  # noqa: ANN401
+        value = self._made_of(node, hint, current) if isinstance(node, dict) else node
+        if not fits(value, hint):
+            raise ValueError(f"found {type(value).__name__}; expected {getattr(hint, '__name__', hint)}")
+        if isinstance(node, dict) and "id" in node:
+            self._made[node["id"]] = value
         return value
 
-    def _use(self, number: int, value: Any) -> Any:  # noqa: ANN401
-        """Note that an object stands for a number of the tree and for no other."""
-        self._made[number] = value
-        self._taken.add(id(value))
-        return value
+    def _made_of(self, node: dict[str, Node], hint: Any, current: Any) -> Any:  # noqa: ANN401
+        if "same" in node:
+            return self._made[node["same"]]
+        if "scalar" in node:
+            kind = np.dtype(node["scalar"])
+            if kind.kind not in "biuf" or not isinstance(node["value"], bool | int | float):
+                raise ValueError(f"found a {kind} of {type(node['value']).__name__}; expected a number")
+            return kind.type(node["value"])
+        kind, parts = content_type(hint)
+        if kind is Future:
+            future: Future[Any] = Future()
+            future.set_result(self._value(node["result"], parts[0]))
+            return future
+        if kind is Callable:
+            result = self._value(node["result"], parts[0])
+            return lambda: result
+        if not isinstance(kind, type) or kind is object:
+            raise ValueError(f"found a value of the kind {sorted(node)}; expected {hint}")
+        return self._content(node, kind, parts, current)
 
-    def _tuple(self, items: list[Any], name: str | None) -> tuple[Any, ...]:
-        if name is None:
-            return tuple(items)
-        cls: Any = schema.class_of(name)
-        if not issubclass(cls, tuple) or len(items) != len(getattr(cls, "_fields", ())):
-            raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
-        return tuple.__new__(cls, items)
+    def _content(self, node: dict[str, Node], kind: type, parts: tuple[Any, ...], current: Any) -> Any:  # noqa: ANN401
+        if kind is np.ndarray:
+            return self._arrays[node["array"]]
+        if kind is np.random.Generator:
+            generator = np.random.default_rng(0)
+            generator.bit_generator.state = node["random"]
+            return generator
+        if issubclass(kind, BaseModel):
+            return kind.model_validate_json(node["json"])
+        if issubclass(kind, Stateful):
+            return self._object(node, kind, current)
+        if hints := fields_of(kind):
+            return kind(**self._named(node["fields"], hints, kind))
+        if issubclass(kind, Mapping):
+            keys, items = (self._items(node[name], list, parts[n : n + 1]) for n, name in enumerate(("keys", "items")))
+            return dict(zip(keys, items, strict=True))
+        items = self._items(node["items"], kind, parts, current)
+        return deque(items, node["limit"]) if kind is deque else kind(items) if kind in (tuple, set) else items
 
-    def _items(self, node: Node, current: Any = None) -> list[Any]:  # noqa: ANN401
-        if isinstance(node, list):
-            known = current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
-            out = []
-            for n, (item, one) in enumerate(zip(node, known, strict=True)):
-                self._at.append(f"[{n}]")
-                out.append(self._value(item, one))
-                self._at.pop()
-            return out
-        if "numbers" in node:
-            return self._arrays[node["numbers"]].tolist()
-        if "stack" in node:
-            stack = self._arrays[node["stack"]]
-            if len(stack) > schema.LARGEST_COUNT:
-                raise ValueError(f"found {len(stack)} arrays; expected {schema.LARGEST_COUNT} or less")
-            return [row.copy() for row in stack]
-        cls = schema.class_of(node["columns"])
-        columns = [self._items(column) for column in node["values"]]
-        schema.check_attributes(cls, dict.fromkeys(node["names"]), {})
-        out = []
-        for values in zip(*columns, strict=True):
-            out.append(object.__new__(cls))
-            for name, value in zip(node["names"], values, strict=True):
-                schema.check_value(cls, name, value, None)
-                object.__setattr__(out[-1], name, value)
+    def _named(self, content: Node, hints: dict[str, Any], kind: type, current: object = None) -> dict[str, Any]:
+        """Attributes by name, those and no others that the annotations name."""
+        _check_names(content, hints, kind)
+        out = {}
+        for name, hint in hints.items():
+            self._at.append(f".{name}")
+            out[name] = self._value(content[name], hint, getattr(current, name, None))
+            self._at.pop()
         return out
 
-    def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
-        cls = schema.class_of(node["object"])
-        frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009 - not in the stubs
-        usable = type(current) is cls and id(current) not in self._taken and not frozen
-        if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
-            raise ValueError(f"{cls.__name__} is no class of plain objects")
-        value: Any = self._use(node["id"], current if usable else object.__new__(cls))
-        content = node["attributes"]
-        like = self._new.setdefault(cls, schema.attributes(current)) if usable else self._new.get(cls, {})
-        schema.check_attributes(cls, content, like)
-        for name, default in {} if usable else schema.defaults(cls).items():
-            object.__setattr__(value, name, default)
-        for name, attribute in content.items():
-            self._at.append(f".{name}")
-            made = self._value(attribute, getattr(current, name, None))
-            schema.check_value(cls, name, made, like.get(name))
-            self._at.pop()
-            object.__setattr__(value, name, made)
-        if cls is Camera:
-            value.__post_init__()  # its size decides how much memory is taken
-        if "map" in node:
-            self._fill_map(value, node["map"], self._value(node["blocks"]))
-        if "store" in node:
-            self._connect_frames(value, node["store"])
-        return value
+    def _items(self, node: Node, kind: type, parts: tuple[Any, ...], current: object = None) -> list[Any]:
+        if isinstance(node, list):
+            out, known = [], current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
+            for n, (item, hint) in enumerate(zip(node, item_hints(kind, parts, len(node)), strict=True)):
+                self._at.append(f"[{n}]")
+                out.append(self._value(item, hint, known[n]))
+                self._at.pop()
+            return out
+        if "columns" in node:
+            return self._columns(node, content_type(parts[0])[0])
+        stored = self._arrays[node["stack" if "stack" in node else "lines"]]
+        if len(stored) > LARGEST_COUNT and "stack" in node:
+            raise ValueError(f"found {len(stored)} values; expected {LARGEST_COUNT} or less")
+        if "lines" in node:
+            out = [parse_json(line, exact=True) for line in stored.tobytes().decode().splitlines()]
+        else:
+            out = stored.tolist() if stored.ndim == 1 else [row.copy() for row in stored]
+        if parts[0] != RECORD and not all(map(fits, out, item_hints(kind, parts, len(out)))):
+            raise ValueError(f"found other values than {parts}")
+        return out
 
-    def _fill_map(self, volume: TsdfVolume, number: int, index: dict[str, Any]) -> None:
-        reader = self._reader
-        restore_map(volume, index, *reader.blocks(number), lambda region: reader.region(number, region))
+    def _columns(self, node: dict[str, Node], kind: type) -> list[Any]:
+        """Many objects of one class, of which one attribute after the other is stored."""
+        hints = fields_of(kind)
+        _check_names(node["columns"], hints, kind)
+        columns = [self._items(node["columns"][name], list, (hint,)) for name, hint in hints.items()]
+        items = [kind(**dict(zip(hints, values, strict=True))) for values in zip(*columns, strict=True)]
+        self._made |= {node["first"] + n: item for n, item in enumerate(items)}
+        return items
+
+    def _object(self, node: dict[str, Node], kind: type, current: Any) -> Stateful:  # noqa: ANN401
+        if issubclass(kind, TsdfVolume):
+            current = self._new_map(kind, self._value(node["settings"], MapSettings))
+        if not isinstance(current, kind):
+            raise ValueError(f"found a {kind.__name__}, which a new object of this kind does not have")
+        assert isinstance(current, Stateful)
+        self._made[node["id"]] = current  # its content may refer to it
+        current.restore(self._named(node["state"], remembered(type(current)), kind, current))
+        if isinstance(current, TsdfVolume):
+            self._fill_map(current, node["map"])
+        if isinstance(current, FrameStore):
+            self._connect_frames(current, node["store"])
+        return current
+
+    def _new_map(self, kind: type[TsdfVolume], settings: MapSettings) -> TsdfVolume:
+        if kind is not TsdfVolume:
+            return kind(*settings[:4])
+        backend = make_backend("cpu" if settings.config.adaptive else self.device)
+        return make_volume(*settings[:4], backend, settings.max_blocks)
+
+    def _fill_map(self, volume: TsdfVolume, number: int) -> None:
+        """Give a map whose index is complete the voxels of its blocks."""
+        reader, blocks = self._reader, volume.blocks
+        slots, coords, voxels = reader.blocks(number)
+        owned = blocks.active_slots
+        if not (np.array_equal(slots, owned) and np.array_equal(coords, blocks.slot_coords[owned])):
+            raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
+        blocks.write(slots, voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :])
+        if volume.pager is not None:
+            volume.pager.continue_from(lambda region: reader.region(number, region))
         if self._database is not None:
             self._database.maps.add(volume, number)
 
@@ -335,7 +336,8 @@ class TreeReader:
             self._database.frames.add(store, number)
 
 
-def _class_name(value: object, place: str) -> str:
-    if not schema.is_state_class(type(value)):
-        raise StateError(f"{place} is a {schema.name_of(type(value))}, which cannot be stored")
-    return schema.name_of(type(value))
+def _check_names(content: object, hints: Iterable[str], kind: type) -> None:
+    """Check that an object of a class has the attributes that it needs, and no others."""
+    if not isinstance(content, dict) or content.keys() != set(hints):
+        found = sorted(content) if isinstance(content, dict) else content
+        raise ValueError(f"found the attributes {found} of {kind.__name__}; expected {sorted(hints)}")

@@ -4,7 +4,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ class _News:
     figures: list[FrameFigures] = field(default_factory=list)
     images: FrameImages | None = None
     poses: "dict[float, NDArray] | None" = None
+    changes: list[dict[str, Any]] = field(default_factory=list)
     restart: bool = False
 
 
@@ -90,6 +91,13 @@ class LiveView(RunObserver):
             self._changed.notify()
         self.costs.append(1000 * (time.perf_counter() - start))
 
+    def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
+        """Show what changed since an earlier visit."""
+        if name == "change":
+            with self._changed:
+                self._news.changes.append(values)
+                self._changed.notify()
+
     def finish(self, out: Path) -> None:
         """Show the final trajectory and mesh."""
         if self._slam is not None and self._error is None:
@@ -127,7 +135,9 @@ class LiveView(RunObserver):
             return news
 
     def _has_news(self) -> bool:
-        return bool(self._news.figures or self._news.restart or self._news.poses or self._feed.has_copy)
+        return bool(
+            self._news.figures or self._news.restart or self._news.poses or self._news.changes or self._feed.has_copy
+        )
 
     def _show(self) -> None:
         try:
@@ -136,6 +146,8 @@ class LiveView(RunObserver):
                     self._window.clear()
                 self._window.show_mesh(self._feed.take())
                 self._window.add_frames(news.figures, news.poses)
+                for change in news.changes:
+                    self._window.show_change(change)
                 if news.images is not None and news.figures:
                     self._window.add_images(news.figures[-1].timestamp, news.images.files())
                 time.sleep(PERIOD)

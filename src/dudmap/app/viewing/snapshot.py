@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import write_bytes, writing
+from dudmap.atomic_file import write_image, writing
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
 
@@ -233,4 +233,4 @@ def _row(pictures: Iterable[tuple[str, NDArray]], width: int, columns: int) -> N
 
 def _save(path: str | Path, image: NDArray[np.uint8]) -> None:
     with writing(f"the image {path}"):
-        write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+        write_image(path, image)

@@ -2,7 +2,6 @@
 
 import io
 import threading
-from collections.abc import Iterable
 from contextlib import redirect_stdout
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,6 @@ from dudmap.app.viewing.mesh_feed import MeshChanges
 from dudmap.app.viewing.page_access import PageAccess, port_problem
 from dudmap.app.viewing.snapshot import KINDS, FrameFigures
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
 from dudmap.errors import DudmapError
 from dudmap.extras import extra
@@ -28,9 +26,8 @@ MAX_IMAGES = 300
 PLOT_POINTS = 500
 """Points of a plot over time."""
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
-LAYERS = {"map": "map", "path": "trajectory", "camera": "camera", "movers": "what moves"}
-"""Parts of the scene that can be hidden, by the first part of the names of their nodes, and their labels."""
-PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
+CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
+PATH_COLOR, CAMERA_COLOR = (0, 150, 220), (255, 120, 40)
 
 
 class Window:
@@ -64,16 +61,13 @@ class Window:
         self.url = self.access.url
         self._camera: Camera | None = None
         self._handles: dict[str, Any] = {}
-        self._chunks: dict[Chunk, Mesh] = {}
+        self._chunks: set[Chunk] = set()
         self._frames: list[FrameFigures] = []
         self._images: dict[float, dict[str, bytes]] = {}
-        self._marks: list[NDArray[np.float64]] = []
         self._shown = -1
         self._server.gui.set_panel_label(title)
         self._make_controls(title)
-        scene = self._server.scene
-        scene.set_up_direction("-y")
-        scene.on_click()(lambda event: self.mark(np.array(event.ray_origin), np.array(event.ray_direction)))
+        self._server.scene.set_up_direction("-y")
         self._server.initial_camera.position = (0.0, -0.9, -1.6)
         self._server.initial_camera.look_at = (0.0, 0.0, 1.5)
 
@@ -93,6 +87,8 @@ class Window:
             self._frames.clear()
             self._images.clear()
             self._shown = -1
+            for name in [name for name in self._handles if name.startswith("/changes/")]:
+                self._remove(name)
 
     def show_mesh(self, changes: MeshChanges) -> None:
         """Replace the changed parts of the map."""
@@ -103,10 +99,10 @@ class Window:
                 self._chunks.clear()
             for key, mesh in changes.chunks.items():
                 if mesh is None or len(mesh.faces) == 0:
-                    self._chunks.pop(key, None)
+                    self._chunks.discard(key)
                     self._remove(_mesh_name(key))
                 else:
-                    self._chunks[key] = mesh
+                    self._chunks.add(key)
                     file = encoded(mesh, double_sided=False)  # rooms are looked into from outside
                     self._add(_mesh_name(key), "add_glb", file)
 
@@ -126,6 +122,15 @@ class Window:
             self._draw_plots()
             if self._follow.value:
                 self.show_frame(len(self._frames) - 1)
+
+    def show_change(self, change: dict[str, Any]) -> None:
+        """Show the box of a change since an earlier visit, an object of changes.jsonl."""
+        with self._lock:
+            low, high = np.array(change["box"])
+            name, middle = f"/changes/{change['id']}", (low + high) / 2
+            color = CHANGE_COLORS[change["kind"]]
+            self._add(f"{name}/box", "add_box", color=color, dimensions=high - low, position=middle, wireframe=True)
+            self._add(f"{name}/label", "add_label", text=f"{change['id']}: {change['kind']}", position=middle)
 
     def add_images(self, timestamp: float, files: dict[str, bytes]) -> None:
         """JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
@@ -156,21 +161,6 @@ class Window:
             if not self._follow.value and self._images:
                 self._draw_images(min(self._images, key=lambda stamp: abs(stamp - frame.timestamp)))
 
-    def mark(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> None:
-        """Mark the point of the map on a ray; two marked points give their distance."""
-        with self._lock:
-            point = first_hit(origin, direction, self._chunks.values())
-            if point is None:
-                return
-            self._marks = [*self._marks[-1:], point] if len(self._marks) == 1 else [point]
-            text = "point: x {:.3f}, y {:.3f}, z {:.3f} m".format(*point)
-            ends = np.array([self._marks[0], point])
-            if len(self._marks) == 2:
-                text += f"; **{np.linalg.norm(ends[1] - ends[0]):.3f} m** from the one before"
-            self._point.content = text
-            self._add("/marks/points", "add_point_cloud", points=ends, colors=MARK_COLOR, point_size=0.02)
-            self._add("/marks/line", "add_line_segments", points=ends[None], colors=MARK_COLOR, thickness=0.006)
-
     def stop(self) -> None:
         """End the server."""
         with redirect_stdout(io.StringIO()):
@@ -187,10 +177,6 @@ class Window:
         self._follow = gui.add_checkbox("follow the run", initial_value=True)
         self._slider.on_update(lambda event: self._slide(event))
         self._follow.on_update(lambda _: self.show_frame(len(self._frames) - 1) if self._follow.value else None)
-        self._layers = {layer: gui.add_checkbox(label, initial_value=True) for layer, label in LAYERS.items()}
-        for control in self._layers.values():
-            control.on_update(lambda _: self._apply_visibility())
-        self._point = gui.add_markdown("click on the map for a point, again for a distance")
         empty = np.zeros((48, 64, 3), dtype=np.uint8)
         self._pictures = {kind: gui.add_image(empty, label=kind, format="jpeg") for kind in KINDS}
         nothing, seconds = (np.zeros(1), np.zeros(1)), _series("s")
@@ -205,15 +191,6 @@ class Window:
         with self._lock:
             self._follow.value = False
             self.show_frame(int(self._slider.value))
-
-    def _apply_visibility(self) -> None:
-        with self._lock:
-            for name, handle in self._handles.items():
-                handle.visible = self._is_visible(name)
-
-    def _is_visible(self, name: str) -> bool:
-        control = self._layers.get(name.split("/")[1])
-        return control is None or control.value
 
     # -- scene --------------------------------------------------------------------------------------------------------
 
@@ -266,8 +243,7 @@ class Window:
         self._residual_plot.data = (t, np.nan_to_num(residuals))
 
     def _add(self, name: str, method: str, *content: Any, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
-        visible = self._is_visible(name)
-        self._handles[name] = getattr(self._server.scene, method)(name, *content, visible=visible, **values)
+        self._handles[name] = getattr(self._server.scene, method)(name, *content, **values)
 
     def _remove(self, name: str) -> None:
         handle = self._handles.pop(name, None)
@@ -281,39 +257,3 @@ def _mesh_name(key: Chunk) -> str:
 
 def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known where viser is installed
     return {"label": label, "stroke": "#c2410c", "width": 1.5}
-
-
-def first_hit(
-    origin: NDArray[np.float64], direction: NDArray[np.float64], meshes: Iterable[Mesh]
-) -> NDArray[np.float64] | None:
-    """Nearest intersection (3,) of a ray with the triangles of some meshes, None if it meets none; those whose bounding
-    box it misses cost next to nothing.
-    """
-    distances = [distance for mesh in meshes if (distance := _distance(origin, direction, mesh)) is not None]
-    return origin + min(distances) * direction if distances else None
-
-
-def _distance(origin: NDArray[np.float64], direction: NDArray[np.float64], mesh: Mesh) -> float | None:
-    """Distance in units of ``direction`` to the nearest triangle (Moeller and Trumbore 1997)."""
-    if len(mesh.faces) == 0 or not _meets_box(origin, direction, mesh):
-        return None
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    edge_b, edge_c, from_a = b - a, c - a, origin - a
-    p = np.cross(direction, edge_c)
-    q = np.cross(from_a, edge_b)
-    det = np.einsum("ij,ij->i", edge_b, p)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a ray in the plane of a triangle does not meet it
-        u = np.einsum("ij,ij->i", from_a, p) / det
-        v = q @ direction / det
-        t = np.einsum("ij,ij->i", edge_c, q) / det
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-    return float(t[hit].min()) if hit.any() else None
-
-
-def _meets_box(origin: NDArray[np.float64], direction: NDArray[np.float64], mesh: Mesh) -> bool:
-    """Whether the ray passes through the bounding box of the mesh (slab test)."""
-    low, high = mesh.vertices.min(axis=0) - 1e-6, mesh.vertices.max(axis=0) + 1e-6
-    slope = np.where(direction == 0, 1e-300, direction)
-    to_low, to_high = (low - origin) / slope, (high - origin) / slope
-    enter, leave = np.minimum(to_low, to_high).max(), np.maximum(to_low, to_high).min()
-    return bool(enter <= leave and leave > 0)

@@ -12,7 +12,7 @@ from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.map.volume import TsdfVolume
 
 SAMPLES = 5
-"""Other frames whose colours a pixel takes the median of: up to two that still show something that moves do no harm."""
+"""Number of other frames over whose colours the median of a pixel is taken; two of them may show what moves."""
 TRIES = 24
 """Other frames, nearest first, in which a pixel is looked for."""
 TOLERANCE = 0.03

@@ -14,7 +14,6 @@ from dudmap.app.views.rendering import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.exporting.run_content import RunContent
-from dudmap.io.exporting.view_synthesis import index_at
 from dudmap.io.sequences.images import read_mask
 
 if TYPE_CHECKING:
@@ -23,7 +22,8 @@ if TYPE_CHECKING:
 MARGIN = 6 / 640
 """Width by which masks grow, as a share of the image's: blur, mixed pixels and the disparity window of the sensor."""
 REACH = 24 / 640
-"""Pixels so near a mask that lie in front of the map belong to it: in a finished map only what moved is in front."""
+"""Largest distance from a mask, as a share of the width, of pixels in front of the map that are added to it: only what
+moved lies in front of a finished map."""
 IN_FRONT = 0.04
 """A reading is in front of the map if it is nearer by this share: 2.5 standard deviations of a Kinect at 5 m
 (0.0012 m + 0.0019 (z - 0.4)^2)."""
@@ -95,24 +95,14 @@ class Cleaner:
 
     def __init__(self, run: RunContent, sequence: "Sequence") -> None:
         self.run, self.sequence = run, sequence
-        masks = run.mask_files()
-        stamps = np.array(sorted(masks))
         self._poses: dict[int, NDArray[np.float64]] = {}
         self._masks: dict[int, Path] = {}
-        for index, moment in enumerate(sequence.timestamps.tolist()):
-            pose, mask = index_at(run.trajectory.timestamps, moment), index_at(stamps, moment)
-            if pose is not None and mask is not None:
-                self._poses[index] = run.trajectory.Ts_world_camera[pose]
-                self._masks[index] = masks[float(stamps[mask])]
+        for index, T_world_camera, mask in run.frames_of(sequence):
+            self._poses[index], self._masks[index] = T_world_camera, mask
         self.indices = tuple(self._poses)
-        if not self.indices:
-            raise DatasetError(
-                f"no frame of {sequence.name} has a pose in {run.folder}; name the run of this recording"
-            )
-        self.registered = sequence.calibration is None
-        if run.calibration is None and not self.registered:
-            raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
-        color_camera = sequence.camera if run.calibration is None else run.calibration.camera
+        self.registered, color_camera = sequence.calibration is None, run.color_camera(sequence)
+        if run.calibration is not None:  # also of registered images, where it was estimated
+            color_camera = run.calibration.camera
         if run.mesh is not None:
             remove_hanging_pieces(run.volume, run.mesh)
         self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera, registered=self.registered)
@@ -161,7 +151,7 @@ class Cleaner:
 
 
 def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
-    """Mask (H, W) grown by about so many pixels, at least one."""
+    """Mask (H, W) dilated by a disk with a radius of ``width`` pixels, at least one."""
     import cv2
 
     radius = max(1, round(width))

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, pieces
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.io.exporting.mesh_editing import face_areas, pieces
+from dudmap.io.exporting.mesh_editing import face_areas
 
 LARGEST = 25e-4
 """Surface of the largest piece that is removed, square metres: a square of 5 cm. What is larger may be a lamp."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_path, write_bytes, write_text
+from dudmap.atomic_file import atomic_path, write_image, write_text
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, printable
@@ -39,9 +39,8 @@ class TumFolder:
     def add(self, kind: str, timestamp: float, image: NDArray) -> str:
         """Write an image: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool as 255 and 0; returns its line of the
         list."""
-        pixels = image[..., ::-1] if image.ndim == 3 else image.astype(np.uint8) * 255 if image.dtype == bool else image
         line = f"{timestamp:.6f} {kind}/{timestamp:.6f}.png"
-        write_bytes(self._out / line.split()[1], cv2.imencode(".png", pixels)[1].tobytes(), sync=False)
+        write_image(self._out / line.split()[1], image, sync=False)
         self._lines[kind].append(line)
         return line
 
@@ -176,7 +175,7 @@ def render_run(
         run.volume.see_farther(_farthest(run, trajectory))
     if out.suffix.lower() == PICTURE and not out.is_dir():
         color, _ = _view(run, trajectory.Ts_world_camera[0], camera)
-        write_bytes(out, cv2.imencode(PICTURE, color[..., ::-1])[1].tobytes())
+        write_image(out, color)
         return 1
     if out.suffix and not out.is_dir():
         with video_file(out, (camera.width, camera.height), fps) as add, ThreadPoolExecutor(1) as encoder:

@@ -27,10 +27,6 @@ OLDEST_RELEASE = 580
 """First driver that supports it."""
 OLDEST_GPU = 75
 """Oldest compute capability, times ten, that CUDA 13 compiles for."""
-NO_DEVICE = 100
-"""Error of the driver where it finds no GPU."""
-MISMATCH = 803
-"""Error of the driver where its parts are of different versions."""
 
 
 class DeviceWarning(RuntimeWarning):
@@ -95,8 +91,7 @@ def _resolved(device: str) -> str:
     number = int(device.partition(":")[2] or supported_gpus()[0])
     if number not in supported_gpus():
         known = ", ".join(f"cuda:{n}" for n in supported_gpus())
-        lack = f"there is no device {device}" if number >= num_gpus() else f"device {device} is too old for Warp"
-        raise ConfigError(f"{lack}; this machine has {known}")
+        raise ConfigError(f"there is no device {device} that Warp supports; this machine has {known}")
     return f"cuda:{number}"
 
 
@@ -119,16 +114,15 @@ def obstacle() -> str:
             f"the NVIDIA driver supports CUDA {version[0]}.{version[1]}, but Warp needs {OLDEST_DRIVER[0]}."
             f"{OLDEST_DRIVER[1]}, that is driver {OLDEST_RELEASE} or later"
         )
-    if failure := driver_failure():
-        return failure
-    if num_gpus() == 0:
-        return "the NVIDIA driver finds no GPU"
     if not _has_warp():
         return f"Warp is not installed ({install('gpu')})"
     if failure := warp_failure():
         return failure
     if not supported_gpus():
-        return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+        return (
+            f"Warp finds no GPU that it supports: one of compute capability {OLDEST_GPU / 10} or later, whose driver "
+            "starts (nvidia-smi)"
+        )
     return ""
 
 
@@ -160,26 +154,6 @@ def driver_version() -> tuple[int, int] | None:
     if library is None or library.cuDriverGetVersion(ctypes.byref(version)) != 0:
         return None
     return version.value // 1000, version.value % 1000 // 10
-
-
-@cache
-def driver_failure() -> str:
-    """Why the driver does not start, as part of a sentence; empty where it does or is missing."""
-    library = _driver()
-    code = 0 if library is None else library.cuInit(0)
-    if code in (0, NO_DEVICE):
-        return ""
-    hint = "restart the machine after an update of the driver" if code == MISMATCH else "see nvidia-smi"
-    return f"the NVIDIA driver does not start (error {code}: {hint})"
-
-
-@cache
-def num_gpus() -> int:
-    """GPUs that the driver finds."""
-    library, count = _driver(), ctypes.c_int(0)
-    if library is None or library.cuInit(0) != 0 or library.cuDeviceGetCount(ctypes.byref(count)) != 0:
-        return 0
-    return count.value
 
 
 @cache

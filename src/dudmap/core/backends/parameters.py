@@ -259,6 +259,22 @@ class DepthView(NamedTuple):
     T_world_camera: NDArray[np.float64]
 
 
+class LevelImage(NamedTuple):
+    """An image that is compared with the map.
+
+    Attributes:
+        depth: (h, w) float32, metres, 0 = none.
+        intensity: (h, w) float32 in [0, 1].
+        weights: (h, w) float32 static weights in [0, 1]; ``sample`` needs none.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+    """
+
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    intrinsics: NDArray[np.float32]
+
+
 class FreeSpace(NamedTuple):
     """Which blocks without voxels are observed to be empty: those in every second plane of the window.
 
@@ -269,6 +285,24 @@ class FreeSpace(NamedTuple):
 
     parity: int
     after: int
+
+
+class BlockVisit(NamedTuple):
+    """Blocks of a level that an image may be averaged into.
+
+    Attributes:
+        candidates: (n,) int32 slots that may be in view.
+        fused: (slots,) uint8 frames that were fused into each slot.
+        turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
+        repeats: Number of equal frames that this one stands for.
+        free_space: Which empty blocks to observe; None = none.
+    """
+
+    candidates: NDArray[np.int32]
+    fused: NDArray[np.uint8]
+    turn: int
+    repeats: int
+    free_space: FreeSpace | None
 
 
 class TouchedBlocks(NamedTuple):

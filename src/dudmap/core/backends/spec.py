@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.parameters import (
+    BlockVisit,
     DepthView,
-    FreeSpace,
     FusedBlocks,
     FusionParameters,
+    LevelImage,
     MapSample,
     NormalEquations,
     RegistrationParameters,
@@ -46,28 +47,12 @@ class Backend(Protocol):
         ...
 
     def fuse(
-        self,
-        grid: VoxelGrid,
-        view: DepthView,
-        touched: TouchedBlocks,
-        candidates: NDArray[np.int32],
-        fused: NDArray[np.uint8],
-        turn: int,
-        count: int,
-        free_space: FreeSpace | None,
-        parameters: FusionParameters,
+        self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
         """Average an image into the voxels in view (eq. 4.18-4.23), and observe the space in front of its readings.
 
-        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``.
-
-        Args:
-            touched: What ``touch`` found for the image.
-            candidates: (n,) int32 slots that may be in view.
-            fused: (slots,) uint8 frames that were fused into each slot.
-            turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
-            count: Number of equal frames that this one stands for.
-            free_space: Which empty blocks to observe; None = none.
+        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``. ``touched`` is what ``touch`` found for the
+        image.
         """
         ...
 
@@ -76,10 +61,7 @@ class Backend(Protocol):
     def register(
         self,
         grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
+        image: LevelImage,
         T_world_camera: NDArray[np.float64],
         first: NormalEquations | None,
         rules: DescentRules,
@@ -88,10 +70,7 @@ class Backend(Protocol):
         """Levenberg-Marquardt steps from a pose on (eq. 4.43 with the weights of 4.46); see ``descent.py``.
 
         Args:
-            depth: (h, w) float32, metres, 0 = none.
-            intensity: (h, w) float32 in [0, 1].
-            weights: (h, w) float32 static weights in [0, 1].
-            intrinsics: (4,) float32 fx, fy, cx, cy.
+            image: Image of a level of the pyramid.
             T_world_camera: (4, 4) pose at which the steps begin.
             first: Normal equations there; None where they are not known yet.
             rules: Beginning and end; without steps the result are the normal equations at the pose.
@@ -99,15 +78,11 @@ class Backend(Protocol):
         ...
 
     def sample(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        free_after: int,
+        self, grid: VoxelGrid, image: LevelImage, T_grid_camera: NDArray[np.float32], free_after: int
     ) -> MapSample:
-        """Signed distance, intensity difference and occupancy of the map at the points of an image; images as of
-        ``register``, ``T_grid_camera`` (3, 4) float32 from the camera to the window's lattice (voxels); ``free_after``
-        observations make free space."""
+        """Signed distance, intensity difference and occupancy of the map at the points of an image.
+
+        ``T_grid_camera`` (3, 4) float32 is the motion from the camera to the window's lattice (voxels); ``free_after``
+        observations make free space.
+        """
         ...

@@ -7,11 +7,12 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 import atexit
 import gc
 import hashlib
+import inspect
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from functools import cache
+from functools import cache, cached_property, partial, update_wrapper
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ _OPTIONS: dict[str, Any] = {
     "cache": True,
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
     "error_model": "numpy",
+    "no_cfunc_wrapper": True,
 }
 
 
@@ -52,13 +54,18 @@ event.register("numba:compile", _Uncollected())  # sent under the lock of the co
 
 
 @cache
-def sources() -> str:
-    """Digest of name, time of change and size of all files whose text or constants kernels are compiled from."""
+def sources(file: str) -> str:
+    """Digest of a kernel's file and of all others whose text or constants kernels are compiled from. The times of their
+    changes do not enter it: a file that is written anew as it was costs no compilation."""
     folder = Path(__file__).parent
     folders = folder, folder / "cpu", folder.parent / "formulas"
-    files = sorted(path for each in folders for path in each.glob("*.py"))
-    stamps = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files]
-    return hashlib.sha256(repr(stamps).encode()).hexdigest()
+    files = {Path(file), *(path for each in folders for path in each.glob("*.py"))}
+    return hashlib.sha256(repr([(path.name, _digest(path)) for path in sorted(files)]).encode()).hexdigest()
+
+
+@cache
+def _digest(file: Path) -> bytes:
+    return hashlib.sha256(file.read_bytes()).digest()
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -70,19 +77,51 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = njit(**(_OPTIONS | options))(function)
         if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
-            index: Any = vars(compiled)["_cache"]._cache_file
-            index._source_stamp = index._source_stamp, sources()
+            file = vars(compiled)["_cache"]._cache_file
+            file._source_stamp = sources(inspect.getfile(function))
+            # two processes that compile it for other types at the same time do not write one file
+            file._data_name_pattern = file._data_name_pattern.replace("{number", f"{os.getpid()}.{{number")
         return compiled
 
     return decorate
 
 
+class Scalar:
+    """What kernels call: it is inlined there, and becomes a kernel of its own only where Python calls it.
+
+    Numba would make each callable from Python and C, and store it, which can take longer than to compile it.
+
+    Attributes:
+        py_func: The function as it was written.
+        inlined: What Numba compiles for kernels.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        update_wrapper(self, function)
+        self.py_func, self._options = function, options
+        inlined: dict[str, Any] = {"cache": False, "forceinline": True, "no_cpython_wrapper": True}
+        self.inlined = njit(**(_OPTIONS | options | inlined))(function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What Numba takes this for in a kernel."""
+        return self.inlined._numba_type_
+
+    @cached_property
+    def _alone(self) -> Callable[..., Any]:
+        return _compiled(**self._options)(self.py_func)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the kernel of its own."""
+        return self._alone(*arguments)
+
+
 kernel = _compiled()
 exact = _compiled(fastmath=False)
 """Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
-exact_scalar = _compiled(fastmath=False, forceinline=True)
+exact_scalar = partial(Scalar, fastmath=False)
 """Compiles what such loops call; ``py_func`` is the same formula for whole images."""
-scalar = _compiled(forceinline=True)
+scalar = Scalar
 """Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
 function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
 of the two is called depends on whether the caller was compiled in this process or loaded from the cache."""

@@ -40,7 +40,7 @@ STEADY = 2
 """Number of steps in a row that must be small: a single one may be before the poses have followed."""
 FIT_ITERATIONS = 3
 """Steps per image size by which poses are fitted to a known calibration."""
-SETTLED, SETTLED_COARSE = 0.01, 0.1
+CONVERGED, CONVERGED_COARSE = 0.01, 0.1
 """A step below this many prior standard deviations in every parameter ends the largest image size; the smaller ones
 only lead to the next."""
 
@@ -139,7 +139,7 @@ class Adjustment:
         fit, system = start, None
         levels = levels or self.levels
         for level in levels:
-            settled = (SETTLED if level == levels[-1] else SETTLED_COARSE) * np.sqrt(CORRELATED / self.prior)
+            settled = (CONVERGED if level == levels[-1] else CONVERGED_COARSE) * np.sqrt(CORRELATED / self.prior)
             small = 0
             for _ in range(ITERATIONS if level == levels[-1] else COARSE_ITERATIONS):
                 system = self._linearize(pairs, fit, level, fit.scales)

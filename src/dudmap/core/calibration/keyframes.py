@@ -12,6 +12,7 @@ from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.state import Remembered, Stateful
 
 GEOMETRY_WIDTH = 160
 """Width of the depth images that are compared, pixels."""
@@ -155,18 +156,21 @@ def central_velocity(
     return se3.log(se3.inverse(before[1]) @ after[1]) / max(after[0] - before[0], 1e-3)
 
 
-class KeyframeCollector:
+class KeyframeCollector(Stateful):
     """Collects ``keyframes``, in the order of time, evenly over the time since tracking began; ``given`` is the
     calibration of the colour images. ``max_gap`` is the largest time between the two neighbours of a keyframe, seconds,
     if less than ``MAX_GAP``."""
 
+    keyframes: Remembered[list[ColorKeyframe]]
+    _interval: Remembered[float]
+    _before: Remembered[tuple[float, NDArray[np.float64]] | None] = None
+    _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None] = None
+
     def __init__(self, given: Calibration, max_gap: float = MAX_GAP) -> None:
         self.given = given
         self.max_gap = min(max_gap, MAX_GAP)
-        self.keyframes: list[ColorKeyframe] = []
+        self.keyframes = []
         self._interval = INTERVAL
-        self._before: tuple[float, NDArray[np.float64]] | None = None
-        self._pending: tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None = None
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]

@@ -14,6 +14,7 @@ from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
 from dudmap.core.calibration.keyframes import KeyframeCollector
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.state import Remembered, Stateful
 
 ATTEMPTS = (120, 240, 480, 960)
 """Numbers of tracked frames after which the calibration is estimated from the keyframes so far: after the four seconds
@@ -26,7 +27,7 @@ PRIORITY = 10
 """Priority of the thread of an estimation, as of ``nice``: a tenth of the share of the tracking on a busy core."""
 
 
-class SelfCalibration:
+class SelfCalibration(Stateful):
     """Estimates the calibration in a thread of its own while frames are tracked.
 
     Each estimate starts from the calibration as given and takes all keyframes of the current submap, whose colours are
@@ -36,17 +37,20 @@ class SelfCalibration:
     last one that was finished; None before.
     """
 
+    estimate: Remembered[Estimate | None] = None
+    _collector: Remembered[KeyframeCollector]
+    _attempts: Remembered[list[int]]
+    _frames: Remembered[int] = 0
+    _submap: Remembered[int] = 0
+    _running: Remembered[Future[Estimate] | None] = None
+    _due: Remembered[int] = 0
+
     def __init__(self, given: Calibration, sensor: SensorConfig, *, live: bool = False) -> None:
         self.given = given
         self.sensor = sensor
         self.live = live
-        self.estimate: Estimate | None = None
         self._collector = KeyframeCollector(given)
         self._attempts = list(ATTEMPTS)
-        self._frames = 0
-        self._submap = 0
-        self._running: Future[Estimate] | None = None
-        self._due = 0
 
     @property
     def finished(self) -> bool:

@@ -8,6 +8,7 @@ from dudmap.core.backends.cpu.splatting import PointImage, overwrite, splat
 from dudmap.core.dynamics.segments import scaled_length
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 
 SAME_INTENSITY = 0.15
 """Largest difference of a pixel's intensity to those of the background around it."""
@@ -24,7 +25,7 @@ MIN_AREA = 0.005
 """Smallest region without readings that is examined, as a share of the image."""
 
 
-class BackgroundModel:
+class BackgroundModel(Stateful):
     """The last static reading of every pixel, as a point in the world that is carried from image to image.
 
     An object that gives no reading hides the background known to be behind it, and looks different; the sensor's own
@@ -34,9 +35,10 @@ class BackgroundModel:
         config: ``settle_time``: background that has not been seen for longer is dropped.
     """
 
+    _background: Remembered[PointImage | None] = None
+
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._background: PointImage | None = None
 
     def reset(self) -> None:
         """Drop the background: it belongs to another world, or the pose was lost."""

@@ -29,6 +29,7 @@ from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_leng
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.observation import Level, exposed
 from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
 """Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
@@ -84,7 +85,7 @@ class _Comparison:
         return self.sample.occupancy == FREE
 
 
-class DynamicDetector:
+class DynamicDetector(Stateful):
     """Labels the pixels of registered frames as static or dynamic.
 
     Args:
@@ -95,6 +96,9 @@ class DynamicDetector:
         memory: Remembered frames.
         background: The static background behind pixels without a reading.
     """
+
+    memory: Remembered[TemporalMemory]
+    background: Remembered[BackgroundModel]
 
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config
@@ -287,7 +291,7 @@ def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level,
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
     """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
     map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
-    return np.asarray(static_sigma.py_func(depth, sensor.sigma_base, sensor.sigma_scale, map_variance), np.float32)
+    return np.asarray(static_sigma.py_func(sensor.sigma(depth), map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:

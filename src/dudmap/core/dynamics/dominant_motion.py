@@ -15,12 +15,18 @@ from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level
-from dudmap.core.frames.optical_flow import consistent_with_static, lengths, track_forward_backward
+from dudmap.core.frames.optical_flow import (
+    FLOW_WIDTH,
+    RETURN_PX,
+    WINDOW,
+    consistent_with_static,
+    lengths,
+    scaled_window,
+    track_forward_backward,
+)
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry.camera import Camera
 
-REFERENCE_WIDTH = 320
-"""Image width that distances in pixels are given for; they grow in proportion to the width of an image."""
 NOISE_PX = 0.7
 """Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
@@ -84,8 +90,8 @@ def rigid_motion(
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
-    """Distance in pixels of an image, given that in an image of REFERENCE_WIDTH with the same view."""
-    return distance * camera.width / REFERENCE_WIDTH
+    """Distance in pixels of an image, given that in an image of FLOW_WIDTH with the same view."""
+    return distance * camera.width / FLOW_WIDTH
 
 
 @lru_cache(maxsize=8)
@@ -141,10 +147,11 @@ class LabelledCorners:
     pixels: NDArray[np.int64]
     moving: NDArray[np.bool_]
 
-    def count_by_segment(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
-        """Corners (count + 1,) in each segment, all or the chosen (n,) of them; entry 0: in none."""
-        segment = self.segment_of if chosen is None else self.segment_of[chosen]
-        return np.bincount(segment, minlength=self.segmentation.count + 1)
+    @cached_property
+    def count_by_segment(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Moving corners (count + 1,) in each segment, and all; entry 0: in none."""
+        size, segment = self.segmentation.count + 1, self.segment_of
+        return np.bincount(segment[self.moving], minlength=size), np.bincount(segment, minlength=size)
 
     @cached_property
     def segment_of(self) -> NDArray[np.int32]:
@@ -228,7 +235,10 @@ def dominant_motion(
     T_expected = np.eye(4) if T_expected is None else T_expected
     points = before.corner_points
     expected = reproject(T_expected, points, camera)
-    pixels, targets, difference, found = track_forward_backward(first, second, before.corners, expected)
+    window, limit = scaled_window(WINDOW, camera.width), pixels_at_width(RETURN_PX, camera)
+    found_at, differences, found = track_forward_backward(first, second, before.corners, expected, window, 3, limit)
+    targets, difference = (values[found].astype(np.float64) for values in (found_at, differences))
+    pixels = before.corners[found]
     points, labelled = points[found], _pixels_of_level(pixels, fine, before.labelled)
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
@@ -307,7 +317,7 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
         return np.zeros(level.depth.shape, dtype=bool)
-    num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
+    num_moving, num_all = corners.count_by_segment
     enough = num_moving >= FEWEST_MOVING
     whole = enough & (num_moving >= AGREED * num_all)
     mixed = enough & ~whole
@@ -327,7 +337,8 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of such corners."""
-    num_static, num_all = corners.count_by_segment(~corners.moving), corners.count_by_segment()
+    num_moving, num_all = corners.count_by_segment
+    num_static = num_all - num_moving
     static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
     static[0] = False
     return static[corners.segmentation.labels]

@@ -19,6 +19,7 @@ from dudmap.core.dynamics.dominant_motion import (
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
 """Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
@@ -85,7 +86,7 @@ class SlowMotion:
     moving_first: NDArray[np.bool_] | None
 
 
-class EgoMotionSegmenter:
+class EgoMotionSegmenter(Stateful):
     """Segments moving objects by comparing images, while the map is young or most of the view moves.
 
     Args:
@@ -96,14 +97,20 @@ class EgoMotionSegmenter:
         active: Whether the next frame is to be compared with the last one.
     """
 
+    active: Remembered[bool] = False
+    _young_until: Remembered[float]
+    _latest_end: Remembered[float]
+    _started: Remembered[float]
+    _last_timestamp: Remembered[float]
+    _last: Remembered[tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None] = None
+    _older: Remembered[deque[OlderImage]]
+    _compared: Remembered[tuple[float, DominantMotion | None] | None] = None  # time and result of the last comparison
+
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self.active = False
         self._young_until, self._latest_end = -np.inf, -np.inf
         self._started = self._last_timestamp = -np.inf
-        self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
-        self._older: deque[OlderImage] = deque()
-        self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
+        self._older = deque()
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""

@@ -95,4 +95,5 @@ def intensity_gradient(level: Level) -> NDArray[np.float32]:
     scale, window = pixel_scale(level), scaled_side(1, level)
     du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=scale / 8)
     dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=scale / 8)
-    return np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
+    magnitude = np.sqrt(du * du + dv * dv)  # that of OpenCV rounds by the address of the array
+    return np.asarray(cv2.blur(magnitude, (window, window)), dtype=np.float32)

@@ -14,6 +14,7 @@ from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.segments import Segmentation, scaled_side
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 
 SETTLE_FRAMES = 4
 """Frames kept of ``settle_time``, in which a segment must stand still to be released."""
@@ -48,21 +49,25 @@ class RememberedFrame:
     dynamic: NDArray[np.uint8]
 
 
-class TemporalMemory:
+class TemporalMemory(Stateful):
     """Remembered frames that new ones are compared with.
 
     Args:
         config: ``settle_time`` and ``start_seconds``.
     """
 
+    _last: Remembered[RememberedFrame | None] = None
+    _settle_frames: Remembered[deque[RememberedFrame]]
+    _recent_frames: Remembered[deque[RememberedFrame]]
+    _start_frames: Remembered[list[RememberedFrame]]
+    _imported: Remembered[bool] = False  # the frames of the first seconds come from another pass
+    _young_until: Remembered[float] = -np.inf
+
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._last: RememberedFrame | None = None
-        self._settle_frames: deque[RememberedFrame] = deque()
-        self._recent_frames: deque[RememberedFrame] = deque()
-        self._start_frames: list[RememberedFrame] = []
-        self._imported = False  # the frames of the first seconds come from another pass
-        self._young_until = -np.inf
+        self._settle_frames = deque()
+        self._recent_frames = deque()
+        self._start_frames = []
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map, of this time in seconds."""
@@ -261,8 +266,7 @@ def _still(
         if unmarked and frame.dynamic.any():
             marked = chosen & _seen_marked(found, n)
             still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
-        if not stand_still(segments, chosen, found.gap[n], found.difference[n], still):
-            return np.zeros(chosen.shape, bool)
+    stand_still(segments, chosen, found.gap, found.difference, still)
     return chosen & still[labels]
 
 

@@ -5,11 +5,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.color_registration import color_pixels
+from dudmap.core.backends.cpu.color_registration import register
 from dudmap.core.backends.cpu.filtering import intensity
+from dudmap.core.backends.cpu.teams import run_team
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import ColorProjection
-from dudmap.core.backends.threads import bands, run_bands
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -19,7 +19,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.float32)
 MEDIAN_STRIDE = 8
 """Every so many pixels, across and down, enter the median depth."""
 BAND_ROWS = 60
-"""Rows that are registered at a time: few enough for their coordinates to stay in a core's cache."""
+"""Rows that a thread registers at a time."""
 
 
 def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:
@@ -52,7 +52,7 @@ def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.fl
     known = observation._recorded_halvings
     if not known:
         recorded = observation.rgb if observation.recorded_rgb is None else observation.recorded_rgb
-        known.append(intensity(recorded))
+        known.append(observation.intensity if recorded is observation.rgb else intensity(recorded))
     while len(known) <= halvings:
         h, w = (size // 2 for size in known[-1].shape)
         whole = known[-1][: 2 * h, : 2 * w]
@@ -77,11 +77,14 @@ def register_color(
     readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
     readings = readings[readings > 0]
     fallback = float(median(readings)) if len(readings) else 1.0
-    out = np.empty(depth.shape + color.shape[2:], color.dtype)
-
-    def fill(start: int, stop: int) -> None:
-        us, vs = color_pixels(depth, camera.intrinsics, projection, fallback, start, stop)
-        cv2.remap(color, us, vs, cv2.INTER_LINEAR, dst=out[start:stop], borderMode=cv2.BORDER_REPLICATE)
-
-    run_bands(fill, bands(len(depth), BAND_ROWS))
+    out, none = np.empty(depth.shape + color.shape[2:], color.dtype), np.empty
+    if color.ndim == 3:
+        words, outputs = cv2.cvtColor(color, cv2.COLOR_RGB2RGBA), (none((0, 0), np.float32), out)
+    else:
+        words, outputs = np.ascontiguousarray(color), (out, none((0, 0, 3), np.uint8))
+    size = len(depth), *color.shape[:2]
+    run_team(
+        register, -(-len(depth) // BAND_ROWS), BAND_ROWS, depth, camera.intrinsics, projection, np.float32(fallback),
+        size, words.view(np.int32).reshape(-1), *outputs,
+    )  # fmt: skip
     return out

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.state import CACHE
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +33,10 @@ class Observation:
     rgb: NDArray[np.uint8]
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
-    _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
-    _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
+    _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
+    _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(
+        default_factory=list, repr=False, metadata=CACHE
+    )
 
     @cached_property
     def readings(self) -> NDArray[np.bool_]:

@@ -17,9 +17,9 @@ WINDOW = 11
 """Edge of the window that a corner is matched by, pixels of an image 320 wide."""
 RETURN_PX = 0.5
 """Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
-FEWEST = 64
-"""Fewest corners that are worth another thread."""
-REFERENCE_WIDTH = 320
+FEWEST = 128
+"""Fewest pixels whose flow is worth another thread."""
+FLOW_WIDTH = 320
 """Image width that these distances are given for; they grow in proportion to the width of an image."""
 
 
@@ -28,7 +28,7 @@ def grey(level: Level) -> NDArray[np.uint8]:
     return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
 
 
-def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
+def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
     """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 
@@ -96,32 +96,37 @@ def lucas_kanade(
 def track_forward_backward(
     first: NDArray[np.uint8],
     second: NDArray[np.uint8],
-    pixels: NDArray[np.int64],
-    expected: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Corners that pass the forward-backward check: tracked back from where they were found, they return.
+    pixels: NDArray[np.integer],
+    expected: NDArray[np.number],
+    window: int,
+    halvings: int,
+    limit: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Pixels of an image that pass the forward-backward check: tracked back from where they were found in the images
+    themselves, they return.
 
     Args:
         first, second: (h, w) uint8 images.
-        pixels: (n, 2) int, corners in the first.
+        pixels: (n, 2) int, pixels u, v of the first.
         expected: (n, 2) predicted positions in the second, from which the search starts.
+        window, halvings: As of ``lucas_kanade``, of the search forward.
+        limit: Smallest error of a pixel that does not return, pixels.
 
     Returns:
-        These corners (m, 2) int, their positions (m, 2) in the second image, the mean differences (m,) of the grey
-        values of their windows, and which (n,) of all corners they are.
+        Positions (n, 2) in the second image and the mean differences (n,) of the grey values of the windows, arbitrary
+        for those that do not pass; whether each passes (n,).
     """
-    width, n = first.shape[1], len(pixels)
-    window, limit = scaled_window(WINDOW, width), RETURN_PX * width / REFERENCE_WIDTH
+    n = len(pixels)
 
-    def track(start: int, stop: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    def track(start: int, stop: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         begin = pixels[start:stop]
-        positions, found, difference = lucas_kanade(first, second, begin, expected[start:stop], window, 3)
+        positions, found, difference = lucas_kanade(first, second, begin, expected[start:stop], window, halvings)
         back, found_back, _ = lucas_kanade(second, first, positions, begin, window, 0)
-        return positions, found & found_back & (lengths(back - begin.astype(np.float32)) < limit), difference
+        return positions, difference, found & found_back & (lengths(back - begin.astype(np.float32)) < limit)
 
     parts = run_bands(track, bands(n, max(FEWEST, -(-n // 2))) or [(0, 0)])
-    positions, good, difference = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64), good
+    positions, difference, good = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return positions, difference, good
 
 
 def consistent_with_static(
@@ -130,7 +135,7 @@ def consistent_with_static(
     pixels: NDArray[np.int64],
     expected: NDArray[np.float64],
     allowed: NDArray[np.float64],
-    difference: NDArray[np.float64],
+    difference: NDArray[np.floating],
 ) -> NDArray[np.bool_]:
     """Whether corners (n,) that were found elsewhere match as well at the position of a static point.
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.observation import Observation
+from dudmap.core.state import Remembered, Stateful
 
 INTERVALS = 30
 """Intervals between stamps that the usual one, their median, is taken from."""
@@ -42,7 +43,7 @@ class Rejection(NamedTuple):
     reason: str
 
 
-class StreamCheck:
+class StreamCheck(Stateful):
     """Judges every frame before it is registered, by its stamp and by the frame before.
 
     Stamps must increase. If AGREEING frames in a row increase among themselves but not after the last one used, the
@@ -57,17 +58,20 @@ class StreamCheck:
     since its clock was set back, s; ``repeats`` what the last frame judged repeats of the frame before.
     """
 
+    clock_offset: Remembered[float] = 0.0
+    repeats: Remembered[Repeats] = ""
+    _last_stamp: Remembered[float | None] = None  # of the last frame with a valid stamp
+    _contradicting: Remembered[list[float]]
+    _intervals: Remembered[deque[float]]
+    _arrived: Remembered[float | None] = None  # stamp of the last frame, valid or not
+    _before: Remembered[tuple[NDArray[np.float32], NDArray[np.uint8]] | None] = None  # depth, colour of the last frame
+    _compared: Remembered[tuple[float, NDArray[np.float32]] | None] = None  # stamp and depth of the last with readings
+    _unit: Remembered[float] = 0.0  # logarithm of the factor by which the unit has changed
+
     def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
-        self.clock_offset = 0.0
-        self.repeats: Repeats = ""
-        self._last_stamp: float | None = None  # of the last frame with a valid stamp
-        self._contradicting: list[float] = []  # stamps of the frames since then
-        self._intervals: deque[float] = deque(maxlen=INTERVALS)
-        self._arrived: float | None = None  # stamp of the last frame, valid or not
-        self._before: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None  # depth, colour of the last frame
-        self._compared: tuple[float, NDArray[np.float32]] | None = None  # stamp and depth of the last with readings
-        self._unit = 0.0  # logarithm of the factor by which the unit has changed
+        self._contradicting = []  # stamps of the frames since then
+        self._intervals = deque(maxlen=INTERVALS)
 
     def restamped(self, observation: Observation) -> Observation:
         """The frame with its stamp on the clock of the first frames."""

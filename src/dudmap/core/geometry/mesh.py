@@ -146,6 +146,26 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
+def pieces(mesh: Mesh) -> NDArray[np.int32]:
+    """Number (V,) of the connected piece that each vertex belongs to."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = mesh.faces.T
+    pairs = np.concatenate([a, b]), np.concatenate([b, c])
+    n = len(mesh.vertices)
+    return connected_components(coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(n, n)), directed=False)[1]
+
+
+def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
+    """Mesh of some of the triangles (F,) and the vertices that they need."""
+    faces = mesh.faces[kept]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - 1
+    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.colors[used], mesh.normals[used])
+
+
 def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
     """Vertices and faces as they stand in a PLY file, in which the vertices of this mesh begin at number ``first``."""
     vertex = np.empty(len(mesh.vertices), _PLY_VERTEX)

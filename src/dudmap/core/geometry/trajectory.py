@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dudmap.atomic_file import write_text
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.association import read_rows
 from dudmap.errors import DatasetError
-from dudmap.input_files import read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +78,8 @@ class Trajectory:
             DatasetError: The file is missing, a row is not eight finite numbers, or the times do not increase.
         """
         path = Path(path)
-        try:
-            text = read_text(path)
-        except (OSError, UnicodeDecodeError) as error:
-            raise DatasetError(f"cannot read the trajectory {path}: {error}") from error
         rows: list[list[float]] = []
-        for number, line in enumerate(text.splitlines(), start=1):
-            fields = line.replace(",", " ").split()
-            if not fields or fields[0].startswith("#"):
-                continue
+        for number, fields in read_rows(path, "timestamp tx ty tz qx qy qz qw"):
             try:
                 row = [float(field) for field in fields[:8]]
             except ValueError:
@@ -94,11 +87,9 @@ class Trajectory:
             if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
                 raise DatasetError(
                     f"{path}, line {number}: expected eight finite numbers 'timestamp tx ty tz qx qy qz qw' "
-                    f"with a non-zero quaternion, found {line.strip()!r}"
+                    f"with a non-zero quaternion, found {' '.join(fields)!r}"
                 )
             rows.append(row)
-        if not rows:
-            raise DatasetError(f"{path} holds no pose; expected lines 'timestamp tx ty tz qx qy qz qw'")
         table = np.array(rows)
         Ts = np.tile(np.eye(4), (len(table), 1, 1))
         Ts[:, :3, 3] = table[:, 1:4]

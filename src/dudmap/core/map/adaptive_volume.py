@@ -5,36 +5,30 @@ from the surface are theirs. Blocks of half, and within them of a quarter of the
 surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import adaptive_raycasting
-from dudmap.core.backends.cpu.dual_contouring import contour_blocks, split_polygons
+from dudmap.core.backends.cpu import raycasting
 from dudmap.core.backends.parameters import (
+    BlockVisit,
     DepthView,
     FusionParameters,
-    MeshParameters,
     RaycastParameters,
     RaycastResult,
     TouchedBlocks,
 )
 from dudmap.core.backends.spec import Backend
-from dudmap.core.backends.threads import bands, run_bands
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh, joined
-from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood, two_levels
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map.fine_blocks import FineBlocks, two_levels
 from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
+from dudmap.core.map.level_meshes import level_meshes
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.refinement import prolonged, refine
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
-
-BAND = 64
-"""Blocks of one band."""
 
 
 def make_volume(
@@ -58,8 +52,6 @@ class AdaptiveVolume(TsdfVolume):
 
     ``levels`` are the finer levels, that with the larger voxels first.
     """
-
-    levels: Sequence[FineBlocks]
 
     def _empty(self) -> None:
         super()._empty()
@@ -121,7 +113,7 @@ class AdaptiveVolume(TsdfVolume):
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied, _ = self.backend.fuse(
-            grid, view, touched, candidates, blocks.fused, turn, count, None, self._parameters_of(n + 1)
+            grid, view, touched, BlockVisit(candidates, blocks.fused, turn, count, None), self._parameters_of(n + 1)
         )
         self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
@@ -163,68 +155,12 @@ class AdaptiveVolume(TsdfVolume):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return adaptive_raycasting.raycast(
-            self.grid, two_levels(self.levels), T_world_camera, camera.intrinsics, camera.shape, parameters
+        return raycasting.raycast(
+            self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, two_levels(self.levels)
         )
-
-    def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
-        """See ``TsdfVolume._extract``; by dual contouring."""
-        return extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)[0]
 
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
     ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
-        return extract_groups(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))
-
-
-def extract_groups(
-    blocks: VoxelBlocks,
-    levels: Sequence[FineBlocks],
-    slots: NDArray[np.int32],
-    groups: NDArray[np.integer],
-    parameters: MeshParameters,
-) -> list[Mesh]:
-    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are those of the coarsest level."""
-    number = int(groups.max(initial=-1)) + 1
-    if len(slots) == 0:
-        return [joined([])] * number
-    keys, places, colors, polygons, rows = _contours(blocks, levels, slots, groups >= 0, parameters)
-    corners = np.searchsorted(keys, polygons).astype(np.int32)
-    vertices = np.ascontiguousarray(places[:, :3])
-    faces = np.empty((2 * len(corners), 3), dtype=np.int32)
-    count, each = split_polygons(corners, vertices, faces)
-    faces, group_of = faces[:count], np.repeat(groups[rows], each)
-    out = []
-    for group in range(number):
-        own = faces if number == 1 else faces[group_of == group]
-        used, local = np.unique(own, return_inverse=True)
-        local = local.reshape(own.shape).astype(np.int32)
-        out.append(Mesh(vertices[used], local, colors[used], np.ascontiguousarray(places[used, 3:])))
-    return out
-
-
-def _contours(
-    blocks: VoxelBlocks,
-    levels: Sequence[FineBlocks],
-    slots: NDArray[np.int32],
-    meshed: NDArray[np.bool_],
-    parameters: MeshParameters,
-) -> list[NDArray]:
-    """Results of ``contour_blocks`` for all blocks, in their order."""
-    near = neighbourhood(blocks, slots)
-    row_of = np.full(len(blocks.entry_of) + 1, -1, dtype=np.int32)
-    row_of[slots] = np.arange(len(slots), dtype=np.int32)
-    rows = row_of[near]  # -1 is the last element
-    finer = two_levels(levels)
-    coords = np.ascontiguousarray(blocks.slot_coords[slots])
-    least = max(int(parameters.min_weight), 1)
-    parts = run_bands(
-        lambda start, stop: contour_blocks(
-            start, stop, near, rows, meshed, coords, (blocks.geometry, *finer.geometry), finer.children,
-            (blocks.colors, *finer.colors), least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
-            np.float32(parameters.max_jump),
-        ),
-        bands(len(slots), BAND),
-    )  # fmt: skip
-    return [np.concatenate([part[n] for part in parts]) for n in range(5)]
+        return level_meshes(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))

@@ -3,9 +3,7 @@
 The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Niessner et al. 2013, section 5.
 """
 
-import weakref
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import product
 from typing import NamedTuple
 
@@ -17,6 +15,8 @@ from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.scratch_store import ScratchStore
+from dudmap.core.state import Remembered, Stateful
+from dudmap.errors import MapError
 
 REGION_BITS = 4
 REGION = 1 << REGION_BITS
@@ -25,8 +25,6 @@ MARGIN = 4
 """Blocks beside the view that are in memory with it, so that all blocks that touch a changed piece of the mesh are."""
 ROOM = 0.85
 """Share of the allowed blocks to which the memory is emptied, so that the index is not rebuilt with every region."""
-MAX_PENDING = 8
-"""Regions that may wait to be written, each a copy of up to 17 MB."""
 RETRY_AFTER = 100
 """Moves of the window before a store that could not be written is tried again."""
 Region = tuple[int, int, int]
@@ -42,23 +40,25 @@ class Away(NamedTuple):
     finer: int
 
 
-class BlockPager:
+class BlockPager(Stateful):
     """Moves regions of a map between memory and a store.
 
-    A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are.
-    Regions are written and read ahead by one background thread, in the order in which that was asked for.
+    A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are. A
+    region on a surface takes some milliseconds to write, and as long to read.
 
     ``max_blocks`` is the largest number of blocks with voxels in memory, of all levels, or a limit that is asked each
     time; blocks within the view stay, even if they are more. ``failure`` says why the store could not be written the
-    last time it was tried (empty if it could): the regions are then back in memory, and nothing is lost.
+    last time it was tried (empty if it could): the regions then stay in memory, and nothing is lost.
     """
+
+    failure: Remembered[str] = ""
+    _next_serial: Remembered[int] = 0
+    _away: Remembered[dict[Region, Away]]
+    _retry_in: Remembered[int]
 
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
-        self.failure = ""
         self._store: ScratchStore | None = None
-        self._executor: ThreadPoolExecutor | None = None
-        self._next_serial = 0
         self.clear()
 
     def clear(self) -> None:
@@ -66,13 +66,10 @@ class BlockPager:
         if self._store is not None:
             self._store.close()
         self._store = None
-        self._away: dict[Region, Away] = {}
-        self._writing: dict[Region, tuple[BlockRecords, Future[None]]] = {}
-        self._reading: dict[Region, Future[BlockRecords]] = {}
+        self._away = {}
         self._returned: dict[Region, tuple[int, int]] = {}  # frame number and serial of what the store also holds
         self._archived: set[Region] = set()
         self._archive: Callable[[Region], BlockRecords] | None = None
-        self._middle = np.zeros(3)
         self._retry_in = 0
 
     @property
@@ -98,15 +95,14 @@ class BlockPager:
         Raises:
             MapError: It cannot be read.
         """
-        return self._writing[region][0] if region in self._writing else self._read(region)
+        if self._archive is not None and region in self._archived:
+            return self._archive(region)
+        parts = self._stored.read(str(region))
+        return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
 
-    def continue_from(
-        self, away: dict[Region, tuple[int, int, int, int]], archive: Callable[[Region], BlockRecords]
-    ) -> None:
-        """Take regions from an archive, which has them as long as they have not come back into memory."""
-        self.clear()
-        self._away = {region: Away(*numbers) for region, numbers in away.items()}
-        self._archived, self._archive = set(away), archive
+    def continue_from(self, archive: Callable[[Region], BlockRecords]) -> None:
+        """Take the regions that are away from an archive, which has them until they have come back into memory."""
+        self._archived, self._archive = set(self._away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
         """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
@@ -115,18 +111,14 @@ class BlockPager:
     def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
         """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
 
-        Regions farther away leave if there are too many blocks, and those in the direction of motion are read ahead.
-        Entries of the blocks in memory are numbered anew.
+        Regions farther away leave if there are too many blocks. Entries of the blocks in memory are numbered anew.
         """
         first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
         last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
-        self._settle(tree, frame_number)
         wanted = self._stored_in(first, last) if self._away else []
         self._make_room(tree, first, last, frame_number, wanted)
         for region in wanted:
             self._bring_back(tree, region, frame_number)
-        if self._away:
-            self._read_ahead(first, last)
 
     def _stored_in(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> list[Region]:
         """Regions of the box from ``first`` to ``last`` that are in the store."""
@@ -137,45 +129,17 @@ class BlockPager:
         return [(x, y, z) for x, y, z in product(*ranges) if (x, y, z) in self._away]
 
     def _bring_back(self, tree: BlockTree, region: Region, frame_number: int) -> None:
-        if region in self._writing:
-            records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
-        else:
-            read = self._reading.pop(region, None)
-            # one that waits behind regions to be written is read at once
-            records = self._read(region) if read is None or read.cancel() else read.result()
-            if region not in self._archived:
-                self._returned[region] = frame_number, self._away[region].serial
+        records = self.records(region)
+        if region not in self._archived:
+            self._returned[region] = frame_number, self._away[region].serial
         del self._away[region]
         self._archived.discard(region)
         tree.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
 
-    def _read_ahead(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> None:
-        """Read the regions that come into the box if it goes on as it has moved since the last call."""
-        middle = (first + last) / 2
-        step = np.sign(middle - self._middle).astype(np.int64)
-        self._middle = middle
-        wanted = set(self._stored_in(first + np.minimum(step, 0), last + np.maximum(step, 0)))
-        for region in set(self._reading) - wanted:
-            self._reading.pop(region).cancel()
-        for region in wanted - set(self._reading) - set(self._writing):
-            self._reading[region] = self._submit(self._read, region)
-
-    def _read(self, region: Region) -> BlockRecords:
-        if self._archive is not None and region in self._archived:
-            return self._archive(region)
-        parts = self._stored.read(str(region))
-        return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
-
-    def _write(self, region: Region, records: BlockRecords) -> None:
-        self._stored.write(str(region), [blob for level in blobs_of(records) for blob in level])
-
     def _make_room(
         self, tree: BlockTree, first: NDArray[np.integer], last: NDArray[np.integer], number: int, coming: list[Region]
     ) -> None:
-        """Move the regions farthest from the box to the store while there are too many blocks with those that come.
-
-        Beyond what must leave only as many do as can wait to be written, so that no frame waits for the disk.
-        """
+        """Move the regions farthest from the box to the store while there are too many blocks with those that come."""
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(tree)
         needed = tree.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
@@ -186,75 +150,58 @@ class BlockPager:
         outside = np.maximum(np.maximum(first - keys, keys - last), 0)
         distance = np.linalg.norm(outside, axis=1)
         leaving = np.zeros(len(keys), dtype=bool)
-        at_once = MAX_PENDING - len(self._writing)
         for n in np.lexsort((np.arange(len(keys)), -distance)):
-            enough = needed <= (allowed if np.count_nonzero(leaving) >= at_once else ROOM * allowed)
-            if enough or distance[n] == 0:
+            if needed <= ROOM * allowed or distance[n] == 0:
                 break
             leaving[n] = True
             needed -= owned[n]
-        if leaving.any():
-            self._send_all_away(tree, keys, region_of, leaving, number)
+        if leaving.any() and self._send_away(tree, keys, region_of, leaving, number):
             tree.remove(np.flatnonzero(leaving[region_of]), number + 1)
 
-    def page_out(self, tree: BlockTree, frame_number: int) -> None:
-        """Move all regions to the store; empty blocks must take the place of those of ``tree``."""
+    def page_out(self, tree: BlockTree, frame_number: int) -> bool:
+        """Move all regions to the store; returns whether that worked: empty blocks must then take the place of those
+        of ``tree``."""
         keys, region_of = _regions_of_entries(tree)
-        self._send_all_away(tree, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
+        return self._send_away(tree, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
 
-    def _send_all_away(
+    def _send_away(
         self,
         tree: BlockTree,
         keys: NDArray[np.integer],
         region_of: NDArray[np.integer],
         leaving: NDArray[np.bool_],
         frame_number: int,
-    ) -> None:
-        """Send the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry."""
+    ) -> bool:
+        """Write the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry, which the caller
+        removes. Returns whether all could be written; else none has left."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))
         finer = np.bincount(region_of, tree.owned_slots(), minlength=len(keys)) - voxel_blocks
-        for n in np.flatnonzero(leaving):
-            region, entries = _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]]
-            returned_in, serial = self._returned.pop(region, (-1, 0))
-            if returned_in != frame_number:  # the store does not hold it as it is
-                serial = self._next_serial = self._next_serial + 1
-                self._have_written(region, tree, entries)
-            self._away[region] = Away(serial, len(entries), int(voxel_blocks[n]), int(finer[n]))
-
-    def _have_written(self, region: Region, tree: BlockTree, entries: NDArray[np.integer]) -> None:
-        """Have a region written; its entries (n,) are removed by the caller."""
-        for pending in list(self._writing)[: max(len(self._writing) - MAX_PENDING + 1, 0)]:
-            if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
-                del self._writing[pending]
-        records = tree.records(entries)
-        self._writing[region] = records, self._submit(self._write, region, records)
-
-    def _settle(self, tree: BlockTree, frame_number: int) -> None:
-        """Forget what has been written; take back what could not be."""
-        for region, (records, written) in list(self._writing.items()):
-            if not written.done():
-                continue
-            del self._writing[region]
-            if error := written.exception():
-                self.failure, self._retry_in = str(error), RETRY_AFTER
-                del self._away[region]
-                tree.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
-            else:
-                self.failure = ""
+        away: dict[Region, Away] = {}
+        try:
+            for n in np.flatnonzero(leaving):
+                region, entries = _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]]
+                returned_in, serial = self._returned.get(region, (-1, 0))
+                if returned_in != frame_number:  # the store does not hold it as it is
+                    serial = self._next_serial = self._next_serial + 1
+                    levels = blobs_of(tree.records(entries))
+                    self._stored.write(str(region), [blob for level in levels for blob in level])
+                away[region] = Away(serial, len(entries), int(voxel_blocks[n]), int(finer[n]))
+        except MapError as error:
+            self.failure, self._retry_in = str(error), RETRY_AFTER
+            return False
+        self.failure = ""
+        self._away |= away
+        for region in away:
+            self._returned.pop(region, None)
+        return True
 
     @property
     def _stored(self) -> ScratchStore:
         if self._store is None:
             self._store = ScratchStore("blocks of the map")
         return self._store
-
-    def _submit(self, work, *arguments) -> Future:  # noqa: ANN001, ANN002 - as of Executor.submit
-        if self._executor is None:
-            self._executor = ThreadPoolExecutor(1, thread_name_prefix="dudmap-pager")
-            weakref.finalize(self, self._executor.shutdown, wait=False)
-        return self._executor.submit(work, *arguments)
 
 
 def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:

@@ -7,6 +7,7 @@ from dudmap.core.backends.cpu import hashing
 from dudmap.core.backends.mirror import Mirror
 from dudmap.core.backends.parameters import to_lattice
 from dudmap.core.map.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
+from dudmap.core.state import Remembered, Stateful
 from dudmap.errors import MapError
 
 MARGIN = 3
@@ -17,7 +18,7 @@ LOCAL_GRID = 4096
 where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
 
 
-class BlockWindow:
+class BlockWindow(Stateful):
     """Dense copy of the hash table, which stays the authoritative index, around the view.
 
     Attributes:
@@ -30,6 +31,9 @@ class BlockWindow:
         origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
     """
 
+    near: Remembered[NDArray[np.int32]]
+    origin: Remembered[NDArray[np.int64] | None] = None
+
     def __init__(self, block_size: float, cells: int) -> None:
         size = 16 * int(np.ceil(cells / 16))
         self.block_size = block_size
@@ -38,7 +42,6 @@ class BlockWindow:
         self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)
-        self.origin: NDArray[np.int64] | None = None
 
     def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
         """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
@@ -61,6 +64,20 @@ class BlockWindow:
         count = hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
         self.near = np.sort(inside[:count])
         self.mirror.wrote()
+
+    def refill(self, blocks: VoxelBlocks) -> None:
+        """Place a window that was stored where it was; the order of its slots, in which they are fused, is kept.
+
+        Raises:
+            ValueError: It was not a window of these blocks.
+        """
+        if self.origin is None:
+            return
+        near = self.near
+        self.fill(self.origin, blocks)
+        if not np.array_equal(np.sort(near), self.near):
+            raise ValueError("the blocks around the camera are not those of the map")
+        self.near = near
 
     @property
     def local_origin(self) -> NDArray[np.int64]:

@@ -2,25 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.adaptive_raycasting import FinerLevels
+from dudmap.core.backends.cpu.octree_field import FinerLevels
 from dudmap.core.backends.mirror import grown
 from dudmap.core.backends.parameters import VoxelGrid
 from dudmap.core.map.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
+from dudmap.core.state import Remembered, Stateful
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
 """Stand for a level that a map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
 """Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
-NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
-"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 
 
-class FineBlocks:
+class FineBlocks(Stateful):
     """One level of refinement. A block covers one octant of its parent, a block of the next coarser level.
 
     Attributes:
@@ -29,7 +29,12 @@ class FineBlocks:
         children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
         parents: (slots,) int32 slot of the parent of each block.
         calm: (slots,) uint8 successive evaluations in which a block was not needed.
+        voxels: Geometry and colours of the blocks as they are stored, as a whole: they are few.
     """
+
+    blocks: Remembered[VoxelBlocks]
+    calm: Remembered[NDArray[np.uint8]]
+    voxels: Remembered[tuple[NDArray[np.int32], NDArray[np.int32]]]
 
     def __init__(self, voxel_size: float, blocks: VoxelBlocks | None = None, finer: "FineBlocks | None" = None) -> None:
         self.voxel_size, self._finer = voxel_size, finer
@@ -37,6 +42,19 @@ class FineBlocks:
         self.children = np.full((0, 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+
+    def state(self) -> dict[str, Any]:
+        """The level without spare room."""
+        m, blocks = self.blocks.num_slots, self.blocks
+        return {"blocks": blocks, "calm": self.calm[:m], "voxels": (blocks.geometry[:m], blocks.colors[:m])}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take over a stored level, which is to be linked (``link``)."""
+        blocks, (geometry, colors) = self.blocks, state["voxels"]
+        if not len(state["calm"]) == len(geometry) == len(colors) == blocks.num_slots:
+            raise ValueError("blocks with smaller voxels lack some of them")
+        blocks.write(np.arange(blocks.num_slots), geometry, colors)
+        self.calm = grown(state["calm"], len(blocks.entry_of), 0)
 
     def make_room(self, parents: VoxelBlocks) -> None:
         """Have room for the links of all slots of the parents and of this level."""
@@ -119,7 +137,7 @@ class FineBlocks:
         """Find the parents of all blocks anew, by coordinates; whether each of the active slots (n,) has one."""
         self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
-        self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+        self.calm = grown(self.calm[: len(self.parents)], len(self.parents), 0)
         slots = self.blocks.active_slots
         found = parents.slots_at((self.blocks.slot_coords[slots] >> 1).astype(np.int32))
         known = found >= 0
@@ -199,12 +217,6 @@ class BlockTree:
             level.insert(parents, part, frame_number)
         for level, parents in zip(self.levels, self.parents, strict=True):
             level.make_room(parents)
-
-
-def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
-    coords = blocks.slot_coords[slots][:, None] + NEIGHBOURHOOD
-    return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:

@@ -2,6 +2,7 @@
 
 import ctypes
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from dudmap.core.map.fine_blocks import BlockTree
@@ -14,6 +15,7 @@ LEAST = 400_000_000
 _STATM = Path("/proc/self/statm")
 
 
+@dataclass(frozen=True)
 class MemoryLimit:
     """Memory limit of the process, shared by all its maps.
 
@@ -25,12 +27,13 @@ class MemoryLimit:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.
     """
 
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
+    limit: int
+
+    def __post_init__(self) -> None:
         taken = resident_bytes()
-        if limit < taken + LEAST:
+        if self.limit < taken + LEAST:
             raise ConfigError(
-                f"found a memory limit of {limit / 1e6:.0f} MB; the program takes {taken / 1e6:.0f} MB before the "
+                f"found a memory limit of {self.limit / 1e6:.0f} MB; the program takes {taken / 1e6:.0f} MB before the "
                 f"first frame, so that at least {(taken + LEAST) / 1e6:.0f} MB are needed"
             )
 

@@ -1,6 +1,7 @@
 """The blocks of a map, of which those far from the view may wait on disk: which are in memory, and reading them all."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,20 +12,35 @@ from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import BlockTree, FineBlocks
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+from dudmap.core.state import Remembered, Stateful
 
 
-class PagedMap:
+class PagedMap(Stateful):
     """What ``TsdfVolume`` does with its blocks as a whole, wherever they are; its attributes are described there."""
 
     config: VolumeConfig
-    levels: Sequence[FineBlocks]
-    pager: BlockPager | None
     block_size: float
-    blocks: VoxelBlocks
-    window: BlockWindow
     _window_cells: int
-    _frame_number: int
-    _left: NDArray[np.int64] | None  # where the window was when all blocks left the memory
+    blocks: Remembered[VoxelBlocks]
+    levels: Remembered[Sequence[FineBlocks]]
+    window: Remembered[BlockWindow]
+    pager: Remembered[BlockPager | None]
+    _frame_number: Remembered[int]
+    _left: Remembered[NDArray[np.int64] | None]  # where the window was when all blocks left the memory
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take over the blocks of a stored map, but for the voxels of the coarsest level.
+
+        Raises:
+            ValueError: Its parts do not fit each other.
+        """
+        super().restore(state)
+        parents = self.blocks
+        for level in self.levels:
+            if not np.all(level.link(parents)):
+                raise ValueError("blocks with smaller voxels lie in no larger block")
+            parents = level.blocks
+        self.window.refill(self.blocks)
 
     @property
     def all_blocks(self) -> BlockTree:
@@ -67,12 +83,14 @@ class PagedMap:
 
     def _empty(self) -> None:
         """Have no blocks and no window in memory."""
+        self.levels = []
         self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
 
     def page_out(self) -> None:
         """Have all blocks wait on disk, where the map may do so, until they are needed again."""
-        if self.pager is not None and self.blocks.num_entries:
-            self.pager.page_out(self.all_blocks, self._frame_number)
+        if self.pager is None or self.blocks.num_entries == 0:
+            return
+        if self.pager.page_out(self.all_blocks, self._frame_number):
             self._left = self._left if self.window.origin is None else self.window.origin
             self._empty()
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu.refinement import SATURATED, examine, prolong
 from dudmap.core.backends.parameters import FusionParameters
-from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood
+from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
 FIRST = 3
@@ -49,7 +49,7 @@ def refine(
     slots, sigma, fused = slots[due], sigma[due], fused[due]
     if len(slots) == 0:
         return slots
-    near = neighbourhood(parents, slots)
+    near = parents.neighbourhood(slots)
     bend, texture, found = examine(parents.geometry, near, unit, saturated)
     surface = found.astype(bool)
     noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (coarser.voxel_size * np.sqrt(np.minimum(fused, 64)))
@@ -87,7 +87,7 @@ def prolonged(
     """Interpolation of the coarser level in octants (n,) of blocks in slots (n,): voxels and colours (n, 512)."""
     voxels, colors = np.empty((2, len(slots), BLOCK**3), dtype=np.int32)
     rows = np.arange(len(slots), dtype=np.int32)
-    prolong(parents.geometry, parents.colors, neighbourhood(parents, slots), octants, rows, voxels, colors)
+    prolong(parents.geometry, parents.colors, parents.neighbourhood(slots), octants, rows, voxels, colors)
     return voxels, colors
 
 

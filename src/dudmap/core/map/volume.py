@@ -1,7 +1,7 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,10 @@ from dudmap.core.backends.parameters import (
     FREE,
     SURFACE,
     UNKNOWN,
+    BlockVisit,
     DepthView,
     FreeSpace,
+    LevelImage,
     MapSample,
     MeshParameters,
     RaycastParameters,
@@ -31,7 +33,6 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
@@ -42,6 +43,8 @@ from dudmap.errors import MapError
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
 _MAP_IDS = itertools.count()
+NO_WEIGHTS = np.empty((0, 0), np.float32)
+"""Of an image that is only sampled."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -75,8 +78,6 @@ class TsdfVolume(PagedMap):
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
-
-    levels: Sequence[FineBlocks] = ()
 
     def __init__(
         self,
@@ -178,8 +179,9 @@ class TsdfVolume(PagedMap):
         turn = number if self.config.take_turns else -1
         free_space = FreeSpace(number % 2, free_after) if self.config.carving else None
         slots, occupied, empty = self.backend.fuse(
-            self._local_grid, view, touched, window.near, blocks.fused, turn, count, free_space, self.parameters
-        )
+            self._local_grid, view, touched, BlockVisit(window.near, blocks.fused, turn, count, free_space),
+            self.parameters,
+        )  # fmt: skip
         blocks.written[slots] = number
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
         if self.config.carving:
@@ -247,7 +249,8 @@ class TsdfVolume(PagedMap):
         """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
         at a pose inside the window."""
         T = self.T_grid_camera(T_world_camera)
-        return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
+        image = LevelImage(depth, intensity, NO_WEIGHTS, camera.intrinsics)
+        return self.backend.sample(self.grid, image, T, self.config.free_after)
 
     def known_share(
         self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
@@ -297,12 +300,8 @@ class TsdfVolume(PagedMap):
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
             return joined(list(self.extract_pieces(min_weight)))
-        return self._extract(self.active_slots, self._mesh_parameters(min_weight))
-
-    def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
-        """Mesh of blocks (n,) that are in memory."""
-        blocks, near = self.blocks, self.blocks.neighbours(slots)
-        return meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters)
+        slots = self.active_slots
+        return joined(self.extract_chunks(slots, np.zeros(len(slots), np.int64), min_weight))
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
@@ -330,7 +329,7 @@ class TsdfVolume(PagedMap):
         ``slots`` (n,) are the blocks to mesh and all that touch one of them, ``chunks`` (n,) the group of each, counted
         from 0; -1 for blocks that only lend their voxels.
         """
-        blocks, near, parameters = self.blocks, self.blocks.neighbours(slots), self._mesh_parameters(min_weight)
+        blocks, near, parameters = self.blocks, self.blocks.neighbourhood(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(
             blocks.geometry, blocks.colors, slots, blocks.slot_coords, near, parameters, chunks
         )

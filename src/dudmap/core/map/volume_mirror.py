@@ -16,8 +16,6 @@ GROWTH = 4
 class VolumeMirror:
     """Copy of a volume, brought up to date by copying only the blocks that were written since they were copied.
 
-    ``update`` runs in the thread that changes the volume; between two updates any thread may read the copy.
-
     ``update`` runs in the thread that changes the volume; between two updates any thread may read its copy ``volume``
     (``extract_mesh``, ``IncrementalMesh``), whose frames count the updates.
     """

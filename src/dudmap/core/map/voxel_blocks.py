@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu import hashing
 from dudmap.core.backends.mirror import Mirror, grown
 from dudmap.core.backends.parameters import BLOCK
+from dudmap.core.state import Remembered, Stateful
 
 __all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
@@ -16,8 +18,12 @@ COORDINATE_BITS = 18
 """Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
+"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
+LARGEST_TABLE = 2**26
+"""Largest number of places of the hash table of a stored map: that of 50 million blocks."""
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
@@ -52,7 +58,7 @@ _TYPES = {
 }  # fmt: skip
 
 
-class VoxelBlocks:
+class VoxelBlocks(Stateful):
     """The map's content, block by block.
 
     An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
@@ -68,9 +74,20 @@ class VoxelBlocks:
         entry_of, slot_coords, written, fused: Of each of the ``num_slots`` slots in use or released: int32 entry, -1 =
             unused, (3,) int32 block coordinates, int32 number of the frame that last wrote to it, and uint8 frames that
             were fused into it, 255 or more.
+        table_size: Number of places of the hash table of stored blocks.
     """
 
-    def __init__(self, slots: int = 1 << 10) -> None:
+    coords: Remembered[NDArray[np.int32]]
+    slot_of: Remembered[NDArray[np.int32]]
+    free_count: Remembered[NDArray[np.uint8]]
+    entry_of: Remembered[NDArray[np.int32]]
+    slot_coords: Remembered[NDArray[np.int32]]
+    written: Remembered[NDArray[np.int32]]
+    fused: Remembered[NDArray[np.uint8]]
+    _released: Remembered[NDArray[np.int32]]
+    table_size: Remembered[int]
+
+    def __init__(self, slots: int = 1 << 14) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
@@ -84,6 +101,30 @@ class VoxelBlocks:
         self.fused = np.zeros(slots, dtype=np.uint8)
         self.use_slots(0)
         self._released = np.empty(0, dtype=np.int32)
+
+    def state(self) -> dict[str, Any]:
+        """The index, without spare room; voxels are stored block by block (``app/state``)."""
+        self.table_size = len(self.table)
+        state, n, m = super().state(), self.num_entries, self.num_slots
+        state |= {name: state[name][:n] for name in ("coords", "slot_of", "free_count")}
+        return state | {name: state[name][:m] for name in ("entry_of", "slot_coords", "written", "fused")}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take the index of other blocks; the voxels are empty. A ``ValueError`` if its parts do not fit each other."""
+        room = max(len(self.entry_of), len(state["entry_of"]))
+        super().restore(state)
+        n, m, owned = len(self.coords), len(self.entry_of), np.flatnonzero(self.entry_of >= 0)
+        sizes = [len(array) for array in (self.free_count, self.slot_of, self.slot_coords, self.written, self.fused)]
+        fitting = sizes == [n, n, m, m, m] and np.array_equal(self.slot_of[self.entry_of[owned]], owned)
+        if not (fitting and n / MAX_LOAD <= self.table_size <= LARGEST_TABLE):
+            raise ValueError("the parts of the index of a map do not fit each other")
+        self.num_entries = n
+        for name, unused in (("entry_of", -1), ("slot_coords", 0), ("written", 0), ("fused", 0)):
+            setattr(self, name, grown(getattr(self, name), room, unused))
+        self.geometry, self.colors = (np.zeros((room, BLOCK**3), np.int32) for _ in range(2))
+        self.use_slots(m)
+        self.table = np.full(self.table_size, hashing.EMPTY, dtype=np.int32)
+        hashing.rebuild(self.table, self.coords, n)
 
     @property
     def geometry(self) -> NDArray[np.int32]:
@@ -270,13 +311,10 @@ class VoxelBlocks:
         entries = hashing.find_all(self.table, self.coords, coords)
         return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
 
-    def neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
-        out = np.empty((len(slots), 8), dtype=np.int32)
-        for column in range(8):
-            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            out[:, column] = self.slots_at(self.slot_coords[slots] + offset)
-        return out
+    def neighbourhood(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+        coords = self.slot_coords[slots][:, None] + NEIGHBOURHOOD
+        return self.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
     @classmethod
     def restored(

@@ -13,6 +13,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.objects.object_fusion import ObjectFusion
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover, ObjectTracker
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 
@@ -31,16 +32,20 @@ class _Frame:
     movers: tuple[Mover, ...] | None = None
 
 
-class MovingObjects:
+class MovingObjects(Stateful):
     """Tracks the objects that the labels show to move; nothing here influences the camera's pose or the map.
 
     ``movers`` of the configuration switches tracking and fusion on and off.
     """
 
+    tracker: Remembered[ObjectTracker | None]
+    fusion: Remembered[ObjectFusion | None]
+    _waiting: Remembered[deque[_Frame]]
+
     def __init__(self, config: Config) -> None:
         self.tracker = ObjectTracker(config.movers) if config.movers.enabled else None
         self.fusion = ObjectFusion(config) if config.movers.enabled and config.movers.meshes else None
-        self._waiting: deque[_Frame] = deque()
+        self._waiting = deque()
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
         """Take note of a tracked frame; the function that is returned finds its moving objects, by id.

@@ -21,6 +21,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.objects.object_map import ObjectTrack, ObjectVolume, RigidObject
 from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
 MAX_OBJECTS = 4
@@ -130,8 +131,13 @@ def _padded_range(indices: NDArray[np.int64], shortest: int, size: int) -> slice
     return slice(start, min(max(stop, start + shortest), size))
 
 
-class ObjectFusion:
+class ObjectFusion(Stateful):
     """Shape and trajectory of the moving objects of a sequence."""
+
+    _rng: Remembered[np.random.Generator]
+    _tracks: Remembered[dict[int, ObjectTrack]]
+    _closed: Remembered[set[int]]
+    _results: Remembered[list[tuple[RigidObject, dict[float, NDArray[np.float64]]]]]
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -149,9 +155,9 @@ class ObjectFusion:
         self.tracker = Tracker(tracker, config.sensor, config.preprocess.smoothing_px)
         self._volume_config = config.volume.model_copy(update={"voxel_size": config.movers.mesh_voxel_size})
         self._rng = np.random.default_rng(0)
-        self._tracks: dict[int, ObjectTrack] = {}
-        self._closed: set[int] = set()
-        self._results: list[tuple[RigidObject, dict[float, NDArray[np.float64]]]] = []
+        self._tracks = {}
+        self._closed = set()
+        self._results = []
 
     def objects(self, poses: dict[float, NDArray[np.float64]]) -> list[RigidObject]:
         """All objects so far, by number; their trajectories follow from camera poses (4, 4) by time."""

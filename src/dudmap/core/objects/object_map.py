@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, pieces, with_faces
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
@@ -131,15 +131,6 @@ class ObjectTrack:
 
 def _main_components(mesh: Mesh) -> Mesh:
     """Mesh without connected components much smaller than the largest, which stem from readings beside the object."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, c = mesh.faces.T
-    ends = np.concatenate([a, b]), np.concatenate([b, c])
-    size = len(mesh.vertices)
-    _, component = connected_components(coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(size, size)), False)
-    counts = np.bincount(component)
-    kept = (counts >= MIN_COMPONENT * counts.max())[component]
-    number = np.cumsum(kept) - 1
-    faces = number[mesh.faces[kept[a]]].astype(np.int32)
-    return Mesh(mesh.vertices[kept], faces, mesh.colors[kept], mesh.normals[kept])
+    piece = pieces(mesh)
+    counts = np.bincount(piece)
+    return with_faces(mesh, (counts >= MIN_COMPONENT * counts.max())[piece[mesh.faces[:, 0]]])

@@ -25,6 +25,7 @@ from dudmap.core.objects.regions import (
     trimmed_box,
 )
 from dudmap.core.objects.scene_flow import InstanceFrame, displacements
+from dudmap.core.state import Remembered, Stateful
 
 OUTLIER_SPEED = 0.7
 """A displacement whose velocity differs from the median of its neighbours by more than this is a change of the mask,
@@ -87,7 +88,7 @@ class _Track:
     measurements: list[_Measurement] = field(default_factory=list)
 
 
-class ObjectTracker:
+class ObjectTracker(Stateful):
     """Segments the moving pixels of each frame into objects and associates these with those of earlier frames.
 
     The moving pixels of the last frame, displaced by the velocities of their objects, predict the object in each pixel.
@@ -102,11 +103,13 @@ class ObjectTracker:
 
     """
 
+    _tracks: Remembered[list[_Track]]
+    _last: Remembered[InstanceFrame | None] = None
+    _next_id: Remembered[int] = 1
+
     def __init__(self, config: MoversConfig) -> None:
         self.config = config
-        self._tracks: list[_Track] = []
-        self._last: InstanceFrame | None = None
-        self._next_id = 1
+        self._tracks = []
 
     def update(
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]

@@ -7,15 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.median import median
-from dudmap.core.frames.optical_flow import lucas_kanade, scaled_window
+from dudmap.core.frames.optical_flow import scaled_window, track_forward_backward
 
 PAIRED_PIXELS = 60
 """Pixels of an object that are tracked into the last frame."""
 FEWEST_PIXELS = 15
 """Fewest pixels with a known displacement that determine that of their object."""
 WINDOW = 9
-"""Edge of the window that a pixel is matched by, pixels of an image REFERENCE_WIDTH wide."""
-REFERENCE_WIDTH = 160
+"""Edge of the window that a pixel is matched by, pixels of an image WINDOW_WIDTH wide."""
+RETURN_PX = 0.5
+"""Largest error of a pixel that is tracked into the last image and back, pixels of an image WINDOW_WIDTH wide."""
+WINDOW_WIDTH = 160
 """Default width of the label image."""
 
 
@@ -53,12 +55,11 @@ def displacements(
     flat = np.concatenate(chosen)
     h, w = now.ids.shape
     v_now, u_now = np.divmod(flat, w)
-    pixels = np.stack([u_now, v_now], axis=1).astype(np.float32)
-    window = scaled_window(WINDOW, w, REFERENCE_WIDTH)
-    matches, found, _ = lucas_kanade(now.grey, last.grey, pixels, pixels, window, 2)
-    back, found_back, _ = lucas_kanade(last.grey, now.grey, matches, matches, window, 2)
+    pixels = np.stack([u_now, v_now], axis=1)
+    window = scaled_window(WINDOW, w, WINDOW_WIDTH)
+    limit = RETURN_PX * w / WINDOW_WIDTH
+    matches, _, good = track_forward_backward(now.grey, last.grey, pixels, pixels, window, 2, limit)
     u, v = np.rint(matches).astype(np.int64).T
-    good = found & found_back & (np.abs(back - pixels).max(axis=1) < 0.5 * w / REFERENCE_WIDTH)
     good &= (u >= 0) & (v >= 0) & (u < w) & (v < h)
     number = now.ids[v_now, u_now]
     good[good] = last.ids[v[good], u[good]] == number[good]

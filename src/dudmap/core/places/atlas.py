@@ -20,9 +20,10 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
-from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
+from dudmap.core.places.map_rebuilding import MAX_ADDED, MAX_IMMEDIATE, PER_FRAME, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.places.saved_map import PriorMap, SavedMap
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
 
@@ -40,7 +41,7 @@ class TimedPose:
     repeats: Repeats = ""
 
 
-class Atlas:
+class Atlas(Stateful):
     """The submaps and everything whose pose changes when a submap is corrected or joined with another.
 
     Attributes:
@@ -54,6 +55,15 @@ class Atlas:
             submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
     """
 
+    history: Remembered[FrameStore | None]
+    keyframes: Remembered[KeyframeDatabase]
+    volumes: Remembered[dict[int, TsdfVolume]]
+    rebuildings: Remembered[dict[int, MapRebuilding]]
+    repainting: Remembered[MapRebuilding | None] = None
+    current: Remembered[int]
+    poses: Remembered[list[TimedPose]]
+    saved: Remembered[int | None] = None
+
     def __init__(
         self,
         make_volume: Callable[[], TsdfVolume],
@@ -65,11 +75,9 @@ class Atlas:
         self.keyframes = keyframes
         self.history = history
         self.volumes = {number: make_volume()}
-        self.rebuildings: dict[int, MapRebuilding] = {}
-        self.repainting: MapRebuilding | None = None
+        self.rebuildings = {}
         self.current = number
-        self.poses: list[TimedPose] = []
-        self.saved: int | None = None
+        self.poses = []
 
     @classmethod
     def of(
@@ -132,7 +140,7 @@ class Atlas:
         for number in self.volumes:
             if number == self.saved:
                 continue
-            self.repainting = MapRebuilding(self.history, number, self.make_volume(), [], [])
+            self.repainting = MapRebuilding.of(self.history, number, self.make_volume())
             if not (gradually and number == self.current):
                 self._complete_repainting()
         self.switch_to(self.current)
@@ -210,7 +218,7 @@ class Atlas:
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
         """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
         if number in self.rebuildings:
-            self.rebuildings[number].show(self.volumes[number], T_world_camera, SHOWN)
+            self.rebuildings[number].show(self.volumes[number], T_world_camera, MAX_ADDED)
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
@@ -288,7 +296,7 @@ class Atlas:
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
-            self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
+            self.rebuildings[self.current] = MapRebuilding.of(self.history, self.current, new, fused)
         return corrections[-1]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
@@ -309,7 +317,7 @@ class Atlas:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
         self._complete_repainting()
-        moved_nodes, fused_nodes = self.kept_nodes(source), self.nodes(target)
+        moved_nodes = self.kept_nodes(source)
         for moved in (*self.poses, *self.keyframes.keyframes):
             if moved.submap == source:
                 moved.T_world_camera = T_target_source @ moved.T_world_camera
@@ -319,28 +327,16 @@ class Atlas:
             self.history.submaps[n] = target
         del self.volumes[source]
         self.rebuildings.pop(source, None)
-        if len(moved_nodes) <= AT_ONCE or target == self.saved:  # not all frames of a saved map are stored
+        if len(moved_nodes) <= MAX_IMMEDIATE or target == self.saved:  # not all frames of a saved map are stored
             self.history.reintegrate(self.volumes[target], moved_nodes)
             if target in self.rebuildings:
                 self.rebuildings[target].add_shown(moved_nodes)
         else:
-            self._fuse_gradually(target, fused_nodes)
+            nodes = np.array(self.kept_nodes(target))
+            Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
+            near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
+            provisional = self.make_volume()
+            self.history.reintegrate(provisional, near)
+            self.volumes[target].take_over(provisional)
+            self.rebuildings[target] = MapRebuilding.of(self.history, target, self.make_volume(), near)
         self.switch_to(target)
-
-    def _fuse_gradually(self, target: int, fused_nodes: list[int]) -> None:
-        """Add the stored frames of a submap that its map lacks over the frames to come; it holds ``fused_nodes``, or is
-        to hold them first."""
-        assert self.history is not None
-        running = self.rebuildings.pop(target, None)
-        if running is None:
-            volume = self.make_volume()
-            volume.take_over(self.volumes[target])
-            volume.page_out()
-            running = MapRebuilding(self.history, target, volume, fused_nodes, [])
-        provisional = self.make_volume()
-        nodes = np.array(self.kept_nodes(target))
-        Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
-        near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, AT_ONCE)].tolist()
-        self.history.reintegrate(provisional, near)
-        self.volumes[target].take_over(provisional)
-        self.rebuildings[target] = running.restarted(near)

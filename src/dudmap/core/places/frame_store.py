@@ -16,6 +16,7 @@ from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.scratch_store import ScratchStore
+from dudmap.core.state import Remembered, Stateful
 
 DEPTH_UNIT = 0.0005
 """Step of the stored depth, metres. The quantisation error, 0.29 steps rms, is 0.14 mm: a seventh of ``sigma_base``."""
@@ -45,7 +46,7 @@ class StoredFrame:
     count: int
 
 
-class FrameStore:
+class FrameStore(Stateful):
     """A selection of the fused frames in a temporary file, which the operating system removes.
 
     A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
@@ -63,6 +64,13 @@ class FrameStore:
         archived: Returns a frame, by its number, that is in the database of a continued run.
     """
 
+    timestamps: Remembered[list[float]]
+    Ts_world_camera: Remembered[list[NDArray[np.float64]]]
+    counts: Remembered[list[int]]
+    cells: Remembered[list[int]]
+    submaps: Remembered[list[int]]
+    color_timestamps: Remembered[list[float | None]]
+
     def __init__(
         self,
         camera: Camera,
@@ -73,13 +81,13 @@ class FrameStore:
     ) -> None:
         self.camera = camera
         self.registered = registered
-        self.color_timestamps: list[float | None] = []
+        self.color_timestamps = []
         self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
-        self.timestamps: list[float] = []
-        self.Ts_world_camera: list[NDArray[np.float64]] = []
-        self.counts: list[int] = []
-        self.cells: list[int] = []
-        self.submaps: list[int] = []
+        self.timestamps = []
+        self.Ts_world_camera = []
+        self.counts = []
+        self.cells = []
+        self.submaps = []
         self.archived: Callable[[int], EncodedFrame] | None = None
         self._first_own = 0  # number; the frames before it are archived
         self._file: ScratchStore | None = None

@@ -13,6 +13,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_store import CELLS, FrameStore
 from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE, LOCAL_FRAMES
+from dudmap.core.state import Remembered, Stateful
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
 """Views within this distance (m) and angle (deg) of each other show the same: half of what separates keyframes."""
@@ -20,7 +21,7 @@ MIN_KEPT = 256
 """Kept frames of which none are removed: 50 MB at 640x480. Recordings of some minutes give fewer."""
 
 
-class FrameThinning:
+class FrameThinning(Stateful):
     """Removes the images of kept frames of the current submap whose view newer ones show.
 
     They are removed when, in every cell of its image that a frame was fused in, newer frames of the same view
@@ -30,12 +31,13 @@ class FrameThinning:
 
     """
 
+    _stored: Remembered[int] = 0  # number of frames stored until the last call
+
     def __init__(self, config: Config, atlas: Atlas) -> None:
         self.atlas = atlas
         # an average capped at N readings has the variance of the mean of 2 N + 1: a / (2 - a) with a = 1 / (N + 1)
         held = 2 * min(config.volume.max_readings, config.volume.max_weight) + 1
         self._enough = config.similarity.threshold * held
-        self._stored = 0  # number of frames stored until the last call
 
     def thin(self) -> None:
         """Test the frames with the view of the newest one if that is new; call it with every frame."""

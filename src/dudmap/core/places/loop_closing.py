@@ -15,6 +15,7 @@ from dudmap.core.places.frame_thinning import FrameThinning
 from dudmap.core.places.loop_correction import LoopCorrector
 from dudmap.core.places.loop_verification import LoopQuery, LoopVerifier
 from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 
@@ -45,7 +46,7 @@ class LoopSearch:
     due: int
 
 
-class LoopCloser:
+class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
     A match is accepted if its features (3D-3D RANSAC), the distances to the local map of the matched time and the
@@ -57,21 +58,24 @@ class LoopCloser:
     ``closed`` is the number of corrections and joins made.
     """
 
+    corrector: Remembered[LoopCorrector]
+    thinning: Remembered[FrameThinning]
+    closed: Remembered[int] = 0
+    _frame: Remembered[int] = 0
+    _next_search: Remembered[int] = 0
+    _failures: Remembered[int] = 0
+    _newest_keyframe: Remembered[float | None] = None  # timestamp; their number ends at ``max_keyframes``
+    _search: Remembered[LoopSearch | None] = None
+    _pending: Remembered[tuple[int, NDArray[np.float64]] | None] = None
+
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
         self.config = config
         self.atlas = atlas
         self.verifier = LoopVerifier(config, atlas, tracker)
         self.corrector = LoopCorrector(atlas)
         self.thinning = FrameThinning(config, atlas)
-        self.closed = 0
-        self._frame = 0
-        self._next_search = 0
-        self._failures = 0
-        self._newest_keyframe: float | None = None  # timestamp; their number ends at ``max_keyframes``
-        self._search: LoopSearch | None = None
         self._executor: ThreadPoolExecutor | None = None
         # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
-        self._pending: tuple[int, NDArray[np.float64]] | None = None
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.

@@ -7,9 +7,10 @@ from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
-from dudmap.core.places.map_rebuilding import AT_ONCE, nearest_views, view_distances
+from dudmap.core.places.map_rebuilding import MAX_IMMEDIATE, nearest_views, view_distances
 from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.pose_graph import Edge, optimize
+from dudmap.core.state import Remembered, Stateful
 
 TRUNCATED_DISTANCE = 0.05
 """Distances to the map are truncated at this value in that comparison, metres."""
@@ -27,15 +28,17 @@ by 2 cm and 1 degree or by 5 cm gave more than 2 times.
 """
 
 
-class LoopCorrector:
+class LoopCorrector(Stateful):
     """Distributes the drift measured by loop closures over the stored frames of the current submap.
 
     ``edges`` are the motions measured by the loop closures so far, between numbers of stored frames.
     """
 
+    edges: Remembered[list[Edge]]
+
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
-        self.edges: list[Edge] = []
+        self.edges = []
 
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
@@ -134,8 +137,8 @@ def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) ->
     ends: those before and those after the farthest point of the way from ``a`` to ``b``, about as many of each."""
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
-    new = after[nearest_views(Ts[after], Ts[b], max(AT_ONCE // 2, AT_ONCE - len(before)))]
-    old = before[nearest_views(Ts[before], Ts[b], AT_ONCE - len(new))]
+    new = after[nearest_views(Ts[after], Ts[b], max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before)))]
+    old = before[nearest_views(Ts[before], Ts[b], MAX_IMMEDIATE - len(new))]
     return old.tolist(), new.tolist()
 
 

@@ -85,7 +85,7 @@ class LoopVerifier:
         if (
             found.converged
             and len(found.unobservable) == 0
-            and not monitor.reason_to_doubt(found)
+            and not monitor.misfit_reason(found)
             and found.inlier_share >= limits.min_on_map
             and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
         ):

@@ -7,6 +7,7 @@ RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac`
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.alignment import agree, rigid_ransac
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
+from dudmap.core.state import Remembered, Stateful
 
 COARSE_FEATURES = 64
 """Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
@@ -85,21 +87,29 @@ class PlaceMatch:
     num_inliers: int
 
 
-class KeyframeDatabase:
+class KeyframeDatabase(Stateful):
     """Keyframes along the trajectory, and the recognition of the places they show.
 
     The features of a new keyframe are extracted in another thread, and are there after ``settle``. Not for concurrent
     calls of ``extract``.
     """
 
+    keyframes: Remembered[list[Keyframe]]
+    _frames_since_last: Remembered[int]
+
     def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:
         self.config = config
         self.camera = camera
         self.sensor = sensor or SensorConfig()
-        self.keyframes: list[Keyframe] = []
+        self.keyframes = []
         self._sift = SiftExtractor(config.max_features)
         self._frames_since_last = config.keyframe_gap
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
+
+    def state(self) -> dict[str, Any]:
+        """The keyframes, once their features are there."""
+        self.settle()
+        return super().state()
 
     def extract(self, observation: Observation, dynamic_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
         """SIFT features of a frame that lie on one static surface.

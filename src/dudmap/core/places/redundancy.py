@@ -17,6 +17,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 
@@ -30,7 +31,7 @@ the fit 0.05, at a quarter of the width 0.10.
 """
 
 
-class SimilarityTest:
+class SimilarityTest(Stateful):
     """Compares the appearance of a frame with that of a reference frame.
 
     The share of the reference's SIFT features that are found again is measured on a reduced image and converted to
@@ -38,12 +39,14 @@ class SimilarityTest:
     when a comparison needs them, once per image. Not for concurrent calls.
     """
 
+    _reference: Remembered[NDArray[np.uint8] | None] = None
+    _cache: Remembered[list[tuple[NDArray[np.uint8], NDArray[np.float32]]]]
+
     def __init__(self, config: SimilarityConfig | None = None) -> None:
         self.config = config or SimilarityConfig()
         self._sift = SiftExtractor(self.config.max_features)
-        self._reference: NDArray[np.uint8] | None = None
         # reduced images and the descriptors of their features: at most the reference and the latest frame
-        self._cache: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
+        self._cache = []
 
     def set_reference(self, rgb: NDArray[np.uint8]) -> None:
         """Compare the frames that follow with this one, (H, W, 3)."""
@@ -83,17 +86,19 @@ class _Place:
     to_carve: NDArray[np.int64]
 
 
-class RedundantViews:
+class RedundantViews(Stateful):
     """Decides which frames are left out of the fusion because they show what the map already has.
 
     A view is only redundant at the place of the last fused frames: from elsewhere the same surface is seen at another
     angle, with other systematic errors, which the average is to contain as well.
     """
 
+    features: Remembered[SimilarityTest]
+    _place: Remembered[_Place | None] = None
+
     def __init__(self, config: Config) -> None:
         self.config = config
         self.features = SimilarityTest(config.similarity)
-        self._place: _Place | None = None
         self._learnt = 2 * config.volume.free_after
 
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:

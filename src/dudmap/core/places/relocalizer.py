@@ -14,6 +14,7 @@ from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.tracker import TrackingResult
@@ -31,7 +32,7 @@ class Relocalization:
     submap: int
 
 
-class Relocalizer:
+class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
     A lost frame is compared with all keyframes of the atlas. Each candidate pose is verified by registering the frame
@@ -40,14 +41,17 @@ class Relocalizer:
 
     """
 
+    _lost_since: Remembered[float | None] = None
+    _mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
+    _recent: Remembered[deque[FrameView]]
+    _place_unknown: Remembered[bool] = False
+    _counted: Remembered[tuple[float, int]]
+
     def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
         self.config = config
         self.atlas = atlas
         self.prior_map = prior_map
-        self._lost_since: float | None = None
-        self._crowded = False  # most of the view moved in the last tracked frame
-        self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
-        self._place_unknown = False
+        self._recent = deque()  # lost frames: the last, those of LONGEST_BASELINE
         self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
 
     @property
@@ -61,18 +65,18 @@ class Relocalizer:
 
     @property
     def reason(self) -> str:
-        """Sentence on why no registration from a predicted pose can be trusted, empty if one can."""
+        """Reason why no registration from a predicted pose can be trusted, empty if one can."""
         return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
 
-    def lost(self, timestamp: float, *, crowded: bool = False) -> None:
-        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized; ``crowded``: most of the view
-        moved in the last tracked frame."""
+    def lost(self, timestamp: float, *, mostly_dynamic: bool = False) -> None:
+        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized, and whether most of the view
+        moved in the last tracked one."""
         if self._lost_since is None:
-            self._lost_since, self._crowded = timestamp, crowded
+            self._lost_since, self._mostly_dynamic = timestamp, mostly_dynamic
 
     def found(self) -> None:
         """Record that the camera is tracked again or that a new submap was started."""
-        self._lost_since, self._crowded, self._place_unknown = None, False, False
+        self._lost_since, self._mostly_dynamic, self._place_unknown = None, False, False
         self._recent.clear()
 
     def recover(
@@ -156,5 +160,5 @@ class Relocalizer:
         if before is not None:
             motion = dominant_motion(before.pyramid, view.pyramid, (before.segmentation(), view.segmentation()))
         if motion is None:
-            return not self._crowded
+            return not self._mostly_dynamic
         return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

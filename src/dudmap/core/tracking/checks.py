@@ -32,7 +32,7 @@ it to confirm a pose: most of the view, and no room for another motion beside it
 depth edges a few percent less; at the wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
 STRICTNESS = {
     "tracking": (4.0, 4.0, 0.03),
-    "crowded": (2.0, 4.0, 0.03),
+    "mostly dynamic": (2.0, 4.0, 0.03),
     "recovering": (1.6, 2.5, 0.02),
     "recognized": (2.5, 2.5, 0.02),
 }
@@ -53,7 +53,7 @@ class Limits:
         sensor: Noise of the sensor.
         max_dynamic_share: Configured largest share of dynamic readings.
         mode: Key of STRICTNESS.
-        crowded: Most of the readings are dynamic.
+        mostly_dynamic: Most of the readings are dynamic.
         residual_mm, overlap, color: What was usual in the frames before; NaN where it is not known yet.
     """
 
@@ -61,7 +61,7 @@ class Limits:
     sensor: SensorConfig
     max_dynamic_share: float = 1.0
     mode: str = "tracking"
-    crowded: bool = False
+    mostly_dynamic: bool = False
     residual_mm: float = np.nan
     overlap: float = np.nan
     color: float = np.nan
@@ -79,7 +79,7 @@ class Check:
     Attributes:
         figure: Name of the figure that is judged, with its unit.
         limit: Limit of the figure. A check whose figure or limit is not known, NaN, passes.
-        reason: Sentence, in which ``figure`` and ``limit`` are replaced by their values.
+        reason: Text, in which ``figure`` and ``limit`` are replaced by their values.
         at_least: The figure must not be below the limit, instead of not above.
         overruled_by: Evidence against which the check does not hold: the ``last frame``, seen from the pose, has the
             same depth and the same image; the ``corners`` of the last image support the pose.
@@ -155,7 +155,7 @@ CHECKS = (
     ),
     Check(
         "verified_share",
-        lambda limits: MIN_VERIFIED_SHARE if limits.crowded else 0.0,
+        lambda limits: MIN_VERIFIED_SHARE if limits.mostly_dynamic else 0.0,
         "most of the readings seem to move, and only {figure:.0%} rest where the map has a surface",
         at_least=True,
     ),

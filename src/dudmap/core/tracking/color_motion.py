@@ -14,6 +14,7 @@ from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 
@@ -47,7 +48,7 @@ class RegisteredLevel(Level):
         return register_color(recorded, self.depth, self.camera, projection)
 
 
-class ColorMotion:
+class ColorMotion(Stateful):
     """Registers colour to depth with the calibration in use, which may change while the camera moves.
 
     A colour image taken at tau after the depth image of a camera at x with the velocity v shows what is seen from
@@ -68,11 +69,14 @@ class ColorMotion:
         calibration: In use; None for images that are taken as they are.
     """
 
+    given: Remembered[Calibration | None]
+    calibration: Remembered[Calibration | None]
+    _first: Remembered[FrameView | None] = None
+
     def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
         self.motion = motion
         self.given = given
         self.calibration = given
-        self._first: FrameView | None = None
 
     def start(self, view: FrameView) -> None:
         """Remember the frame that a map was made of, until its velocity is known."""

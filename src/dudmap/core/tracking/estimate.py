@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.dynamics.masks import Labels
+from dudmap.core.dynamics.masks import Labels, full_mask
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult
 
 PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
@@ -46,6 +47,20 @@ class PoseEstimate:
     def exposure(self) -> tuple[float, float]:
         """Gain and offset that map the frame's intensities to those of the map."""
         return self.tracking.exposure
+
+    @property
+    def unobserved_motion(self) -> str:
+        """Reason why the pose is uncertain: directions that the view does not determine; empty if there are none."""
+        return unobserved_motion(self.tracking.unobservable)
+
+    def dynamic_mask(self, view: FrameView) -> NDArray[np.bool_]:
+        """Dynamic pixels (H, W) of the frame, of the labels and of those that are known before."""
+        with view.timer("label"):
+            if self.labels is None:
+                mask = np.zeros(view.observation.depth.shape, dtype=bool)
+            else:
+                mask = full_mask(self.labels, view.labelled, view.observation.depth)
+            return mask if view.known_dynamic is None else mask | view.known_dynamic
 
 
 def static_weights(

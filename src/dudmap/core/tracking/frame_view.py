@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.state import CACHE
 
 
 class StageTimer:
@@ -26,6 +27,11 @@ class StageTimer:
         self._running: tuple | None = None  # stage, start, milliseconds within the outer stage, the outer stage
         self._stage = ""
         self._within = 0.0  # milliseconds of the stages that ran within the one that is running
+
+    @property
+    def stage(self) -> str:
+        """The stage that is running; empty outside of all."""
+        return "" if self._running is None else self._running[0]
 
     def __call__(self, stage: str) -> "StageTimer":
         """Context manager that measures a block of code; a block left by an exception is not counted."""
@@ -68,7 +74,7 @@ class FrameView:
     observation: Observation
     pyramid: Pyramid
     segmentation: Callable[[], Segmentation]
-    timer: StageTimer
+    timer: StageTimer = field(default_factory=StageTimer, metadata=CACHE)
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False
     color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))

@@ -12,6 +12,7 @@ from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.frame_view import FrameView
@@ -29,7 +30,7 @@ SAME_POSE = 0.01, 0.25
 """Initial poses nearer to each other than this (m, deg) lead to the same registration."""
 
 
-class FrontEnd:
+class FrontEnd(Stateful):
     """Registers frames to a map and labels their dynamic pixels.
 
     Args:
@@ -43,6 +44,8 @@ class FrontEnd:
     Attributes:
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
     """
+
+    last_dynamic: Remembered[NDArray[np.bool_] | None] = None
 
     def __init__(
         self,
@@ -61,7 +64,6 @@ class FrontEnd:
         self.motion = motion
         self.monitor = monitor
         self.color_motion = color_motion
-        self.last_dynamic: NDArray[np.bool_] | None = None
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Pose and labels of a frame, from its predicted pose on.

@@ -18,7 +18,7 @@ from dudmap.core.tracking.observability import STEEPEST
 
 ACROSS = 80
 """Readings across the image whose gradients are compared."""
-SHOWN = 0.2
+MIN_AGREEMENT = 0.2
 """Share of the gradients, of distances and intensities together, that map and image have in common, from which on a
 direction is shown. Noise gives 1 / sqrt(n) in n readings, 0.02; an endless tunnel and a wall without texture gave up to
 0.06, walls with wallpaper of which H says no more than of those two 0.3 to 0.6 (rendered

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.config import TrackerConfig
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 
 VELOCITY_LIFETIME = 0.15
 """Time after the last accepted pose during which the velocity is still used, seconds."""
@@ -20,7 +21,7 @@ ACCELERATION = 1.0
 """Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
 
 
-class MotionModel:
+class MotionModel(Stateful):
     """Predicts the next pose from the last two.
 
     Args:
@@ -31,14 +32,17 @@ class MotionModel:
         T_world_camera: (4, 4), the last accepted pose.
     """
 
+    T_world_camera: Remembered[NDArray[np.float64]]
+    _timestamp: Remembered[float] = 0.0
+    _velocity: Remembered[NDArray[np.float64]]
+    _initialized: Remembered[bool] = False
+    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
+
     def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
         self.config = config
         self.timed = timed
         self.T_world_camera = np.eye(4)
-        self._timestamp = 0.0
         self._velocity = np.zeros(6)  # twist per second, camera axes
-        self._initialized = False
-        self._observed = 0.0  # time of the last pose whose motion was seen in all directions
 
     @property
     def timestamp(self) -> float:

@@ -166,8 +166,8 @@ def gradient_noise(
     return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)
 
 
-def sentence(unobservable: NDArray[np.float64]) -> str:
-    """Sentence on the directions (k, 6) that a view does not determine, empty if there are none."""
+def unobserved_motion(unobservable: NDArray[np.float64]) -> str:
+    """Reason why a pose is uncertain: the directions (k, 6) that a view does not determine, empty if there are none."""
     if len(unobservable) == 0:
         return ""
     strongest = np.abs(unobservable).max(axis=0)

@@ -13,6 +13,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.motion_model import MotionModel
@@ -42,7 +43,7 @@ class PosePrediction:
     unverified_mask: NDArray[np.bool_] | None = None
 
 
-class PosePredictor:
+class PosePredictor(Stateful):
     """Predicts by constant velocity, and by ego-motion while the map is young or most of the view is dynamic.
 
     Args:
@@ -52,9 +53,14 @@ class PosePredictor:
         known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
 
     Attributes:
-        slow_crowd: Whether most of the view is seen to move, but only in comparison with an older image: what has not
+        mostly_slow: Whether most of the view is seen to move, but only in comparison with an older image: what has not
             been seen to rest in between may move as well, and is neither registered nor fused.
     """
+
+    ego_motion: Remembered[EgoMotionSegmenter]
+    mostly_slow: Remembered[bool] = False
+    _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
+    _dynamic_start: Remembered[bool] = False  # most of the view has moved in every frame so far
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
@@ -63,22 +69,19 @@ class PosePredictor:
         self.tracker = tracker
         self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
         self._known_poses = known_poses
-        self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
-        self.slow_crowd = False
-        self._crowded_start = False  # most of the view has moved in every frame so far
 
     def start(self, view: FrameView) -> None:
         """A map has been made of this frame."""
         self.ego_motion.start(view.timestamp)
-        self._single_frame_map = self._crowded_start = True
+        self._single_frame_map = self._dynamic_start = True
 
-    def is_crowded(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
+    def is_mostly_dynamic(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
         """Whether most of the view has moved since the map was begun, or in the last tracked frame, whose dynamic
         pixels (h, w) are given; None for none."""
-        return self._crowded_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
+        return self._dynamic_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
 
-    def doubt(self, view: FrameView, prediction: PosePrediction, estimate: PoseEstimate) -> str:
-        """Sentence on why the labels of a tracked frame cannot be trusted yet, empty if they can.
+    def ambiguity(self, view: FrameView, prediction: PosePrediction, estimate: PoseEstimate) -> str:
+        """Reason why the labels of a tracked frame cannot be trusted yet, empty if they can.
 
         In the first moments of a map motion of less than MOVES_PX from image to image cannot be told from that of the
         camera. If something moves in view, more of it may move, more slowly, and drag the camera along. Where most of
@@ -89,7 +92,7 @@ class PosePredictor:
         moving = np.zeros(view.labelled.depth.shape, bool)
         for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
             moving = moving if mask is None else moving | mask
-        verified = prediction.unverified_mask is not None and not self.slow_crowd
+        verified = prediction.unverified_mask is not None and not self.mostly_slow
         if verified or not exceeds_noise_share(moving, view.labelled):
             return ""
         return "something moves in view, and the map is too young to show what else does"
@@ -108,7 +111,7 @@ class PosePredictor:
         if self._known_poses and not self.ego_motion.started:
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
-        self.slow_crowd = False
+        self.mostly_slow = False
         by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
         if not self.ego_motion.active:
             return by_velocity
@@ -132,10 +135,10 @@ class PosePredictor:
             if slow is not None:
                 moving, moving_before = moving | slow.moving, slow.moving_first
             young = self.ego_motion.map_is_young(timestamp)
-            self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
-            unverified = ~motion.static_after if self._crowded_start else None
-            self.slow_crowd = slow is not None and is_majority_dynamic(moving, view.labelled)
-            if slow is not None and self.slow_crowd:
+            self._dynamic_start = self._dynamic_start and young and is_majority_dynamic(moving, view.labelled)
+            unverified = ~motion.static_after if self._dynamic_start else None
+            self.mostly_slow = slow is not None and is_majority_dynamic(moving, view.labelled)
+            if slow is not None and self.mostly_slow:
                 unverified = ~slow.static
             if not young:  # where the map is known, it labels better than two images
                 moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)

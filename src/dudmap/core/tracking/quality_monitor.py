@@ -21,6 +21,7 @@ from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import (
     CHECKS,
     CONFIRMED_OF_SEEN,
@@ -72,7 +73,7 @@ class ImageComparison:
         return self.confirms and self.shift <= MAX_IMAGE_SHIFT
 
 
-class ImageConsistency:
+class ImageConsistency(Stateful):
     """Measures how well the motion since the last tracked frame explains both frames.
 
     Args:
@@ -80,12 +81,13 @@ class ImageConsistency:
         motion: Knows the pose of the last tracked frame.
     """
 
+    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None] = None  # coarsest level, dynamic pixels, blind
+    _gain: Remembered[float] = 1.0  # of the exposure of the last frame
+
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
         self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
-        self._last: tuple[Level, NDArray[np.uint8], bool] | None = None  # coarsest level, dynamic pixels, blind
-        self._gain = 1.0  # of the exposure of the last frame
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Compare the next frame with this one, whose pose is accepted."""
@@ -202,13 +204,20 @@ class Verdict:
     figures: dict[str, float] = field(default_factory=dict)
 
 
-class QualityMonitor:
+class QualityMonitor(Stateful):
     """Decides whether the registration of a frame can be trusted.
 
     Args:
         config: ``tracker``, ``dynamics.max_share`` and the sensor's noise.
         motion: Velocity of the camera.
     """
+
+    images: Remembered[ImageConsistency]
+    recovering: Remembered[bool]
+    _residuals: Remembered[deque[float]]
+    _shares: Remembered[deque[float]]
+    _colors: Remembered[deque[float]]
+    _usual: Remembered[tuple[float, float, float]]
 
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
@@ -218,9 +227,9 @@ class QualityMonitor:
 
     def reset(self) -> None:
         """Forget all registrations: a new map begins."""
-        self._residuals: deque[float] = deque(maxlen=HISTORY)
-        self._shares: deque[float] = deque(maxlen=HISTORY)
-        self._colors: deque[float] = deque(maxlen=HISTORY)
+        self._residuals = deque(maxlen=HISTORY)
+        self._shares = deque(maxlen=HISTORY)
+        self._colors = deque(maxlen=HISTORY)
         self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN where they are not known yet
         self.recovering = False
         self.images.reset()
@@ -230,7 +239,7 @@ class QualityMonitor:
         """The registrations that new ones are compared with."""
         return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
 
-    def restore(self, history: RegistrationHistory) -> None:
+    def go_on_from(self, history: RegistrationHistory) -> None:
         """Compare new registrations with those of an earlier run in the same map."""
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
@@ -261,23 +270,25 @@ class QualityMonitor:
                 "image_shift_px": seen.shift,
                 "confirmed_share": seen.share,
             }
-            crowded = bool(share > 0.5)
+            mostly_dynamic = bool(share > 0.5)
             evidence = {
-                "last frame": lambda: not crowded and seen.is_same_view,
+                "last frame": lambda: not mostly_dynamic and seen.is_same_view,
                 "corners": partial(self.images.supported, view, estimate, seen, image_pose),
             }
-            mode = "recovering" if self.recovering else "crowded" if crowded else "tracking"
-            return Verdict(first_failure(CHECKS, figures, self.limits(mode, crowded=crowded), evidence), figures)
+            mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
+            return Verdict(
+                first_failure(CHECKS, figures, self.limits(mode, mostly_dynamic=mostly_dynamic), evidence), figures
+            )
 
-    def reason_to_doubt(self, tracking: TrackingResult) -> str:
+    def misfit_reason(self, tracking: TrackingResult) -> str:
         """Reason why the registration of a frame at a recognised place is much worse than usual, empty if it is not."""
         return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
-    def limits(self, mode: str, *, crowded: bool = False) -> Limits:
+    def limits(self, mode: str, *, mostly_dynamic: bool = False) -> Limits:
         """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
         config, (residual, overlap, color) = self.config, self._usual
         share = config.dynamics.max_share
-        return Limits(config.tracker, config.sensor, share, mode, crowded, 1000 * residual, overlap, color)
+        return Limits(config.tracker, config.sensor, share, mode, mostly_dynamic, 1000 * residual, overlap, color)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""

@@ -10,14 +10,20 @@ from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
-from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.core.backends.parameters import (
+    LevelImage,
+    NormalEquations,
+    RegistrationParameters,
+    SensorNoise,
+    TruncationBand,
+)
 from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
-from dudmap.core.tracking.gradient_agreement import SHOWN, GradientAgreement
+from dudmap.core.tracking.gradient_agreement import MIN_AGREEMENT, GradientAgreement
 from dudmap.core.tracking.observability import COMPLETE, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
@@ -247,7 +253,7 @@ class Tracker:
                 self._descend(volume, level, T, weights, None, NO_STEP, parameters).equations.residuals
                 for T in (se3.retract(T_world_camera, way * twist) for way in (step, -step))
             )
-            shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
+            shown.append(agreement.along(twist, forth, back, step) >= MIN_AGREEMENT)
         return seen.with_shown(np.array(shown), R)
 
     def _descend(
@@ -261,10 +267,8 @@ class Tracker:
         parameters: RegistrationParameters,
     ) -> Descent:
         """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
-        return volume.backend.register(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
-            parameters,
-        )  # fmt: skip
+        image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
+        return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
         """Rules of the steps of a level along all directions.

@@ -23,7 +23,6 @@ CAMERAS = {
     "oak": "drivers:OakCamera",
     "orbbec": "drivers:OrbbecCamera",
     "iphone": "drivers:IPhoneCamera",
-    "openni": "drivers:OpenNiCamera",
     "replay": "replay:ReplayCamera",
 }
 """Module and class of every camera by its name; without a name the first of them that is connected is taken."""

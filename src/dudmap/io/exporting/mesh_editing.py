@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, pieces, with_faces
 from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
 from dudmap.io.exporting.run_content import SPECK, Box, ExportOptions
@@ -42,26 +42,6 @@ def without_small_pieces(mesh: Mesh, area: float = SPECK) -> Mesh:
     piece = pieces(mesh)[mesh.faces[:, 0]]
     kept = np.bincount(piece, face_areas(mesh))[piece] >= area
     return mesh if kept.all() else with_faces(mesh, kept)
-
-
-def pieces(mesh: Mesh) -> NDArray[np.int32]:
-    """Number (V,) of the connected piece that each vertex belongs to."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, c = mesh.faces.T
-    pairs = np.concatenate([a, b]), np.concatenate([b, c])
-    n = len(mesh.vertices)
-    return connected_components(coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(n, n)), directed=False)[1]
-
-
-def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
-    """Mesh of some of the triangles (F,) and the vertices that they need."""
-    faces = mesh.faces[kept]
-    used = np.zeros(len(mesh.vertices), bool)
-    used[faces] = True
-    number = np.cumsum(used, dtype=np.int32) - 1
-    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.colors[used], mesh.normals[used])
 
 
 def with_filled_holes(mesh: Mesh, longest: float) -> Mesh:

@@ -4,6 +4,7 @@ What is missing, damaged or of a newer version is a ``DatasetError``, and a ``Ma
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,12 @@ from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
 
 if TYPE_CHECKING:
+    from dudmap.core.geometry.camera import Camera
     from dudmap.core.map.volume import TsdfVolume
+    from dudmap.io.sequences import Sequence
+
+NEAR = 0.001
+"""Largest difference between the time stamp of a frame and those of its pose and mask, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +135,42 @@ class RunContent:
         if not masks:
             raise DatasetError(f"{self.folder} holds no masks of what moves; repeat the run with --save-masks")
         return masks
+
+    def frames_of(self, sequence: "Sequence") -> Iterator[tuple[int, NDArray[np.float64], Path]]:
+        """Number, pose (4, 4) and mask of every frame of the recording that has both in the run.
+
+        Raises:
+            DatasetError: The run has no masks, or none of its poses belongs to the recording.
+        """
+        masks, found = self.mask_files(), False
+        stamps = np.array(sorted(masks))
+        for index, moment in enumerate(sequence.timestamps.tolist()):
+            pose, mask = _index_at(self.trajectory.timestamps, moment), _index_at(stamps, moment)
+            if pose is not None and mask is not None:
+                found = True
+                yield index, self.trajectory.Ts_world_camera[pose], masks[float(stamps[mask])]
+        if not found:
+            raise DatasetError(
+                f"no frame of {sequence.name} has a pose in {self.folder}; name the run of this recording"
+            )
+
+    def color_camera(self, sequence: "Sequence") -> "Camera":
+        """Camera of the recorded colour images: that of depth if they are registered to it.
+
+        Raises:
+            DatasetError: They are not, and the run does not say where their camera is.
+        """
+        if sequence.calibration is None:
+            return sequence.camera
+        if self.calibration is None:
+            raise DatasetError(f"{self.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
+        return self.calibration.camera
+
+
+def _index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
+    """Number of the time in (N,) increasing ones that belongs to a frame's, None if there is none."""
+    nearest = int(np.argmin(np.abs(stamps - timestamp)))
+    return nearest if abs(float(stamps[nearest]) - timestamp) <= NEAR else None
 
 
 def _numbers(version: str) -> list[int]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import write_bytes, write_text
+from dudmap.atomic_file import write_image, write_text
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.lens import Lens, OtherView
@@ -25,8 +25,6 @@ from dudmap.io.sequences.intrinsics import DISTORTION_KEYS
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
-NEAR = 0.001
-"""Largest difference between the time stamp of a frame and those of its pose and mask, seconds."""
 PIXEL = 0.5
 """These programs put the corner of the first pixel at the origin, dudmap its centre."""
 
@@ -61,15 +59,15 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
         name = f"{view.name}.png"
         millimetres = np.rint(1000 * view.depth)
         depth = np.where(millimetres > 65535, 0, millimetres).astype(np.uint16)
-        for folder, image in zip(folders, (view.color, depth, _kept(view)), strict=True):
-            _save(folder / name, image)
+        for folder, image in zip(folders, (view.color, depth, ~view.moving), strict=True):
+            write_image(folder / name, image, sync=False)
         frames.append(
             {
                 "file_path": f"images/{name}", "depth_file_path": f"depth/{name}", "mask_path": f"masks/{name}",
                 "transform_matrix": (view.T_world_color @ OPENGL_AXES).tolist(),
             }
         )  # fmt: skip
-    camera = _color_camera(run, sequence)
+    camera = run.color_camera(sequence)
     lens = dict(zip(DISTORTION_KEYS, (*camera.distortion, *(0.0,) * 5), strict=False))
     tree = {
         "camera_model": "OPENCV", "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + PIXEL,
@@ -88,8 +86,8 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
     for number, view in enumerate(_views(run, sequence, options.every), start=1):
         name = f"{view.name}.png"
-        _save(images / name, view.color)
-        _save(masks / f"{name}.png", _kept(view))
+        write_image(images / name, view.color, sync=False)
+        write_image(masks / f"{name}.png", ~view.moving, sync=False)
         T = se3.inverse(view.T_world_color)
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
         numbers = " ".join(f"{value:.9f}" for value in (w, x, y, z, *T[:3, 3]))
@@ -99,7 +97,7 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
     for number, (xyz, rgb) in enumerate(zip(seeds.vertices.tolist(), seeds.colors.tolist(), strict=True), start=1):
         lines.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
     write_text(path.parent / "points3D.txt", "\n".join(lines) + "\n")
-    camera = _colmap_camera(_color_camera(run, sequence))
+    camera = _colmap_camera(run.color_camera(sequence))
     write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {camera}\n")
 
 
@@ -116,12 +114,6 @@ def _colmap_camera(camera: Camera) -> str:
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV"}[len(camera.distortion)]
     numbers += [0.0] * 3 if model == "FULL_OPENCV" else []
     return f"{model} {camera.width} {camera.height} " + " ".join(f"{number:.9g}" for number in numbers)
-
-
-def index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
-    """Number of the time in (N,) increasing ones that belongs to a frame's, None if there is none."""
-    nearest = int(np.argmin(np.abs(stamps - timestamp)))
-    return nearest if abs(float(stamps[nearest]) - timestamp) <= NEAR else None
 
 
 def _open(run: RunContent, options: ExportOptions) -> "Sequence":
@@ -143,14 +135,8 @@ def _open(run: RunContent, options: ExportOptions) -> "Sequence":
         raise DatasetError(
             f"the recording that the run names cannot be read; name it by --sequence: {error}"
         ) from error
-    if sequence.calibration is not None and run.calibration is None:
-        raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
+    run.color_camera(sequence)  # refused before anything is written
     return sequence
-
-
-def _color_camera(run: RunContent, sequence: "Sequence") -> Camera:
-    """Camera of the recorded colour images: that of depth if they are registered to it."""
-    return sequence.camera if sequence.calibration is None or run.calibration is None else run.calibration.camera
 
 
 def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
@@ -159,38 +145,18 @@ def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
 
 def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
     """The frames that have a pose and a mask."""
-    masks, count = run.mask_files(), 0
-    stamps = np.array(sorted(masks))
     other = None
     if sequence.calibration is not None:
-        other = OtherView(Lens(sequence.camera), Lens(_color_camera(run, sequence)))
-    for index in range(0, len(sequence), every):
-        moment = float(sequence.timestamps[index])
-        pose, mask = index_at(run.trajectory.timestamps, moment), index_at(stamps, moment)
-        if pose is None or mask is None:
+        other = OtherView(Lens(sequence.camera), Lens(run.color_camera(sequence)))
+    for index, T_world_camera, mask in run.frames_of(sequence):
+        if index % every:
             continue
-        frame, moving = sequence[index], read_mask(masks[float(stamps[mask])])
+        frame, moving = sequence[index], read_mask(mask)
         if moving.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {run.folder} do not have the size of the images of {sequence.name}")
         taken = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
         depth, T_world_color = frame.depth, run.color_pose(taken)
         if other is not None:
-            T_color_depth = se3.inverse(T_world_color) @ run.trajectory.Ts_world_camera[pose]
+            T_color_depth = se3.inverse(T_world_color) @ T_world_camera
             depth, moving = other.depth(depth, T_color_depth), other.mask(moving, depth, T_color_depth)
         yield View(f"frame_{index:05d}", frame.color, depth, moving, T_world_color)
-        count += 1
-    if not count:
-        raise DatasetError(f"no frame of {sequence.name} has a pose in {run.folder}; name the recording of that run")
-
-
-def _kept(view: View) -> NDArray[np.uint8]:
-    """Mask (H, W) of these programs: 255 = use."""
-    return np.where(view.moving, 0, 255).astype(np.uint8)
-
-
-def _save(path: Path, image: NDArray) -> None:
-    """Write a PNG image, colour in RGB order."""
-    import cv2
-
-    data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1]
-    write_bytes(path, data.tobytes(), sync=False)

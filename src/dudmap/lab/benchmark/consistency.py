@@ -29,7 +29,7 @@ from dudmap.lab.benchmark.measure import grid
 GAPS = 5, 15, 30
 """Frames between the two of a pair."""
 PAIRS = 100
-"""About so many pairs of each gap are compared."""
+"""Approximate number of pairs of each gap that are compared."""
 TERMS = {"depth": "mm at 1 m", "intensity": "of 255"}
 """What is compared, and its unit."""
 WORST_DEPTH, WORST_INTENSITY = 0.05, 0.2

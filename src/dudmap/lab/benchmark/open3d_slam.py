@@ -1,8 +1,7 @@
 """Open3D's dense SLAM (t.pipelines.slam) on frames in a folder; a separate program that needs only open3d and numpy.
 
-    python open3d_slam.py FOLDER VOXEL_SIZE DEPTH_MAX [DEVICE]
+    python open3d_slam.py FOLDER VOXEL_SIZE DEPTH_MAX
 
-DEVICE is CPU:0 (the default), or CUDA:0 where the wheel of Open3D supports it.
 FOLDER holds depth.npy (N, H, W) uint16, color.npy (N, H, W, 3) uint8 and camera.json with fx, fy,
 cx, cy and depth_scale. The steps and values are those of Open3D's own example dense_slam.py: frame to model tracking,
 integration with a band of 8 voxels, model frame by ray casting. Prints one JSON object: version, ms per frame, poses.
@@ -24,10 +23,7 @@ def main() -> None:
     depths, colors = (np.load(folder / f"{kind}.npy", mmap_mode="r", allow_pickle=False) for kind in ("depth", "color"))
     camera = json.loads((folder / "camera.json").read_text(encoding="utf-8"))
     scale, band, nearest, distance = camera["depth_scale"], 8.0, 0.1, 0.07
-    device = o3d.core.Device(sys.argv[4] if len(sys.argv) > 4 else "CPU:0")
-    on_gpu = device.get_type() == o3d.core.Device.DeviceType.CUDA
-    if on_gpu and not o3d.core.cuda.is_available():
-        sys.exit(f"Open3D {o3d.__version__} finds no GPU, or its wheel is that for the CPU")
+    device = o3d.core.Device("CPU:0")
     intrinsic = o3d.core.Tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     height, width = depths.shape[1:]
     T = o3d.core.Tensor(np.eye(4))
@@ -46,8 +42,6 @@ def main() -> None:
         model.update_frame_pose(number, T)
         model.integrate(seen, scale, depth_max, band)
         model.synthesize_model_frame(expected, scale, nearest, depth_max, band, False)
-        if on_gpu:
-            o3d.core.cuda.synchronize(device)
         ms.append(1000 * (time.perf_counter() - start))
         poses.append(T.numpy().tolist())
     sys.stdout.write(json.dumps({"version": o3d.__version__, "ms": ms, "poses": poses}) + "\n")

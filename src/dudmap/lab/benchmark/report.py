@@ -9,8 +9,9 @@ from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
 from dudmap.evaluation.trajectory import accuracy
+from dudmap.lab.benchmark.limits import limits_table
 from dudmap.lab.benchmark.measure import COLUMNS, SCORED, Job, Row, grid, markdown, measure_all, save, score_mesh, shown
-from dudmap.lab.benchmark.suites import Entry, Suite
+from dudmap.lab.benchmark.suites import UNCALIBRATED, Entry, Suite
 from dudmap.lab.data import tables
 
 
@@ -48,11 +49,12 @@ def run_suite(
 ) -> tuple[Row, str]:
     """Measure a suite, write <suite>.md, .csv and .json into ``out``, and return what JSON holds and the Markdown.
 
-    Runs are kept in ``out``/runs/<system>/<sequence>. ``others`` are folders with results of other systems by name:
-    FOLDER/<sequence>/trajectory.txt and mesh.ply.
+    Runs are kept in ``out``/runs/<system>/<sequence>, but for those of the suite ``limits``. ``others`` are folders
+    with results of other systems by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
     """
+    kept = None if suite.name == "limits" else out / "runs"
     jobs = [
-        Job(entry, name, config, out / "runs" / name / entry.name)
+        Job(entry, name, config, kept and kept / name / entry.name, name not in UNCALIBRATED)
         for entry in suite.entries
         for name, config in systems.items()
     ]
@@ -66,6 +68,7 @@ def run_suite(
     printed = published(suite.names())
     table = markdown(rows) if rows else "None of its recordings was found.\n"
     text = f"# Suite {suite.name}\n\n{table}\n{_missing(suite)}{comparison_tables(rows, printed, suite)}"
+    text += limits_table(rows, [*systems, *others]) if suite.name == "limits" else ""
     if workers > 1:
         text += f"\n{workers} runs at a time: the times per frame are not those of an otherwise idle machine.\n"
     cpu = machine()

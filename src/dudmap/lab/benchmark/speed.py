@@ -15,17 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark.measure import Row, grid, in_own_process
 from dudmap.lab.benchmark.suites import Entry
-from dudmap.lab.data import tables
-from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
-from dudmap.lab.synthetic.rooms import build_scene
-from dudmap.lab.synthetic.scene import look_at
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -34,8 +28,6 @@ if TYPE_CHECKING:
 
 WARM_UP = 10
 """Number of frames at the start of a run that are not timed."""
-ALTERNATION = 20
-"""Number of frames after which two systems alternate."""
 FRAME_TARGETS = {0.01: 20.0, 0.02: 14.0, 0.005: 40.0}
 """Largest acceptable median time per frame by voxel size, milliseconds by metres."""
 
@@ -52,16 +44,13 @@ class SpeedFigure(NamedTuple):
 
 def speed_figures(
     frames: int,
-    long_frames: int = 0,
     announce: Callable[[str], None] = lambda text: None,
-    open3d: str | None = None,
+    open3d: Path | None = None,
     recording: Path | None = None,
 ) -> list[SpeedFigure]:
     """Measure all figures over so many frames; ``announce`` is called with a description of the next measurement.
 
     Args:
-        long_frames: Frames of the walk through unseen space, which shows whether the time per frame grows; 0 skips
-            it.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
     """
@@ -86,32 +75,24 @@ def speed_figures(
     figures.append(SpeedFigure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
     announce("starting")
     figures += _start_times()
-    if long_frames:
-        announce(f"{long_frames} frames through new space")
-        row = _measured(time_walk, long_frames)
-        remark = f"{long_frames} frames, {row['first_ms']:.1f} to {row['last_ms']:.1f} ms"
-        figures.append(SpeedFigure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
-        remark = f"{row['stale']} chunks; all of the map takes {row['mesh_ms']:.0f} ms"
-        figures.append(SpeedFigure("mesh again after one frame, end of the walk", "ms", None, row["again_ms"], remark))
     if open3d is not None:
         announce("Open3D's dense SLAM and ours in turn")
         figures += _open3d_figures(open3d, recording, frames)
     return figures
 
 
-def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[SpeedFigure]:
-    from dudmap.lab.benchmark.gpu import compare_with_open3d
+def _open3d_figures(python: Path, recording: Path | None, frames: int) -> list[SpeedFigure]:
+    from dudmap.lab.benchmark.open3d_comparison import compare_with_open3d
 
     static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
     entry = static_room if recording is None else Entry(recording.resolve().name, recording)
-    found = compare_with_open3d(python, entry, frames)
+    found = compare_with_open3d(python, entry.open(), frames)
     remark = f"{entry.name}, {found.frames} frames, {found.ours_ms:.1f} to {found.theirs_ms:.1f} ms"
-    figures = [SpeedFigure("frame, over Open3D's dense SLAM", "x", 1 / 3, found.ours_ms / found.theirs_ms, remark)]
+    figures = [SpeedFigure("frame, over Open3D's dense SLAM", "x", 1 / 8, found.ours_ms / found.theirs_ms, remark)]
     if found.ours_ate is not None and found.theirs_ate is not None:
         remark = f"{100 * found.ours_ate:.2f} to {100 * found.theirs_ate:.2f} cm; Open3D {found.version}"
-        figures.append(
-            SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, found.ours_ate / found.theirs_ate, remark)
-        )
+        ratio = found.ours_ate / found.theirs_ate
+        figures.append(SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, ratio, remark))
     return figures
 
 
@@ -271,51 +252,3 @@ def time_iteration(frames: int) -> Row:
     slam.volume.look_at(pose)
     seconds, _ = median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
     return {"iteration_ms": 1000 * seconds}
-
-
-def time_walk(frames: int) -> Row:
-    """Median time per frame in the first and the last tenth of a walk through unseen space.
-
-    The speed of a machine varies within minutes. Therefore a second system processes the first tenth while the first
-    one processes the last, alternating every few frames.
-    """
-    sequence, slam = passage(frames + 1), None
-    start = min(60, frames // 4)
-    tenth = max((frames - start) // 10, 1)
-    old, new = _processed(Config(), sequence, frames), _processed(Config(), sequence, frames)
-    for _ in range(frames - tenth):
-        slam, _ = next(old)
-    for _ in range(start):
-        next(new)
-    first: list[float] = []
-    last: list[float] = []
-    while len(last) < tenth:
-        for walk, times in ((new, first), (old, last)):
-            times += [next(walk)[1] for _ in range(min(ALTERNATION, tenth - len(times)))]
-    assert slam is not None
-    row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
-    row["growth"] = row["last_ms"] / row["first_ms"]
-    row["mesh_ms"] = 1000 * median_seconds(slam.volume.extract_mesh, 1)[0]
-    return row | _time_again(slam, sequence[frames])
-
-
-SPEED, FPS = 0.3, 30.0
-"""Speed of the camera in the passage, m/s, and frame rate, Hz."""
-LAP = 194
-"""Period in frames of the sway of the camera and of the objects along the walls (up to their pattern of three).
-
-60 frames of warm-up and ten periods are 2000 frames: the first and the last tenth show the same, nine periods apart.
-"""
-
-
-def passage(frames: int) -> SyntheticSequence:
-    """Recording of up to 2000 frames in which the camera moves straight on and looks at either wall in turn."""
-    times = np.arange(frames) / FPS
-    truth = Trajectory(times, np.array([_passage_pose(t) for t in times]))
-    scene = build_scene("passage", tables("benchmark/passage.toml"))
-    return SyntheticSequence(scene, [], truth, DEFAULT_CAMERA, noise="kinect", seed=0, fps=FPS)
-
-
-def _passage_pose(t: float) -> NDArray[np.float64]:
-    sway, y = np.sin(2 * np.pi * FPS / LAP * t), SPEED * t
-    return look_at((0.1 * sway, y, 1.4 + 0.05 * sway), (sway, y + 1.6, 1.0))

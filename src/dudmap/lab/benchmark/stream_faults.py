@@ -3,27 +3,23 @@
 An unknown fault, or a recording without true poses, is a ``ConfigError``.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.pipeline.inspection import inspect
 from dudmap.config import Config
-from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
-from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.measure import Row, grid
+from dudmap.lab.benchmark.measure import grid
 from dudmap.lab.benchmark.suites import Excerpt
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream, black, scaled
+from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SILENT_ERROR = 0.03
 """Error of a pose said to be tracked from which on it is wrong, metres; at least
@@ -53,7 +49,7 @@ class FaultRun:
     flagged: NDArray[np.bool_]
 
     def wrong(self, clean: "FaultRun") -> tuple[int, int]:
-        """Poses that are wrong although the run calls them tracked: without a word, and those it calls doubtful."""
+        """Numbers of wrong poses that the run calls tracked: not flagged, and flagged as doubtful."""
         wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
         return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
@@ -76,12 +72,12 @@ class FaultRun:
         return "skipped and counted" if self.rejected else "handled"
 
 
-def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
-    """A synthetic scene with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+def default_room(frames: int, width: int, seed: int) -> Sequence:
+    """A synthetic room with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
 
     camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
-    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera)
+    return synthetic.sequence(frames=frames, seed=seed, camera=camera)
 
 
 def measure_stream_faults(
@@ -155,78 +151,3 @@ def fault_row(run: FaultRun, clean: FaultRun) -> str:
              f"{np.sqrt(np.mean(errors**2)):.1f}", f"{errors.max():.1f}", "{}, {}".format(*run.wrong(clean)),
              "never" if recovery is None else recovery]  # fmt: skip
     return f"| {' | '.join(map(str, cells))} |"
-
-
-def _turned(frame: Frame, rows: int, columns: int) -> Frame:
-    return replace(frame, color=np.ascontiguousarray(frame.color[::rows, ::columns]))
-
-
-def _wall(frame: Frame) -> Frame:
-    """A wall without relief at 2 m, whose readings have a standard deviation of 4 mm."""
-    rng = np.random.default_rng(round(1000 * frame.timestamp))
-    return replace(frame, depth=rng.normal(2.0, 0.004, frame.depth.shape).astype(np.float32))
-
-
-RIGHT = "as recorded"
-"""The recording itself, of which nothing may be said."""
-LARGE = "depth five times too large"
-FACTORS = {LARGE: 5.0, "depth five times too small": 0.2}
-"""True depth scale over the given one."""
-SPOILT: dict[str, Callable[[Frame], Frame]] = {
-    RIGHT: lambda frame: frame,
-    **{name: partial(scaled, factor=factor) for name, factor in FACTORS.items()},
-    "colour mirrored left-right": partial(_turned, rows=1, columns=-1),
-    "colour upside down": partial(_turned, rows=-1, columns=1),
-    "colour rotated by 180 degrees": partial(_turned, rows=-1, columns=-1),
-    "colour black": black,
-    "depth a flat wall of noise": _wall,
-    "the same, colour black": lambda frame: black(_wall(frame)),
-}
-"""What is done to every frame, by name."""
-
-
-class SpoiltSequence(Excerpt):
-    """The first frames of a recording, each of them spoilt in the same way, a key of ``SPOILT``."""
-
-    def __init__(self, recording: Sequence, name: str, frames: int) -> None:
-        super().__init__(recording, frames)
-        self.name = name
-        self.camera = replace(recording.camera, depth_scale=recording.camera.depth_scale / FACTORS.get(name, 1.0))
-
-    def __getitem__(self, index: int) -> Frame:
-        return SPOILT[self.name](super().__getitem__(index))
-
-
-def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str], frames: int) -> Iterator[Row]:
-    """Inspect and process a recording spoilt in the ways that are named, keys of ``SPOILT``.
-
-    Yields:
-        ``name`` of the way, ``warnings`` (sentences of ``inspect``), number of ``frames``, of those ``tracked`` and of
-        those called ``doubtful`` (uncertain or blind), and ``ate``, its RMSE in metres; None with too few poses.
-    """
-    if recording.ground_truth is None:
-        raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
-    for name in names:
-        sequence = SpoiltSequence(recording, name, frames)
-        slam = Slam(sequence.camera, config, calibration=sequence.calibration)
-        results = [slam.process(sequence[index]) for index in range(len(sequence))]
-        tracked = sum(result.T_world_camera is not None for result in results)
-        doubtful = sum(bool(result.uncertain) or result.blind for result in results)
-        ate = accuracy(slam.trajectory, recording.ground_truth, ("ate_rmse_m",))["ate_rmse_m"]
-        yield {"name": name, "warnings": inspect(sequence).warnings, "frames": len(results), "tracked": tracked,
-               "doubtful": doubtful, "ate": ate}  # fmt: skip
-
-
-def fails(row: Row) -> bool:
-    """Whether nothing is said of wrong input, or something of right input."""
-    return bool(row["warnings"]) == (row["name"] == RIGHT)
-
-
-def spoilt_table(rows: list[Row]) -> str:
-    """Markdown table, one line per way."""
-    lines = []
-    for row in rows:
-        figures = [f"{row['tracked']} of {row['frames']}", str(row["doubtful"])]
-        ate = f"{1000 * row['ate']:.1f}" if isinstance(row["ate"], float) else "-"
-        lines.append([row["name"], "; ".join(row["warnings"]) or "nothing", *figures, ate])
-    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, mm"], lines)

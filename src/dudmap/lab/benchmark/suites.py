@@ -78,7 +78,7 @@ def local_entries(data: Path) -> list[Entry]:
 
 
 class Excerpt:
-    """The first frames of a recording, all without a number, each of which is read or rendered once."""
+    """The first ``frames`` frames of a recording (None: all), each of which is read or rendered once."""
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
@@ -104,28 +104,25 @@ class Excerpt:
             self._masks[index] = self.recording.mask(index)
         return self._masks[index]
 
-    def load(self) -> "Excerpt":
-        """Read or render all frames and masks now, so that this falls into the time of nobody."""
-        for index in range(len(self)):
-            _ = self[index], self.mask(index)
-        return self
-
 
 DATA = tables("benchmark/suites.toml")
 SUITES: dict[str, str] = DATA["suites"]
 """What each suite is, by name."""
 WORLDS: dict[str, dict[str, dict[str, Any]]] = DATA["worlds"]
 """Parameters of the synthetic worlds of a suite, by name."""
-SENSORS: dict[str, dict[str, Any]] = DATA["sensors"]
-"""The same static room, taken with sensors of different faults and with named cameras."""
 SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
 """Differences from the default configuration, by name."""
 PASSES = {"two-passes": 2}
 """Systems that process a recording more than once, and how often."""
-ABLATION = ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))])
-"""Systems of the suite ``ablation``."""
-ROOM = {"movers": (), "frames": 120}
-QUICK = ("room-static", "room-person", "room-people-at-start", "two-people")
+UNCALIBRATED = ("colour-as-given",)
+"""Systems that take the colour camera as the recording gives it; the others calibrate it first."""
+USUAL = {
+    "ablation": ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))]),
+    "sensors": "colour-as-given,no-colour,dudmap",
+    "limits": "dudmap,none,threshold,em",
+}
+"""Systems of a suite unless others are named; of the other suites the default alone."""
+QUICK = ("room-static", "room-person", "room-people-at-start", "two-people", "speed-1.0-50", "camera_path-still-30")
 
 
 @dataclass(frozen=True)
@@ -146,13 +143,19 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
     Args:
         data: Folder that is searched, two levels deep; synthetic worlds need none.
-        quick: Only one to three synthetic worlds, and at most 60 frames of every recording.
+        quick: A few synthetic worlds, in images of 320x240, and at most 60 frames of every recording.
     """
     find(name, SUITES, "suite")
     missing: list[Entry] = []
-    if name in WORLDS:
-        worlds = {key: world for key, world in WORLDS[name].items() if not quick or key in QUICK}
-        found = [Entry(key, parameters=world | ({"frames": 60} if quick else {})) for key, world in worlds.items()]
+    if name in (*WORLDS, "limits"):
+        from dudmap.lab.benchmark import limits
+
+        worlds, reduced = (
+            WORLDS[name] if name in WORLDS else limits.worlds(),
+            {"frames": 60, "camera": (320, 240)} if quick else {},
+        )
+        names = [key for key in QUICK if key in worlds] if quick else []
+        found = [Entry(key, parameters=worlds[key] | reduced) for key in names or worlds]
     elif data is None:
         raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")
     elif name == "local":
@@ -165,15 +168,6 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
         ]
         found, missing = _located(entries, data)
     return Suite(name, [replace(entry, max_frames=60) for entry in found] if quick else found, missing)
-
-
-def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> list[Entry]:
-    """The room of suite ``sensors``, taken with every sensor or with the named ones, ``quick`` in small images."""
-    unknown = [name for name in names or [] if name not in SENSORS]
-    if unknown:
-        raise ConfigError(f"unknown sensor of the suite {unknown[0]!r}; known are {', '.join(SENSORS)}")
-    size = {"camera": (320, 240) if quick else (640, 480)}
-    return [Entry(name, parameters=ROOM | size | SENSORS[name]) for name in names or SENSORS]
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:

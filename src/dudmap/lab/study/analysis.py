@@ -10,7 +10,7 @@ from dudmap.lab.study import screening
 from dudmap.lab.study.designs import Table
 from dudmap.lab.study.effects import anova, interactions, main_effects
 from dudmap.lab.study.report import Report
-from dudmap.lab.study.response_surface import Prediction, lack_of_fit, predict_optimum, values_text
+from dudmap.lab.study.response_surface import Prediction, predict_optimum, values_text
 from dudmap.lab.study.responses import RESPONSES
 
 if TYPE_CHECKING:
@@ -56,15 +56,10 @@ def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> 
 
 def describe_surface(report: Report, predicted: Prediction) -> None:
     """Add the quadratic model, its optimum and what speaks against it."""
-    surface, best, fit = predicted.surface, predicted.best, lack_of_fit(predicted.surface)
-    lack = (
-        "lack of fit cannot be tested, since no point was repeated"
-        if fit is None
-        else "lack of fit F = {:.2f}, p = {:.2g}".format(*fit)
-    )
+    surface, best = predicted.surface, predicted.best
     report.text(
         f"Full quadratic model: R2 = {surface.r2:.2f}, {surface.r2_predicted:.2f} when each run is left out in turn, "
-        f"residual standard deviation {surface.residual_sd:.3g}{surface.scale.unit}; {lack}."
+        f"residual standard deviation {surface.residual_sd:.3g}{surface.scale.unit}."
     )
     figure = figures.surface_figure(surface, best, surface.scale.heading)
     report.figure(figure, "Prediction through the optimum, with 95 % intervals.")

@@ -134,7 +134,7 @@ Coded = NDArray[np.float64]
 Point = dict[str, Value]
 """Values of all factors by key."""
 Kind = Literal[
-    "full-factorial", "fractional-factorial", "plackett-burman", "central-composite", "box-behnken", "latin-hypercube",
+    "full-factorial", "plackett-burman", "central-composite", "latin-hypercube",
 ]  # fmt: skip
 DESIGNS: tuple[str, ...] = get_args(Kind)
 
@@ -145,8 +145,6 @@ class DesignOptions(BaseModel):
     Attributes:
         kind: Name of the design.
         samples: Number of points of a Latin hypercube.
-        resolution: Resolution of a fractional factorial design.
-        generators: Generators of a fractional factorial design such as ``a b c abc``, instead of a resolution.
         seed: Seed of a Latin hypercube.
         foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
             interactions of two factors.
@@ -156,8 +154,6 @@ class DesignOptions(BaseModel):
 
     kind: Kind = Field("full-factorial", description=f"one of {', '.join(DESIGNS)}")
     samples: int = Field(64, ge=1)
-    resolution: int = 4
-    generators: str = ""
     seed: int = 0
     foldover: bool = True
 
@@ -165,19 +161,17 @@ class DesignOptions(BaseModel):
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
     """All points of a design, each once."""
     kind = options.kind
-    found: list[Point]
     if kind == "full-factorial":
-        found = _full_factorial(factors)
-    elif kind in ("fractional-factorial", "plackett-burman"):
+        return _full_factorial(factors)
+    if kind == "plackett-burman":
         ends = [(f.value(-1), f.value(1)) if f.numeric else (f.levels[0], f.levels[-1]) for f in factors]
-        rows = (_fractional if kind == "fractional-factorial" else _plackett_burman)(factors, options)
-        found = [{f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)} for row in rows]
-    else:
-        words = [factor.key for factor in factors if not factor.numeric]
-        if words:
-            raise ConfigError(f"a {kind} design needs numbers, but {words[0]} has levels that are none")
-        rows = (_latin_hypercube if kind == "latin-hypercube" else _response_surface)(factors, options)
-        found = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
+        rows = _plackett_burman(factors, options)
+        return [{f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)} for row in rows]
+    words = [factor.key for factor in factors if not factor.numeric]
+    if words:
+        raise ConfigError(f"a {kind} design needs numbers, but {words[0]} has levels that are none")
+    rows = (_central_composite if kind == "central-composite" else _latin_hypercube)(factors, options)
+    found: list[Point] = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
     return [point for number, point in enumerate(found) if point not in found[:number]]
 
 
@@ -202,19 +196,6 @@ def _full_factorial(factors: Sequence[Factor]) -> list[Point]:
     return [{f.key: f.levels[n] for f, n in zip(factors, row, strict=True)} for row in rows]
 
 
-def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from pyDOE3 import fracfact, fracfact_by_res
-
-    given, count = options.generators, len(factors)
-    try:
-        rows = np.asarray(fracfact(given) if given else fracfact_by_res(count, options.resolution))
-    except ValueError as error:
-        raise ConfigError(f"no fractional factorial design for {count} factors: {error}") from None
-    if rows.shape[1] != count:
-        raise ConfigError(f"the generators {given!r} make {rows.shape[1]} columns for {count} factors")
-    return rows
-
-
 def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded:
     from pyDOE3 import pbdesign
 
@@ -232,13 +213,12 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
     return np.vstack([rows, -rows]) if options.foldover else rows
 
 
-def _response_surface(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from pyDOE3 import bbdesign, ccdesign
+def _central_composite(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import ccdesign
 
-    count, composite = len(factors), options.kind == "central-composite"
-    if count < (2 if composite else 3):
-        raise ConfigError(f"a {options.kind} design needs {'two' if composite else 'three'} factors or more")
-    return np.asarray(ccdesign(count, center=(0, 1), face="faced") if composite else bbdesign(count, center=1))
+    if len(factors) < 2:
+        raise ConfigError("a central-composite design needs two factors or more")
+    return np.asarray(ccdesign(len(factors), center=(0, 1), face="faced"))
 
 
 def _latin_hypercube(factors: Sequence[Factor], options: DesignOptions) -> Coded:

@@ -8,7 +8,7 @@ import inspect
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError
+from dudmap.lab.benchmark.measure import code_hash
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.data import find
 from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, count_of, make_factors, points_of
@@ -72,7 +73,7 @@ class DesignFile(BaseModel):
     log: list[str] = Field([], description="a list of responses")
     calibrate: bool = Field(False, description="true or false")
     confirm: int = Field(1, ge=0, description="the number of confirmation runs, 0 or more")
-    tune: dict[str, Any] = Field({}, description="a table with trials, early, seed")
+    tune: dict[str, Any] = Field({}, description="a table with trials and seed")
 
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -135,10 +136,10 @@ class Plan:
         base: Configuration of the keys that are no factors.
         entries: Recordings: the name of each without its replicate, the number of the replicate, and the recording.
         responses: Names of the responses; the first is optimised, the others are reported beside it.
-        log: Names of the responses that are analysed as logarithms.
-        confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
-        code: Hash of the code.
+        file: The design file.
+        tune: Its table of that name.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
+        code: Hash of the code.
     """
 
     name: str
@@ -147,12 +148,10 @@ class Plan:
     options: DesignOptions
     entries: tuple[tuple[str, int, Entry], ...]
     responses: tuple[str, ...]
-    log: tuple[str, ...] = ()
-    calibrate: bool = False
-    confirm: int = 1
-    code: str = ""
-    tune: TuneOptions = field(default_factory=TuneOptions)
-    judges: tuple[tuple[str, int, Entry], ...] = ()
+    file: DesignFile
+    tune: TuneOptions
+    judges: tuple[tuple[str, int, Entry], ...]
+    code: str
 
     def runs(self) -> list[Run]:
         """All runs of the design, recording by recording."""
@@ -166,7 +165,7 @@ class Plan:
         config = configured(self.base, point)
         surfaces = any(RESPONSES[name].needs == "surface" for name in self.responses)
         return [
-            Run(number, point, entry, name, replicate, config, self.calibrate, surfaces, self.code)
+            Run(number, point, entry, name, replicate, config, self.file.calibrate, surfaces, self.code)
             for name, replicate, entry in self.entries
         ]
 
@@ -179,7 +178,7 @@ class Plan:
                 entries.append((name, *same[0]))
             else:
                 last = max(int(entry.parameters["seed"]) for _, entry in same)
-                fresh = [_with_seed(same[0][1], last + 1 + n) for n in range(self.confirm)]
+                fresh = [_with_seed(same[0][1], last + 1 + n) for n in range(self.file.confirm)]
                 entries += [(name, -1 - n, entry) for n, entry in enumerate(fresh)]
         return replace(self, entries=tuple(entries), responses=self.responses[:1]).runs_at(-1, point)
 
@@ -190,7 +189,7 @@ class Plan:
 
     def scale(self, response: str) -> Scale:
         """How a response is analysed."""
-        return Scale(response, response in self.log)
+        return Scale(response, response in self.file.log)
 
     def check(self, max_runs: int = MAX_RUNS) -> None:
         """Check everything that can be known before anything is run."""
@@ -233,20 +232,11 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
         options=checked(DesignOptions, design, "the design"),
         entries=make_entries(file.sequences, folder),
         responses=tuple(dict.fromkeys(file.responses)),
-        log=tuple(file.log),
-        calibrate=file.calibrate,
-        confirm=file.confirm,
-        code=method_hash(),
+        file=file,
         tune=checked(TuneOptions, file.tune, "tune"),
         judges=make_entries(file.judge, folder) if file.judge else (),
+        code=code_hash(without=("cli", "lab/study")),  # what a result depends on
     )
-
-
-def method_hash() -> str:
-    """Hash of all code that a result depends on: all but the commands and the analysis of studies."""
-    from dudmap.lab.benchmark.measure import code_hash
-
-    return code_hash(without=("cli", "lab/study"))
 
 
 def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str, int, Entry], ...]:

@@ -1,7 +1,7 @@
 """Full quadratic response surface (Box and Wilson 1951): fit, optimum, doubts about it, and its confirmation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -14,7 +14,7 @@ from dudmap.lab.study.responses import Scale
 
 Numbers = NDArray[np.float64]
 
-STARTS = 200
+STARTS = 50
 """Starting points of the search for the optimum. In a box a quadratic has few local optima, which few starts miss."""
 
 
@@ -29,7 +29,6 @@ class Surface:
         blocks: Number of columns of the recordings after the P terms.
         observed: (N,) values of the response.
         coded: (N, K) coded values of the runs.
-        labels: (N,) description of every run.
     """
 
     scale: Scale
@@ -38,7 +37,6 @@ class Surface:
     blocks: int
     observed: Numbers
     coded: Numbers
-    labels: list[str]
 
     @property
     def r2(self) -> float:
@@ -115,17 +113,14 @@ def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface
     if rank < terms:
         return (
             f"There is no response surface: the design tells apart {rank} of the {terms} terms of the full quadratic "
-            "model; take three or more levels per factor (central-composite, box-behnken, full-factorial)."
+            "model; take three or more levels per factor (central-composite, full-factorial)."
         )
     if runs <= terms:
         return f"There is no response surface: {runs} runs leave nothing over for {terms} terms."
     observed = data[scale.response].to_numpy(float)
     if np.ptp(observed) == 0:
         return "There is no response surface: the response is the same in all runs."
-    labels = [
-        f"{values_text({f.key: row[f.key] for f in used})} on {row['sequence']}" for row in data.to_dict("records")
-    ]
-    return Surface(scale, used, sm.OLS(observed, exog).fit(), effects.shape[1], observed, coded, labels)
+    return Surface(scale, used, sm.OLS(observed, exog).fit(), effects.shape[1], observed, coded)
 
 
 def values_text(values: dict[str, Any]) -> str:
@@ -162,25 +157,8 @@ def optimum(surface: Surface) -> Optimum:
     return Optimum(tuple(map(float, exact[0])), values, float(surface.predict(exact)[0]))
 
 
-def lack_of_fit(surface: Surface) -> tuple[float, float] | None:
-    """F and p of the quadratic against the saturated model (``anova_lm``); None without repeated points."""
-    import statsmodels.api as sm
-    from statsmodels.stats.anova import anova_lm
-
-    exog = np.asarray(surface.model.model.exog)
-    cells = np.hstack([surface.coded, exog[:, exog.shape[1] - surface.blocks :]]).round(9)
-    _, group = np.unique(cells, axis=0, return_inverse=True)
-    group, count = group.ravel(), int(group.max()) + 1
-    if count in (len(group), exog.shape[1]):
-        return None
-    row = anova_lm(surface.model, sm.OLS(surface.observed, np.eye(count)[group]).fit()).iloc[1]
-    return float(row["F"]), float(row["Pr(>F)"])
-
-
 ENOUGH_EXPLAINED = 0.5
 """Smallest share of the variance that a model must predict (leave-one-out) to be better than a guess."""
-SIGNIFICANT = 0.05
-"""Largest p of a significant lack of fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,37 +219,7 @@ def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
             f"The prediction {scale.text(best.predicted)} {where} ({scale.text(seen)}), from which it differs by less "
             f"than the standard deviation of the residuals of a point, {noise:.3g}{scale.unit}."
         )
-    if (single := carried_by(surface)) is not None:
-        reasons.append(single)
-    fit = lack_of_fit(surface)
-    if fit is not None and fit[1] < SIGNIFICANT:
-        reasons.append(f"The lack of fit is significant (F = {fit[0]:.2f}, p = {fit[1]:.2g}): it is not quadratic.")
     return tuple(reasons)
-
-
-def carried_by(surface: Surface) -> str | None:
-    """The run that carries the model, and the model without it, as a sentence; None if no run does.
-
-    A run carries the model if its Cook's distance is beyond the median of F(P, N - P): it then moves the estimate out
-    of its own 50 % confidence region (Cook 1977).
-    """
-    import statsmodels.api as sm
-    from scipy import stats
-
-    model, scale = surface.model, surface.scale
-    distances, exog = model.get_influence().cooks_distance[0], np.asarray(model.model.exog)
-    worst, limit = int(np.argmax(distances)), float(stats.f.ppf(0.5, exog.shape[1], model.df_resid))
-    rest = np.arange(len(distances)) != worst
-    if distances[worst] <= limit or np.linalg.matrix_rank(exog[rest]) < exog.shape[1] or rest.sum() <= exog.shape[1]:
-        return None
-    observed = surface.observed[rest]
-    smaller = replace(surface, model=sm.OLS(observed, exog[rest]).fit(), observed=observed, coded=surface.coded[rest])
-    best = optimum(smaller)
-    return (
-        f"One value carries the model: {scale.text(surface.observed[worst])} at {surface.labels[worst]}, with a Cook's "
-        f"distance of {distances[worst]:.2f} (limit {limit:.2f}); without it R2 is {smaller.r2:.2f}, and the optimum "
-        f"{scale.text(best.predicted)} at {values_text(best.values)}."
-    )
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def run_study(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS)
     table.to_csv(out / "runs.csv", index=False)
     predicted = predict_optimum(scale.usable(table), plan.factors, scale)
     confirmation = (
-        NOTHING if isinstance(predicted, str) or not plan.confirm else _confirm(plan, predicted, out, conduct)
+        NOTHING if isinstance(predicted, str) or not plan.file.confirm else _confirm(plan, predicted, out, conduct)
     )
     return write_report(plan, table, predicted, confirmation, out)
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError
 from dudmap.lab.synthetic.faults import SensorFaults
-from dudmap.lab.synthetic.kernels import depth_noise as kernels
-from dudmap.lab.synthetic.render import over_rows
 
 Image = NDArray[np.float32]
 TARGET_LEVEL = 110.0
@@ -133,10 +131,6 @@ BANDS = 8
 """Number of vertical bands over the width of the image, assumed."""
 MODES = 6
 """Number of waves of the smooth distortion."""
-PATCHES = 16
-"""Patches over the width of the image from which indirect light comes."""
-WAVE_NUMBER = 2 * np.pi * 80e6 / 299792458.0
-"""Wave number, rad/m, of light modulated with 80 MHz, the middle one of the three frequencies of a Kinect v2."""
 EDGE = (0.04, 0.02)
 """A neighbour is beyond a depth edge if it differs by more than EDGE[0] z + EDGE[1], metres."""
 
@@ -159,14 +153,14 @@ class DepthFaults:
     def __bool__(self) -> bool:
         f = self._faults
         smooth = f.depth_scale_error or f.depth_offset or f.depth_bands or f.depth_distortion
-        return bool(smooth or f.flying_pixels or f.multipath)
+        return bool(smooth or f.flying_pixels)
 
     def truth(self) -> dict[str, Any]:
         """The patterns, with the formula that they belong to."""
         return {
             "depth_model": "z1 = z (1 + depth_scale_error + z/2 sum_k size_k cos(pi (wave_u_k u / W + wave_v_k v / H) "
             "+ phase_k + turn_k z)) + depth_offset; reading = 1 / (1 / z1 + band(u)), band(u) = bands[int(u n / W)]; "
-            "z is the true depth plus the error of flying pixels and multi-path",
+            "z is the true depth plus the error of flying pixels",
             "depth_distortion_columns": ["size", "wave_u", "wave_v", "phase", "turn_per_m"],
             "depth_distortion_modes": self.modes.tolist(),
             "depth_bands_per_m": self.bands.tolist(),
@@ -184,8 +178,6 @@ class DepthFaults:
     def apply(self, exact: NDArray[np.float32], index: int) -> NDArray[np.float32]:
         """Depth (H, W) in metres that the sensor would read without noise, of the true one; 0 stays 0."""
         faults, depth = self._faults, exact
-        if faults.multipath:
-            depth = with_multipath(depth, self._camera, faults.multipath)
         if faults.flying_pixels:
             depth = with_flying_pixels(depth, faults.flying_pixels, np.random.default_rng([self._seed, 7, index]))
         v, u = np.arange(depth.shape[0])[:, None], np.arange(depth.shape[1])
@@ -207,51 +199,3 @@ def with_flying_pixels(depth: NDArray[np.float32], share: float, rng: np.random.
     mixed = (np.abs(gap) > EDGE[0] * depth + EDGE[1]) & (depth > 0) & (rng.random(depth.shape) < share)
     weight = rng.uniform(0.05, 0.95, depth.shape)
     return np.where(mixed, depth + weight * gap, depth).astype(np.float32)
-
-
-def with_multipath(depth: NDArray[np.float32], camera: Camera, reflectance: float) -> NDArray[np.float32]:
-    """Depth (H, W) of a time-of-flight sensor whose light also arrives over one other surface.
-
-    The light source is at the camera. A patch q of area A, irradiated by E_q ~ cos / d_q^2, sends to the point p the
-    share a = (reflectance / pi) (E_q / E_p) cos_q cos_p A / r^2 of p's direct light, over a path longer by
-    L = d_q + r - d_p. The sensor measures the phase of the sum, so that the range is too long by
-    arg(1 + sum a exp(i k L)) / (2 k) with the wave number k of the modulation (Fuchs 2010, "Multipath interference
-    compensation in time-of-flight camera images"). All surfaces are matt and of one reflectance; occlusion between p
-    and q is not tested.
-    """
-    points = camera.backproject(depth)
-    normals = surface_normals(points)
-    stride = max(camera.width // PATCHES, 1)
-    rows, columns = (slice(stride // 2, None, stride),) * 2
-    patches, facing = points[rows, columns].reshape(-1, 3), normals[rows, columns].reshape(-1, 3)
-    distance = np.linalg.norm(patches, axis=1)
-    cosine = -np.sum(patches * facing, axis=1) / np.maximum(distance, 1e-6)
-    good = (distance > 0) & (cosine > 0.1)
-    patches, facing, distance, cosine = patches[good], facing[good], distance[good], cosine[good]
-    # Area of a patch: its solid angle stride^2 z^3 / (fx fy d^3) times d^2 / cosine.
-    area = stride**2 * patches[:, 2] ** 3 / (camera.fx * camera.fy * distance * cosine)
-    table = np.column_stack([patches, facing, distance, area, cosine / distance**2]).astype(np.float32)
-    # The error is smooth on a surface: every second row and column is enough.
-    points, normals = np.ascontiguousarray(points[::2, ::2]), np.ascontiguousarray(normals[::2, ::2])
-    ratio = np.empty(points.shape[:2], dtype=np.float32)
-    gain = np.float32(reflectance / np.pi)
-    over_rows(len(ratio), kernels.multipath, points, normals, table, gain, np.float32(WAVE_NUMBER), ratio)
-    return depth * np.repeat(np.repeat(ratio, 2, axis=0), 2, axis=1)[: depth.shape[0], : depth.shape[1]]
-
-
-def surface_normals(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit normals (H, W, 3) towards the camera of points (H, W, 3), from the nearer neighbour on each axis."""
-    slopes = []
-    for axis in (1, 0):
-        steps = np.diff(points, axis=axis)
-        valid = np.minimum(np.take(points, range(points.shape[axis] - 1), axis)[..., 2],
-                           np.take(points, range(1, points.shape[axis]), axis)[..., 2]) > 0  # fmt: skip
-        steps = np.where(valid[..., None], steps, np.float32(1e3))
-        edge = np.full_like(np.take(steps, [0], axis), 1e3)
-        before, after = np.concatenate([edge, steps], axis), np.concatenate([steps, edge], axis)
-        nearer = np.linalg.norm(before, axis=2) < np.linalg.norm(after, axis=2)
-        slopes.append(np.where(nearer[..., None], before, after))
-    normals = np.cross(slopes[1], slopes[0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    flip = np.sum(normals * points, axis=2, keepdims=True) > 0
-    return np.where(flip, -normals, normals).astype(np.float32)

@@ -54,8 +54,6 @@ class SensorFaults:
         depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern over the image that changes
             with the range and grows with z.
         flying_pixels: Share of the pixels next to a depth edge that read a depth between both surfaces.
-        multipath: Reflectance of all surfaces to the light of a time-of-flight sensor; light that comes over another
-            surface makes corners recede. 0 for no indirect light.
         dropped_frames: Share of the frames that are missing.
         late_frames: Share of the frames taken late, by 10 to 60 % of the frame interval; their stamps say so.
 
@@ -79,7 +77,6 @@ class SensorFaults:
     depth_bands: float = _fault(0.0, 0.0, 0.02)
     depth_distortion: float = _fault(0.0, 0.0, 0.1)
     flying_pixels: float = _fault(0.0, 0.0, 1.0)
-    multipath: float = _fault(0.0, 0.0, 0.95)
     dropped_frames: float = _fault(0.0, 0.0, 0.8)
     late_frames: float = _fault(0.0, 0.0, 1.0)
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.lab.synthetic.scene import Material, Primitive, box, capsule, ellipsoid, pose
+from dudmap.lab.synthetic.rooms import SOLIDS, built
+from dudmap.lab.synthetic.scene import Material, pose
 
 STEP = 0.01
 """Sampling interval of a path, seconds."""
@@ -13,15 +14,9 @@ STEP = 0.01
 
 def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
     """Gaussian smoothing along axis 0 of samples ``STEP`` apart, with constant continuation at the ends."""
-    width = seconds / STEP
-    if width < 0.5:
-        return values
-    reach = int(np.ceil(3 * width))
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
-    weights /= weights.sum()
-    padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
-    columns = [np.convolve(column, weights, mode="valid") for column in padded.reshape(len(padded), -1).T]
-    return np.asarray(np.stack(columns, axis=1), dtype=np.float64).reshape(values.shape)
+    from scipy.ndimage import gaussian_filter1d
+
+    return gaussian_filter1d(values, seconds / STEP, axis=0, mode="nearest", truncate=3.0)
 
 
 class FloorPath:
@@ -123,7 +118,8 @@ def smooth_step(share: float) -> float:
 
 HIP, KNEE, SHOULDER, ELBOW = 0.90, 0.44, 1.40, 0.28  # hip and shoulder above the ground, thigh and upper arm lengths
 SHANK = 0.40
-TORSO, HEAD, ARM_L, ARM_R, FOREARM_L, FOREARM_R, THIGH_L, THIGH_R, SHANK_L, SHANK_R = range(10)
+LIMBS = ("torso", "head", "arm_l", "arm_r", "forearm_l", "forearm_r", "thigh_l", "thigh_r", "shank_l", "shank_r")
+TORSO, HEAD, ARM_L, ARM_R, FOREARM_L, FOREARM_R, THIGH_L, THIGH_R, SHANK_L, SHANK_R = range(len(LIMBS))
 
 OUTFITS = (
     ("stripes", (1.0, 1.0, 1.0), (0.45, 0.55, 0.85)),
@@ -145,36 +141,16 @@ class Figure:
     def __init__(self, rng: np.random.Generator, outfit: int, size: float = 1.0, stride: float = 1.35) -> None:
         pattern, shirt_tint, trouser_tint = OUTFITS[outfit % len(OUTFITS)]
         shift = tuple(rng.random(2))
-        shirt = Material(pattern, (1.7 / size, 1.7 / size), shift, shirt_tint)
-        trousers = Material("denim", (1.5 / size, 1.5 / size), shift, trouser_tint)
-        skin = Material("skin", (3.0 / size, 3.0 / size), shift)
-        hair = Material("denim", (3.0 / size, 3.0 / size), shift, (0.35, 0.25, 0.18))
-        shoe = Material("denim", (2.0 / size, 2.0 / size), shift, (0.25, 0.22, 0.22))
+        rows = SOLIDS["person"]
+        materials = {name: Material(offset=shift, **given) for name, given in rows["materials"].items()}
+        materials["shirt"] = Material(pattern, (1.7, 1.7), shift, shirt_tint)
+        materials["trousers"] = Material("denim", (1.5, 1.5), shift, trouser_tint)
+        parts = [(row["limb"], row) for row in rows["body"]]
+        parts += [(f"{row['limb']}_{side}", row) for limb in ("arm", "leg") for side in "lr" for row in rows[limb]]
         self.size, self.stride = size, stride * size
-        parts: list[tuple[int, Primitive]] = [
-            (TORSO, ellipsoid((0, 0, HIP + 0.04), (0.115, 0.165, 0.13), trousers)),
-            (TORSO, ellipsoid((0, 0, HIP + 0.33), (0.125, 0.185, 0.27), shirt)),
-            (TORSO, capsule((0, -0.13, SHOULDER - 0.01), (0, 0.13, SHOULDER - 0.01), 0.075, shirt)),
-            (TORSO, capsule((0, 0, SHOULDER), (0.01, 0, SHOULDER + 0.12), 0.05, skin)),
-            (HEAD, ellipsoid((0.02, 0, SHOULDER + 0.21), (0.095, 0.075, 0.115), skin)),
-            (HEAD, ellipsoid((-0.005, 0, SHOULDER + 0.24), (0.10, 0.082, 0.10), hair)),
-            (HEAD, ellipsoid((0.115, 0, SHOULDER + 0.20), (0.02, 0.014, 0.022), skin)),
-        ]
-        for arm, forearm in ((ARM_L, FOREARM_L), (ARM_R, FOREARM_R)):
-            parts += [
-                (arm, capsule((0, 0, 0), (0, 0, -ELBOW), 0.046, shirt)),
-                (forearm, capsule((0, 0, 0), (0, 0, -0.23), 0.036, skin)),
-                (forearm, ellipsoid((0, 0, -0.31), (0.03, 0.022, 0.075), skin)),
-            ]
-        for thigh, shank in ((THIGH_L, SHANK_L), (THIGH_R, SHANK_R)):
-            parts += [
-                (thigh, capsule((0, 0, 0), (0, 0, -KNEE), 0.075, trousers)),
-                (shank, capsule((0, 0, 0), (0, 0, -SHANK), 0.052, trousers)),
-                (shank, box((0.06, 0, -SHANK - 0.025), (0.25, 0.09, 0.07), shoe)),
-            ]
-        scale = np.diag([size, size, size, 1.0])
-        self.limbs = np.array([limb for limb, _ in parts])
-        self.primitives = [_scaled(primitive, scale, size) for _, primitive in parts]
+        self.limbs = np.array([LIMBS.index(limb) for limb, _ in parts])
+        solids = built([{key: row[key] for key in row if key != "limb"} for _, row in parts], materials)
+        self.primitives = [solid.scaled(size) for solid in solids]
 
     def poses(self, T_world_person: NDArray[np.float64], walked: float, carrying: float = 0.0) -> NDArray[np.float64]:
         """Pose T_world_limb (P, 4, 4) of every solid after ``walked`` metres; ``carrying`` in [0, 1] lifts the arms."""
@@ -200,10 +176,3 @@ class Figure:
         limbs[:, 2, 3] -= min(lowest)  # the lower foot stands on the ground
         limbs[:, :3, 3] *= self.size
         return (T_world_person @ limbs)[self.limbs]
-
-
-def _scaled(primitive: Primitive, scale: NDArray[np.float64], size: float) -> Primitive:
-    T = primitive.T_body_primitive.copy()
-    T[:3, 3] = (scale @ np.append(T[:3, 3], 1.0))[:3]
-    hx, hy, hz = primitive.half
-    return Primitive(primitive.kind, (hx * size, hy * size, hz * size), T, primitive.material)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.lab.data import find
 from dudmap.lab.synthetic.motion import Figure, FloorPath, crossing, smooth_step
-from dudmap.lab.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
+from dudmap.lab.synthetic.rooms import SOLIDS, built
+from dudmap.lab.synthetic.scene import Material, Primitive, Scene, pose
 
 Matrix = NDArray[np.float64]
 MOVING_SPEED = 0.01
@@ -158,6 +159,12 @@ def _wanderer(staging: Staging) -> list[SyntheticMover]:
     return [person_on(path, _figure(staging, 3, speed), scene.ground)]
 
 
+def _solids(name: str, size: float) -> list[Primitive]:
+    """Solids of a mover of ``solids.toml``, so many times as large as in life."""
+    materials = {key: Material(**given) for key, given in SOLIDS["materials"].items()}
+    return [solid.scaled(size) for solid in built(SOLIDS["movers"][name], materials)]
+
+
 def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
     """Person who brings a box, puts it down and leaves; or who enters, takes a box and leaves with it."""
     scene, speed, size = staging.scene, staging.pace(1.0), staging.scene.mover_scale
@@ -191,10 +198,8 @@ def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
         start = pose((*stand, scene.ground), yaw) @ pose((0.40 * size, 0, 0.92 * size))
         return se3.interpolate(start, scene.rest, share(t))
 
-    x, y, z = 0.36 * size, 0.30 * size, 0.28 * size
-    carton = [box((0, 0, z / 2), (x, y, z), Material("cardboard", (1.9 / size, 1.9 / size)))]
     name = "carried_box" if put_down else "removed_box"
-    return [person, rigid(name, carton, reference, lambda t: put_down or t < times[-1])]
+    return [person, rigid(name, _solids("carton", size), reference, lambda t: put_down or t < times[-1])]
 
 
 def _ball(staging: Staging) -> list[SyntheticMover]:
@@ -205,8 +210,7 @@ def _ball(staging: Staging) -> list[SyntheticMover]:
     def reference(t: float) -> Matrix:
         return path.pose(t, scene.ground + radius) @ pose(pitch=float(np.degrees(path.at(t)[2] / radius)))
 
-    skin = Material("checks", (1.5 / size, 1.5 / size), tint=(1.2, 0.7, 0.5))
-    return [rigid("ball", [ellipsoid((0, 0, 0), (radius,) * 3, skin)], reference, path.present)]
+    return [rigid("ball", _solids("ball", size), reference, path.present)]
 
 
 def _balloon(staging: Staging) -> list[SyntheticMover]:
@@ -219,23 +223,12 @@ def _balloon(staging: Staging) -> list[SyntheticMover]:
         height = scene.ground + size * (1.35 + 0.15 * np.sin(1.7 * t))
         return pose((*position, height), 25 * np.sin(0.9 * t), 6 * np.sin(2.3 * t))
 
-    skin = Material("stripes", (1.2 / size, 1.2 / size), tint=(1.2, 0.6, 0.7))
-    solids = [
-        ellipsoid((0, 0, 0), (0.2 * size, 0.2 * size, 0.25 * size), skin),
-        capsule((0, 0, -0.25 * size), (0, 0, -0.7 * size), 0.004 * size, Material("plain")),
-    ]
-    return [rigid("balloon", solids, reference, path.present)]
+    return [rigid("balloon", _solids("balloon", size), reference, path.present)]
 
 
 def _cart(path: FloorPath, scene: Scene, name: str) -> list[SyntheticMover]:
-    size, rubber = scene.mover_scale, Material("denim", (3, 3), tint=(0.25, 0.25, 0.25))
-    body = box((0, 0, 0.38 * size), (0.5 * size, 0.4 * size, 0.6 * size), Material("books", (1.6 / size, 1.6 / size)))
-    wheels = [
-        cylinder((x * size, y * size - 0.02 * size, 0.06 * size), (x * size, y * size + 0.02 * size, 0.06 * size),
-                 0.06 * size, rubber)
-        for x in (-0.18, 0.18) for y in (-0.15, 0.15)
-    ]  # fmt: skip
-    return [rigid(name, [body, *wheels], lambda t: path.pose(t, scene.ground), path.present)]
+    solids = _solids("cart", scene.mover_scale)
+    return [rigid(name, solids, lambda t: path.pose(t, scene.ground), path.present)]
 
 
 def _creeper(staging: Staging) -> list[SyntheticMover]:
@@ -269,25 +262,16 @@ def _starting(staging: Staging) -> list[SyntheticMover]:
 def _door(staging: Staging) -> list[SyntheticMover]:
     """Door leaf that opens, rests and closes again."""
     scene, size = staging.scene, staging.scene.mover_scale
-    width, height, angle = 0.8 * size, 1.95 * size, np.radians(95.0)
-    swing = angle * width / staging.pace(0.5)
+    angle = np.radians(95.0)
+    swing = angle * 0.8 * size / staging.pace(0.5)
     begin = -0.3 * swing if staging.start_dynamic else 1.0
-    leaf = Material("wood", (0.9 / size, 0.7 / size), tint=(0.75, 0.85, 0.95))
-    handle = Material("plain", tint=(0.9, 0.8, 0.4))
-    solids = [
-        box((width / 2, 0, height / 2), (width, 0.04 * size, height), leaf),
-        cylinder((0, 0, 0), (0, 0, height), 0.035 * size, handle),
-        capsule(
-            (width * 0.9, -0.05 * size, 1.0 * size), (width * 0.75, -0.05 * size, 1.0 * size), 0.012 * size, handle
-        ),
-    ]
 
     def reference(t: float) -> Matrix:
         phase = (t - begin) % (2 * swing + 2.0) if t > begin else 0.0
         opened = smooth_step(phase / swing) - smooth_step((phase - swing - 1.0) / swing)
         return scene.hinge @ pose(yaw=-float(np.degrees(angle)) * opened)
 
-    return [rigid("door", solids, reference)]
+    return [rigid("door", _solids("door", size), reference)]
 
 
 MOVERS: dict[str, Callable[[Staging], list[SyntheticMover]]] = {

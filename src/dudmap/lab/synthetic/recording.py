@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, with_faces
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import FrameError
-from dudmap.io.exporting.mesh_editing import with_faces
 from dudmap.lab.synthetic.color_camera import ColorCamera, DepthFaults, compressed, exposure_gains, white_balance
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover, placed
@@ -139,11 +138,9 @@ class SyntheticSequence:
             if mover.present(t)
         ]
 
-    def static_twin(self, since: float = -np.inf) -> "SyntheticSequence":
-        """Recording with the same camera path and sensor noise, but without movers, or without them from a time on."""
-        movers = [replace(m, present=lambda t, m=m: t < since and m.present(t)) for m in self._movers]
-        kept, parameters = (movers, self.parameters) if since > -np.inf else ([], self.parameters | {"movers": []})
-        return self._like(self.scene, kept, parameters)
+    def static_twin(self) -> "SyntheticSequence":
+        """Recording with the same camera path and sensor noise, but without movers."""
+        return self._like(self.scene, [], self.parameters | {"movers": []})
 
     def in_scene(self, scene: Scene) -> "SyntheticSequence":
         """Recording with the same camera path, movers and sensor noise in another scene."""

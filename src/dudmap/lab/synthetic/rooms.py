@@ -5,7 +5,7 @@ other measures, and a material of the scene or of the furniture. A row with ``re
 several, each with one of these numbers in place of every "*".
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -35,6 +35,10 @@ MATERIALS = {"wood": WOOD, "dark wood": DARK_WOOD, "metal": METAL, "cardboard": 
 """Materials that every scene knows by name."""
 
 
+SOLIDS = tables("synthetic/solids.toml")
+"""Rows of furniture and of what moves."""
+
+
 def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
     """Table of the given width, depth and height on four legs."""
     (x, y), (w, d, h) = center, size
@@ -48,17 +52,8 @@ def table(center: tuple[float, float], size: tuple[float, float, float], materia
 
 def chair(center: tuple[float, float], yaw: float, material: Material) -> list[Primitive]:
     """Chair with a cushion, its back towards +y before the rotation by ``yaw`` degrees."""
-    parts = [
-        box((0, 0, 0.45), (0.44, 0.44, 0.05), Material("plaid", (2.3, 2.3))),
-        box((0, 0.2, 0.75), (0.42, 0.04, 0.3), material),
-    ]
-    parts += [
-        cylinder((sx * 0.19, sy * 0.19, 0), (sx * 0.19, sy * 0.19, 0.43), 0.02, METAL)
-        for sx in (-1, 1)
-        for sy in (-1, 1)
-    ]
-    parts += [cylinder((sx * 0.17, 0.2, 0.45), (sx * 0.17, 0.2, 0.75), 0.015, METAL) for sx in (-1, 1)]
-    return [p.moved(pose((*center, 0), yaw)) for p in parts]
+    materials = MATERIALS | {"back": material, "cushion": Material("plaid", (2.3, 2.3))}
+    return [p.moved(pose((*center, 0), yaw)) for p in built(SOLIDS["furniture"]["chair"], materials)]
 
 
 def poster(
@@ -110,9 +105,9 @@ SCENES = tables("synthetic/scenes.toml")
 """Rows of the scenes by name."""
 
 
-def build_scene(name: str, scenes: Mapping[str, Any] = SCENES) -> Scene:
-    """Scene of a name from rows of scenes."""
-    row = dict(find(name, scenes, "scene"))
+def build_scene(name: str) -> Scene:
+    """Scene of a name."""
+    row = dict(find(name, SCENES, "scene"))
     if "painted" in row:
         scene = build_scene(row["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]
@@ -121,13 +116,18 @@ def build_scene(name: str, scenes: Mapping[str, Any] = SCENES) -> Scene:
     materials = MATERIALS | {key: Material(**given) for key, given in row.pop("materials").items()}
     return Scene(
         name=name,
-        primitives=[solid for given in row.pop("solids") for solid in _solids(given, materials)],
+        primitives=built(row.pop("solids"), materials),
         home=look_at(**row.pop("home")),
         rest=pose(**row.pop("rest")),
         hinge=pose(**row.pop("hinge")),
         lights=tuple(Light(**light) for light in row.pop("lights")),
         **row,
     )
+
+
+def built(rows: Iterable[dict[str, Any]], materials: dict[str, Material]) -> list[Primitive]:
+    """Solids of rows, whose materials have these names."""
+    return [solid for row in rows for solid in _solids(row, materials)]
 
 
 def _solids(row: dict[str, Any], materials: dict[str, Material]) -> Iterator[Primitive]:

@@ -68,6 +68,13 @@ class Primitive:
         """Primitive after the rigid motion ``T`` (4, 4)."""
         return replace(self, T_body_primitive=T @ self.T_body_primitive)
 
+    def scaled(self, size: float) -> "Primitive":
+        """Primitive of a body that is ``size`` times as large, and its texture with it."""
+        T, (hx, hy, hz), (across, down) = self.T_body_primitive.copy(), self.half, self.material.scale
+        T[:3, 3] *= size
+        material = replace(self.material, scale=(across / size, down / size))
+        return Primitive(self.kind, (hx * size, hy * size, hz * size), T, material)
+
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (N,) in metres of points (N, 3) in the body frame; negative inside.
 

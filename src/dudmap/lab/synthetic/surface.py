@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh
-from dudmap.io.exporting.mesh_editing import with_faces
+from dudmap.core.geometry.mesh import Mesh, with_faces
 from dudmap.lab.synthetic.kernels import raytracing as kernels
 from dudmap.lab.synthetic.render import over_rows
 from dudmap.lab.synthetic.scene import BOX, CAPSULE, CYLINDER, ELLIPSOID, TORUS, Primitive

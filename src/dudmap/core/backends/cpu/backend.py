@@ -15,11 +15,12 @@ from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.mirror import Mirror, on_host
 from dudmap.core.backends.parameters import (
     BLOCK,
+    BlockVisit,
     DepthTiles,
     DepthView,
-    FreeSpace,
     FusedBlocks,
     FusionParameters,
+    LevelImage,
     MapSample,
     NormalEquations,
     RegistrationParameters,
@@ -70,20 +71,11 @@ class CpuBackend:
         return TouchedBlocks(cells[once], depth, weights, tiles)
 
     def fuse(
-        self,
-        grid: VoxelGrid,
-        view: DepthView,
-        touched: TouchedBlocks,
-        candidates: NDArray[np.int32],
-        fused: NDArray[np.uint8],
-        turn: int,
-        count: int,
-        free_space: FreeSpace | None,
-        parameters: FusionParameters,
+        self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
         mirrors = grid.geometry, grid.colors
-        blocks, *_ = self._fused(grid.on_host(), view, touched, candidates, fused, turn, count, free_space, parameters)
+        blocks, *_ = self._fused(grid.on_host(), view, touched, visit, parameters)
         for mirror in mirrors:
             if isinstance(mirror, Mirror):
                 mirror.wrote(blocks.slots)
@@ -94,11 +86,7 @@ class CpuBackend:
         grid: VoxelGrid,
         view: DepthView,
         touched: TouchedBlocks,
-        candidates: NDArray[np.int32],
-        fused: NDArray[np.uint8],
-        turn: int,
-        count: int,
-        free_space: FreeSpace | None,
+        visit: BlockVisit,
         parameters: FusionParameters,
         *,
         averages: bool = True,
@@ -108,6 +96,7 @@ class CpuBackend:
 
         Without ``averages`` the voxels, which another device then changes, stay as they are.
         """
+        candidates, fused, turn, count, free_space = visit
         n, parity, after = len(candidates), *((-1, 0) if free_space is None else free_space)
         slots, repeats, occupied = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.int32)
         visible, counts = np.zeros(BANDS + 1, dtype=np.int64), np.zeros(BANDS, dtype=np.int64)
@@ -135,17 +124,14 @@ class CpuBackend:
     def register(
         self,
         grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
+        image: LevelImage,
         T_world_camera: NDArray[np.float64],
         first: NormalEquations | None,
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
         """See ``Backend.register``."""
-        height, width = depth.shape
+        height, width = image.depth.shape
         rows = -(-PIXELS_PER_BAND // width)
         num_bands, limit = -(-height // rows), rules.limit
         if (num_bands, limit) not in self._descents:
@@ -157,7 +143,7 @@ class CpuBackend:
             known[registration.SYMMETRIC], known[21:27], known[registration.COST] = first.H, first.b, first.cost
         residuals = np.empty((2, 2, height, width), dtype=np.float32)
         T, sums, buffer, count, settled = run_team(
-            registration.descend, num_bands, rows, depth, intensity, weights, intrinsics, on_host(grid.window),
+            registration.descend, num_bands, rows, *image, on_host(grid.window),
             grid.shape, grid.origin, on_host(grid.geometry).reshape(-1), grid.voxel_size, grid.sdf_unit,
             single(parameters), np.ascontiguousarray(T_world_camera), first is not None, known, rules, poses, buffers,
             residuals, sums,
@@ -166,15 +152,10 @@ class CpuBackend:
         return Descent(T, equations, count, settled)
 
     def sample(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        free_after: int,
+        self, grid: VoxelGrid, image: LevelImage, T_grid_camera: NDArray[np.float32], free_after: int
     ) -> MapSample:
         """See ``Backend.sample``."""
+        depth, intensity, _, intrinsics = image
         shape, window, geometry = depth.shape, on_host(grid.window), on_host(grid.geometry).reshape(-1)
         out = MapSample(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
         rows = max(8, -(-shape[0] // 8))

@@ -1,9 +1,12 @@
-"""Loop over the pixels of a depth image: where each lies in the image of another camera, taken at another time."""
+"""Loop over the pixels of a depth image: what each shows in the image of another camera, taken at another time.
+
+A row is worked through in stages, see ``registration.py``.
+"""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dudmap.core.backends.parameters import ColorProjection
+from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
+from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import elements, project, ray, transform
 
@@ -26,80 +29,130 @@ def _filled(source, fallback, target):
         target[u] = last
 
 
-@kernel
-def color_pixels_rows(
-    row_start, row_stop, depth, intrinsics, place, speed, bend, color_intrinsics, distortion, offset, readout, height,
-    fallback, us, vs,
-):  # fmt: skip
-    """Colour pixel of each depth pixel of rows ``row_start`` to ``row_stop``.
+@scalar
+def color_places(v, depth, intrinsics, projection, size, first, across, down):
+    """Where the pixels of a row of a depth image lie in the colour image, which is continued at its borders.
 
     A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera, the
     second-order expansion of T_color_depth exp(-tau xi) X. The row gives tau, and tau the row: a step of a fixed point
     from the row of the depth image on, which contracts by readout times the image speed over the height: with 20 rows
-    between the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels are left. Pixels without a reading take the depth of
-    a neighbour in their row.
+    between the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels are left.
 
     Args:
-        row_start, row_stop: Rows of the band.
-        depth: (h, w) float32, metres, 0 = none.
+        v: Row.
+        depth: (w,) float32 of the row, metres.
         intrinsics: (4,) float32 of the depth camera.
-        place, speed, bend: (3, 4) float32.
-        color_intrinsics: (4,) float32 of the colour camera.
-        distortion: (5,) float32 k1, k2, p1, p2, k3 of the colour camera (thesis eq. 3.88).
-        offset: Time of the middle row of the colour image minus that of the depth image, s.
-        readout: Time from the first to the last row of the colour image, s.
-        height: Rows of the colour image.
-        fallback: Depth of rows without a reading, metres.
-        us, vs: (row_stop - row_start, w) float32 out, pixel coordinates in the colour image.
+        projection: ColorProjection.
+        size: Heights of the depth image and of the colour image, width of the colour image.
+        first: (w,) int32 out, number of the upper left of the four colour pixels around the point.
+        across, down: (w,) float32 out, its place between them, 0 to 1.
     """
-    p, s, b = elements(place), elements(speed), elements(bend)
-    w = depth.shape[1]
-    filled = np.empty(w, np.float32)
     zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-    fx, fy, cx, cy = color_intrinsics[0], color_intrinsics[1], color_intrinsics[2], color_intrinsics[3]
-    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
+    p, s, b = elements(projection.place), elements(projection.speed), elements(projection.bend)
+    camera, lens = projection.intrinsics, projection.distortion
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    k1, k2, p1, p2, k3 = lens[0], lens[1], lens[2], lens[3], lens[4]
+    offset, readout, height = np.float32(projection.offset), np.float32(projection.readout), np.float32(size[1])
+    last_u, last_v, stride = np.float32(size[2] - 1), np.float32(size[1] - 1), np.int32(size[2])
     by_height, by_fx = one / height, one / intrinsics[0]
-    for v in range(row_start, row_stop):
+    y_ray = ray(v, intrinsics[3], intrinsics[1])
+    guess = offset + readout * ((np.float32(v) + half) / np.float32(size[0]) - half)
+    c_guess = half * guess * guess
+    for u in range(depth.size):
+        z = depth[u]
+        x, y = (np.float32(u) - intrinsics[2]) * by_fx * z, y_ray * z
+        x0, y0, z0 = transform(p, x, y, z)
+        x1, y1, z1 = transform(s, x, y, z)
+        x2, y2, z2 = transform(b, x, y, z)
+        row = project(y0 - guess * y1 + c_guess * y2, one / max(z0 - guess * z1 + c_guess * z2, NEAREST), fy, cy)
+        tau = offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
+        c = half * tau * tau
+        by_z = one / max(z0 - tau * z1 + c * z2, NEAREST)
+        a, d = (x0 - tau * x1 + c * x2) * by_z, (y0 - tau * y1 + c * y2) * by_z
+        r2 = a * a + d * d
+        radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
+        to_u = (a * radial + two * p1 * a * d + p2 * (r2 + two * a * a)) * fx + cx
+        to_v = (d * radial + p1 * (r2 + two * d * d) + two * p2 * a * d) * fy + cy
+        to_u, to_v = min(to_u if to_u > zero else zero, last_u), min(to_v if to_v > zero else zero, last_v)
+        left, top = min(np.floor(to_u), last_u - one), min(np.floor(to_v), last_v - one)
+        first[u] = np.int32(np.int32(top) * stride + np.int32(left))
+        across[u], down[u] = to_u - left, to_v - top
+
+
+@scalar
+def blended(a, b, c, d, across, down):
+    """Value between four pixels, the upper two first, at a place from 0 to 1 across and down."""
+    upper, lower = a + across * (b - a), c + across * (d - c)
+    return upper + down * (lower - upper)
+
+
+@scalar
+def blended_byte(a, b, c, d, shift, across, down):
+    """The same of one byte of four words, rounded."""
+    byte = np.int32(255)
+    value = blended(
+        np.float32((a >> shift) & byte), np.float32((b >> shift) & byte), np.float32((c >> shift) & byte),
+        np.float32((d >> shift) & byte), across, down,
+    )  # fmt: skip
+    return np.int32(value + np.float32(0.5))
+
+
+@scalar
+def register_rows(start, stop, depth, intrinsics, projection, fallback, size, words, shades, colors):
+    """Colours, or intensities, of rows ``start`` to ``stop``; see ``register``."""
+    w, next_row = depth.shape[1], np.uintp(size[2])
+    filled, across, down = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    first, around = np.empty(w, np.int32), np.empty((4, w), np.int32)
+    values = around.view(np.float32)
+    for v in range(start, stop):
         _filled(depth[v], fallback, filled)
-        to_u, to_v = us[v - row_start], vs[v - row_start]
-        y_ray = ray(v, intrinsics[3], intrinsics[1])
-        guess = offset + readout * ((np.float32(v) + half) / np.float32(depth.shape[0]) - half)
-        c_guess = half * guess * guess
+        color_places(v, filled, intrinsics, projection, size, first, across, down)
         for u in range(w):
-            z = filled[u]
-            x, y = (np.float32(u) - intrinsics[2]) * by_fx * z, y_ray * z
-            x0, y0, z0 = transform(p, x, y, z)
-            x1, y1, z1 = transform(s, x, y, z)
-            x2, y2, z2 = transform(b, x, y, z)
-            row = project(y0 - guess * y1 + c_guess * y2, one / max(z0 - guess * z1 + c_guess * z2, NEAREST), fy, cy)
-            tau = offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
-            c = half * tau * tau
-            by_z = one / max(z0 - tau * z1 + c * z2, NEAREST)
-            a, d = (x0 - tau * x1 + c * x2) * by_z, (y0 - tau * y1 + c * y2) * by_z
-            r2 = a * a + d * d
-            radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
-            to_u[u] = (a * radial + two * p1 * a * d + p2 * (r2 + two * a * a)) * fx + cx
-            to_v[u] = (d * radial + p1 * (r2 + two * d * d) + two * p2 * a * d) * fy + cy
+            n = np.uintp(first[u])
+            around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
+            n += next_row
+            around[2, u], around[3, u] = words[n], words[n + np.uintp(1)]
+        if shades.size > 0:
+            row = shades[v]
+            for u in range(w):
+                row[u] = blended(values[0, u], values[1, u], values[2, u], values[3, u], across[u], down[u])
+            continue
+        for u in range(w):
+            a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
+            red, green = (
+                blended_byte(a, b, c, d, 0, across[u], down[u]), blended_byte(a, b, c, d, 8, across[u], down[u])
+            )  # fmt: skip
+            first[u] = red | green << 8 | blended_byte(a, b, c, d, 16, across[u], down[u]) << 16
+        target = colors[v].reshape(-1)
+        for u in range(w):
+            k, word = np.uintp(3 * u), first[u]
+            target[k], target[k + np.uintp(1)], target[k + np.uintp(2)] = (
+                np.uint8(word), np.uint8(word >> 8), np.uint8(word >> 16)
+            )  # fmt: skip
 
 
-def color_pixels(
-    depth: NDArray[np.float32],
-    intrinsics: NDArray[np.float32],
-    projection: ColorProjection,
-    fallback: float,
-    start: int,
-    stop: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
+@kernel
+def register(leads, team, rows, depth, intrinsics, projection, fallback, size, words, shades, colors):
+    """Interpolated colour or intensity of each pixel of a depth image, for a team of threads (``teams.py``).
 
     Args:
+        leads, team: As for ``run_team``.
+        rows: Rows of a band.
         depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
-        intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
-        projection: Of the colour camera.
-        fallback: Depth of rows without a reading, metres.
-        start, stop: First row, and that after the last.
+        intrinsics, projection, size: As for ``color_places``.
+        fallback: Float32, depth of rows without a reading, metres.
+        words: (h * w,) int32 of the colour image: red, green and blue in the lowest bytes, or the bits of a float32.
+        shades: (H, W) float32 out; of size 0 where the words are colours.
+        colors: (H, W, 3) uint8 out; of size 0 where they are not.
     """
-    us, vs = np.empty((2, stop - start, depth.shape[1]), dtype=np.float32)
-    arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
-    color_pixels_rows(start, stop, depth, intrinsics, *arrays, *numbers, us, vs)
-    return us, vs
+    wide_vectors()
+    num_bands = -(-depth.shape[0] // rows)
+    band, _ = first_band(leads, team, 0, num_bands)
+    while band != NO_BAND:
+        start, stop = band * rows, min(band * rows + rows, depth.shape[0])
+        register_rows(start, stop, depth, intrinsics, projection, fallback, size, words, shades, colors)
+        done(team)
+        band, _ = take(team, num_bands)
+    if leads:
+        wait_for_all(team, num_bands)
+        finish(team)

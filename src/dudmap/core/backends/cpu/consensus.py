@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, run_team, take, wait_for_all
-from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
+from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.geometry.se3 import SMALL
 
 BANDS = 12
@@ -308,16 +308,29 @@ def neighbour_votes(
     order = np.argsort(group_of, kind="stable")
     first = np.searchsorted(group_of[order], np.arange(int(group_of.max(initial=0)) + 2))
     by_axis, moves, votes = np.ascontiguousarray(points[order].T), moving[order], np.empty(len(queries), np.int64)
-    run_bands(
-        lambda start, stop: _count_votes(start, stop, queries, groups, by_axis, first, moves, neighbours, votes),
-        bands(len(queries), VOTED),
-    )
+    run_team(count_votes, -(-len(queries) // VOTED), queries, groups, by_axis, first, moves, neighbours, votes)
     return votes
 
 
 @kernel
-def _count_votes(start, stop, queries, groups, points, first, moving, neighbours, votes):
-    """Votes of the queries ``start`` to ``stop``; points (3, n) are sorted by group, of which each begins at ``first``.
+def count_votes(leads, team, queries, groups, points, first, moving, neighbours, votes):
+    """Loop of ``neighbour_votes``, for a team of threads; points (3, n) are sorted by group, of which each begins at
+    ``first``."""
+    num_bands = -(-len(queries) // VOTED)
+    band, _ = first_band(leads, team, 0, num_bands)
+    while band != NO_BAND:
+        start, stop = band * VOTED, min(band * VOTED + VOTED, len(queries))
+        vote(start, stop, queries, groups, points, first, moving, neighbours, votes)
+        done(team)
+        band, _ = take(team, num_bands)
+    if leads:
+        wait_for_all(team, num_bands)
+        finish(team)
+
+
+@scalar
+def vote(start, stop, queries, groups, points, first, moving, neighbours, votes):
+    """Votes of the queries ``start`` to ``stop``.
 
     The voters of the query before, a neighbour in the image, give a bound of the distances of this one's.
     """

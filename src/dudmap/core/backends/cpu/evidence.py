@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dudmap.config import reading_sigma
 from dudmap.core.backends.cpu.labeling import fit_mixture, grow_regions, mean_field, opened
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
-from dudmap.core.backends.threads import exact, exact_scalar
+from dudmap.core.backends.threads import exact, exact_scalar, written_out
 
 BINS = 128
 """Bins of the histogram of normalised residuals."""
@@ -79,11 +80,13 @@ class RegionRules(NamedTuple):
     regions: bool
 
 
+exact_sigma = written_out(reading_sigma)
+"""Of a reading, rounded as the kernel rounds that it is written out in."""
+
+
 @exact_scalar
-def static_sigma(z: Any, base: Any, scale: Any, map_variance: Any) -> Any:
-    """Standard deviation of the distance of a static point at depth z, metres: of the reading (``reading_sigma``) and
-    of the map."""
-    sigma = base + scale * (z * z)
+def static_sigma(sigma: Any, map_variance: Any) -> Any:
+    """Standard deviation of the distance of a static point, metres: of the reading, ``sigma``, and of the map."""
     return np.sqrt(sigma * sigma + map_variance)
 
 
@@ -143,7 +146,7 @@ def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tol
     for v in range(h):
         for u in range(w):
             z = depth[v, u]
-            s = static_sigma(z, noise.base, noise.scale, noise.map_variance)
+            s = static_sigma(exact_sigma(z, noise.base, noise.scale), noise.map_variance)
             sigma[v, u], tolerance[v, u] = s, edge_tolerance(s, z, noise.edge_sigmas, noise.edge_slope)
             readings += z > ZERO
             unknown += (z > ZERO) & (occupancy[v, u] == UNKNOWN)
@@ -187,17 +190,18 @@ def moving_pixels(
                 odds[v, u] = surface_log_odds(distance[v, u], s, least, offset, slope, limit)
             if rules.free_space and (occupancy[v, u] == FREE or (seen and seen_free[v, u])):
                 odds[v, u] = -limit
-    probability[:] = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
+    smoothed = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
     for v in range(h):
         for u in range(w):
+            probability[v, u] = smoothed[v, u]
             dynamic[v, u] = probability[v, u] < np.float32(0.5) and depth[v, u] > ZERO
     if not rules.regions:
         return
-    seeds[:] = opened(dynamic, rules.half_seam)
+    wide = opened(dynamic, rules.half_seam)
     open_pixels = np.empty((h, w), np.bool_)
     for v in range(h):
         for u in range(w):
-            seeds[v, u] = seeds[v, u] or (dynamic[v, u] and occupancy[v, u] == FREE)
+            seeds[v, u] = wide[v, u] or (dynamic[v, u] and occupancy[v, u] == FREE)
             open_pixels[v, u] = odds[v, u] < ONE
     regions, count = grow_regions(seeds, open_pixels, depth, tolerance)
     area, seeded = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.cpu.evidence import edge_tolerance, static_sigma
+from dudmap.core.backends.cpu.evidence import edge_tolerance, exact_sigma
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import exact
@@ -33,10 +33,10 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
     for v in range(h):
         for u in range(w):
             z, step = depth[v, u], abs(gap[v, u])
-            agreeing += step < AGREEING_SIGMAS * (noise.base + noise.scale * (z * z))
+            sigma = exact_sigma(z, noise.base, noise.scale)
+            agreeing += step < AGREEING_SIGMAS * sigma
             readings += z != ZERO
             seen += np.isfinite(step)
-            sigma = static_sigma(z, noise.base, noise.scale, ZERO)
             tolerance = edge_tolerance(sigma, z, noise.edge_sigmas, noise.edge_slope)
             common[v, u] = marks[v, u] == 0 and not moving[v, u] and step < tolerance
             count += common[v, u]

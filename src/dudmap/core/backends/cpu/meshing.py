@@ -9,7 +9,7 @@ global array is frozen into the compiled code, and numba's cache does not notice
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.links import links
+from dudmap.core.backends.cpu.surroundings import surrounded
 from dudmap.core.backends.cpu.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.core.backends.parameters import MeshParameters
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
@@ -25,7 +25,7 @@ def _corner_words(geometry, near, row, words):
     """Words (9, 9, 9) of a block's voxels and of those one step beyond its upper sides; 0 where there is no block."""
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
-        slot = near[row, m]
+        slot = near[row, 13 + 9 * dx + 3 * dy + dz]
         nx, ny, nz = (1 if dx else 8), (1 if dy else 8), (1 if dz else 8)
         for i in range(nx):
             for j in range(ny):
@@ -92,7 +92,7 @@ def _edge(row, n, corner, near, row_of):
     """Row of the block, and number there, of the voxel at a corner of cell ``n`` of the block in ``row``."""
     i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
     if (i | j | k) & 8:
-        row = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (k >> 3)]])
+        row = np.int64(row_of[near[row, 13 + 9 * (i >> 3) + 3 * (j >> 3) + (k >> 3)]])
     return row, ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
 
 
@@ -110,47 +110,6 @@ def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned)
                 flags[owner, voxel] |= bit
 
 
-@kernel
-def _step_block(near, behind, row_of, row, axis, sign):
-    """Row of the block next to ``row`` along an axis, or -1."""
-    if row < 0 or sign == 0:
-        return row
-    m = 4 >> axis
-    if sign < 0:
-        return np.int64(behind[row, m])
-    slot = near[row, m]
-    return np.int64(row_of[slot]) if slot >= 0 else np.int64(-1)
-
-
-@kernel
-def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
-    """Words (10, 10, 10) of a block's voxels and of those one step beyond all its sides; 0 where no block is reached.
-
-    A block across a corner with mixed signs is reached through a neighbour, in either order of the axes; a voxel
-    that is missed there makes one normal slightly less accurate.
-    """
-    for part in range(27):
-        sx, sy, sz = part // 9 - 1, (part // 3) % 3 - 1, part % 3 - 1
-        other = _step_block(near, behind, row_of, row, 0, sx)
-        other = _step_block(near, behind, row_of, other, 1, sy)
-        other = _step_block(near, behind, row_of, other, 2, sz)
-        if other < 0:
-            other = _step_block(near, behind, row_of, row, 2, sz)
-            other = _step_block(near, behind, row_of, other, 1, sy)
-            other = _step_block(near, behind, row_of, other, 0, sx)
-        x0, y0, z0 = (7 if sx < 0 else 0), (7 if sy < 0 else 0), (7 if sz < 0 else 0)
-        nx, ny, nz = (1 if sx else 8), (1 if sy else 8), (1 if sz else 8)
-        tx, ty, tz = 8 * sx + x0 + 1, 8 * sy + y0 + 1, 8 * sz + z0 + 1
-        for i in range(nx):
-            for j in range(ny):
-                target = words[tx + i, ty + j, tz : tz + nz]
-                if other < 0:
-                    target[:] = 0
-                else:
-                    first = ((x0 + i) * 8 + y0 + j) * 8 + z0
-                    target[:] = geometry[slots[other], first : first + nz]
-
-
 @scalar
 def _slope(words, n, step):
     """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
@@ -159,8 +118,8 @@ def _slope(words, n, step):
 
 @kernel
 def _write_vertices(
-    start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, begin, voxel_size,
-    first, vertices, vertex_colors, normals,
+    start, stop, geometry, colors, slots, coords, near, flags, begin, voxel_size, first, vertices, vertex_colors,
+    normals,
 ):  # fmt: skip
     """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
@@ -169,7 +128,7 @@ def _write_vertices(
         number = begin[row]
         if number == begin[row + 1]:
             continue
-        _surrounded_words(geometry, slots, near, behind, row_of, row, words)
+        surrounded(geometry, near[row], words)
         slot = slots[row]
         for n in range(512):
             flag = flags[row, n]
@@ -188,7 +147,7 @@ def _write_vertices(
                 vertices[number, 0] = voxel_size * (8 * coords[slot, 0] + x + (t if axis == 0 else 0.0))
                 vertices[number, 1] = voxel_size * (8 * coords[slot, 1] + y + (t if axis == 1 else 0.0))
                 vertices[number, 2] = voxel_size * (8 * coords[slot, 2] + z + (t if axis == 2 else 0.0))
-                other = near[row, (ex >> 3) * 4 + (ey >> 3) * 2 + (ez >> 3)]
+                other = near[row, 13 + 9 * (ex >> 3) + 3 * (ey >> 3) + (ez >> 3)]
                 c = colors[slot, n]
                 e = colors[other, ((ex & 7) * 8 + (ey & 7)) * 8 + (ez & 7)]
                 for channel in range(3):
@@ -259,42 +218,36 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
     first_vertex[len(begin) - 1] = total
 
 
-def extract(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
-    slots: NDArray[np.int32],
-    coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
-    parameters: MeshParameters,
-) -> Mesh:
-    """Triangles of the zero level of blocks.
-
-    Args:
-        geometry, colors: (slots, 512) int32 packed voxels.
-        slots: (n,) int32 of the blocks.
-        coords: (slots, 3) block coordinates.
-        neighbours: (n, 8) int32, see ``VoxelBlocks.neighbours``.
-        parameters: Of the extraction.
-    """
-    return Mesh(*_extract(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
-
-
 def extract_chunks(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
+    near: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
+    covered: NDArray[np.bool_] | None = None,
 ) -> list[Mesh]:
-    """Meshes of groups of blocks; see ``TsdfVolume.extract_chunks``, and ``extract`` for the other arguments."""
+    """Triangles of the zero level of groups of blocks; see ``TsdfVolume.extract_chunks``.
+
+    Args:
+        geometry, colors: (slots, 512) int32 packed voxels.
+        slots: (n,) int32 of the blocks.
+        coords: (slots, 3) block coordinates.
+        near: (n, 27) int32, see ``VoxelBlocks.neighbourhood``.
+        parameters: Of the extraction.
+        chunks: (n,) group of each block; -1 = it only lends its voxels.
+        covered: (n, 8) octants, number 4 dx + 2 dy + dz, whose cells are left out; None = none.
+    """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
     vertices, faces, vertex_colors, normals, first_face = _extract(
-        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
-    )
+        geometry, colors, slots[order], coords, near[order], parameters, int(per_chunk.sum()),
+        None if covered is None else covered[order],
+    )  # fmt: skip
+    if num_chunks == 1 and per_chunk[0] == len(slots):  # no vertex is only lent
+        return [Mesh(vertices, faces, vertex_colors, normals)]
     begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
     first = np.empty(num_chunks + 1, dtype=np.int64)
@@ -314,14 +267,17 @@ def _extract(
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
+    near: NDArray[np.int32],
     parameters: MeshParameters,
     num_meshed: int,
+    covered: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
     """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
     face (n + 1,) of each block."""
     n = len(slots)
-    slots, near, behind, row_of = links(slots, neighbours, len(geometry))
+    slots, row_of = np.ascontiguousarray(slots, dtype=np.int32), np.full(len(geometry), -1, dtype=np.int32)
+    row_of[slots] = np.arange(n, dtype=np.int32)
+    near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))  # blocks that are not listed count as absent
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.zeros((n, 512), dtype=np.uint8)
@@ -331,6 +287,10 @@ def _extract(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
+    if covered is not None:
+        cells = covered[:num_meshed].reshape(-1, 2, 2, 2).repeat(4, axis=1).repeat(4, axis=2).repeat(4, axis=3)
+        cases[:num_meshed][cells.reshape(-1, 512)] = 0
+        triangles = [TRIANGLE_COUNT[cases[:num_meshed]].sum(axis=1, dtype=np.int64)]
     owned = np.zeros(n, dtype=np.int64)
     _mark_vertices(near, row_of, cases[:num_meshed], TRIANGLE_COUNT, TRIANGLES, flags, owned)
     first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
@@ -342,7 +302,7 @@ def _extract(
     first = np.empty((n, 512), dtype=np.uint16)
     run_bands(
         lambda start, stop: _write_vertices(
-            start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, first_vertex,
+            start, stop, geometry, colors, slots, coords, near, flags, first_vertex,
             float(parameters.voxel_size), first, vertices, vertex_colors, normals,
         ),
         ranges,

@@ -7,11 +7,10 @@ Blocks are first splatted into an image of tiles with the nearest and farthest d
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.neighbors import load_corners
+from dudmap.core.backends.cpu.octree_field import NO_FINER_LEVELS, FinerLevels, blend, corner_gradient, load, sample
 from dudmap.core.backends.parameters import RaycastParameters, RaycastResult, VoxelGrid
-from dudmap.core.backends.threads import bands, kernel, run_bands, scalar, written_out
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.pixel import project, ray
-from dudmap.core.formulas.residual import trilinear
 from dudmap.core.formulas.voxel import sdf_steps
 
 TILE = 8
@@ -85,30 +84,6 @@ def step_length(distance):
 
 
 @scalar
-def _blend(values, ax, ay, az):
-    """Trilinear interpolation of eight corner values."""
-    value, _, _, _ = trilinear(
-        values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7], ax, ay, az
-    )
-    return value
-
-
-@scalar
-def _sample(window, geometry, shape, x, y, z, least, corners, values):
-    """Signed distance in stored steps at lattice point (x, y, z) inside the window; NaN where it is not known."""
-    lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
-    load_corners(window, geometry, np.int64(lx), np.int64(ly), np.int64(lz), corners, 0, shape[1], shape[2])
-    known = True
-    for k in range(8):
-        word = corners[k, 0]
-        known &= ((word >> 8) & 0xFF) >= least
-        values[k] = sdf_steps(word)
-    if not known:
-        return np.float32(np.nan)
-    return _blend(values, x - lx, y - ly, z - lz)
-
-
-@scalar
 def to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
@@ -130,20 +105,8 @@ def inside_window(shape, o, d, t, end, nudge):
     return t, end
 
 
-@written_out
-def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
-    """Gradient of the trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
-    one = np.float32(1)
-    wy, wz = one - fy, one - fz
-    wx = one - fx
-    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
-    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
-    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
-    return gx, gy, gz
-
-
 @scalar
-def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, values):
+def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corners, values):
     """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
 
     Far from the surface the nearest voxel gives the step; the field is interpolated only within FAR of it.
@@ -151,7 +114,7 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
     Args:
         window: (Wx * Wy * Wz,) int32; negative entries are skipped as a whole.
         shape: (3,) int64 blocks of the window.
-        geometry: (slots * 512,) int32.
+        children, voxels: As of ``trace_rows``.
         o, d: (3,) float32, voxels, and voxels per metre of depth.
         t, end: Depths, metres.
         unit: Voxels per step of the stored distance.
@@ -178,24 +141,28 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
             t += min(steps, to_block_boundary(z + half, dz, rz)) + nudge
             before = -one
             continue
-        word = geometry[np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
-        if ((word >> 8) & 0xFF) < least:
+        word = voxels[0][np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
+        trusted = ((word >> 8) & 0xFF) >= least
+        if len(voxels) == 1 and not trusted:
             before = -one
             t += per_voxel
             continue
         value = sdf_steps(word) * unit
-        if value > FAR:
+        if trusted and value > FAR:
             t_before, before = t, value
             t += (value - one) * per_voxel
             continue
-        value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
+        value, level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
+        value *= unit
+        scale = np.float32(1 << level)  # the least step is a share of the voxels that were read
         if value > zero:
             t_before, before = t, value
-            t += step_length(value) * per_voxel
+            t += step_length(value * scale) / scale * per_voxel
         elif value <= zero:
             if before > zero:
-                return _refine(window, shape, geometry, o, d, t_before, before, t, value, unit, least, corners, values)
-            t += step_length(value) * per_voxel
+                ends = t_before, before, t, value
+                return _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, values)
+            t += step_length(value * scale) / scale * per_voxel
         else:
             before = -one
             t += per_voxel
@@ -203,13 +170,16 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
 
 
 @scalar
-def _refine(window, shape, geometry, o, d, a, at_a, b, at_b, unit, least, corners, values):
-    """Zero between depths ``a`` (outside) and ``b`` (inside) by false position (Illinois variant)."""
+def _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, values):
+    """Zero between two depths by false position (Illinois variant); ``ends`` are the one outside and the distance
+    there, and the same inside."""
+    a, at_a, b, at_b = ends
     side = 0
     t = a + (b - a) * at_a / (at_a - at_b)
     for _ in range(4):
         x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-        value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
+        value, _level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
+        value *= unit
         if np.isnan(value) or abs(value) < np.float32(0.01):
             break
         if value > np.float32(0):
@@ -227,13 +197,12 @@ def _refine(window, shape, geometry, o, d, a, at_a, b, at_b, unit, least, corner
 
 
 @scalar
-def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, normal):
+def _shade(window, shape, children, voxels, colors, x, y, z, least, corners, values, color, normal):
     """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 where it has no slope."""
-    lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
-    ix, iy, iz = np.int64(lx), np.int64(ly), np.int64(lz)
-    fx, fy, fz = x - lx, y - ly, z - lz
-    one = np.float32(1)
-    load_corners(window, geometry, ix, iy, iz, corners, 0, shape[1], shape[2])
+    one, level = np.float32(1), 0
+    if len(voxels) > 1:
+        _, level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
+    fx, fy, fz = load(window, shape, children, voxels, level, x, y, z, corners)
     s0, s1 = sdf_steps(corners[0, 0]), sdf_steps(corners[1, 0])
     s2, s3 = sdf_steps(corners[2, 0]), sdf_steps(corners[3, 0])
     s4, s5 = sdf_steps(corners[4, 0]), sdf_steps(corners[5, 0])
@@ -242,22 +211,24 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     scale = one / length if length > np.float32(0) else np.float32(0)
     normal[0], normal[1], normal[2] = gx * scale, gy * scale, gz * scale
-    load_corners(window, colors, ix, iy, iz, corners, 0, shape[1], shape[2])
+    load(window, shape, children, colors, level, x, y, z, corners)
     for channel in range(3):
         for k in range(8):
             values[k] = np.float32((corners[k, 0] >> (20 - 10 * channel)) & 1023)
-        value = _blend(values, fx, fy, fz) * np.float32(0.25) + np.float32(0.5)
+        value = blend(values, fx, fy, fz) * np.float32(0.25) + np.float32(0.5)
         color[channel] = np.uint8(min(value, np.float32(255)))
 
 
 @kernel
 def trace_rows(
-    row_start, row_stop, window, shape, geometry, colors, intrinsics, T, near, far, depth_min, depth_max, unit, least,
-    depth, color, normals,
+    row_start, row_stop, window, shape, children, voxels, colors, intrinsics, T, near, far, depth_min, depth_max, unit,
+    least, depth, color, normals,
 ):  # fmt: skip
     """Fill pixel rows ``row_start`` to ``row_stop`` of a view of the map.
 
-    ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the window.
+    ``voxels`` and ``colors`` hold the words (slots * 512,) int32 of each level, the largest voxels first, ``children``
+    the links from one level to the next (``FinerLevels``). ``T`` (3, 4) float32 maps metres in the camera frame to the
+    lattice of the window.
     """
     corners = np.empty((8, 1), np.int32)
     values = np.empty(8, np.float32)
@@ -273,11 +244,11 @@ def trace_rows(
                 x = ray(u, intrinsics[2], intrinsics[0])
                 for axis in range(3):
                     d[axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2]
-                t = _trace_ray(window, shape, geometry, o, d, start, end, unit, least, corners, values)
+                t = _trace_ray(window, shape, children, voxels, o, d, start, end, unit, least, corners, values)
             if t > np.float32(0) and t <= depth_max:
                 depth[v, u] = t
                 _shade(
-                    window, shape, geometry, colors, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2],
+                    window, shape, children, voxels, colors, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2], least,
                     corners, values, color[v, u], normals[v, u],
                 )  # fmt: skip
             else:
@@ -292,11 +263,13 @@ def raycast(
     intrinsics: NDArray[np.float32],
     size: tuple[int, int],
     parameters: RaycastParameters,
+    finer: FinerLevels = NO_FINER_LEVELS,
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
 
     A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes from
-    unknown space straight to the inside, there is none.
+    unknown space straight to the inside, there is none. Where a map has voxels of several sizes, ``grid`` are the
+    largest, and the smallest that are known count.
     """
     grid = grid.on_host()
     shape = grid.shape
@@ -308,10 +281,12 @@ def raycast(
     color = np.empty((*size, 3), dtype=np.uint8)
     normals = np.empty((*size, 3), dtype=np.float32)
     unit, least = np.float32(grid.sdf_unit / grid.voxel_size), max(int(parameters.min_weight), 1)
+    voxels = tuple(np.asarray(level).reshape(-1) for level in (grid.geometry, *finer.geometry))
+    colors = tuple(np.asarray(level).reshape(-1) for level in (grid.colors, *finer.colors))
     run_bands(
         lambda start, stop: trace_rows(
-            start, stop, grid.window, shape, grid.geometry.reshape(-1), grid.colors.reshape(-1), intrinsics, to_lattice,
-            near, far, low, high, unit, least, depth, color, normals,
+            start, stop, grid.window, shape, finer.children, voxels, colors, intrinsics, to_lattice, near, far, low,
+            high, unit, least, depth, color, normals,
         ),
         bands(height, BAND),
     )  # fmt: skip

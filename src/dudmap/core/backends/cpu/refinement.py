@@ -1,11 +1,12 @@
 """Loops over blocks of one level of the map: where it is too coarse for the surface, and with what a finer one begins.
 
-A block is read with two voxels around it, from its 27 neighbours (``core/map/fine_blocks.py``).
+A block is read with two voxels around it, from its 27 neighbours (``VoxelBlocks.neighbourhood``).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.surroundings import surrounded
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.voxel import intensity_of, pack_color, pack_voxel, sdf_steps
 
@@ -63,48 +64,20 @@ def mean_color(red, green, blue, count):
     return np.int32(word) if count > 0 else np.int32(0)
 
 
-@scalar
-def padded(voxels, near, words):
-    """Words (SIZE, SIZE, SIZE) of a block and of the two voxels around it; 0 where there is no block.
-
-    Args:
-        voxels: (slots, 512) int32.
-        near: (27,) int32 slots of the block and its neighbours.
-        words: Out.
-    """
-    for n in range(27):
-        slot = near[n]
-        low = (n // 9 - 1, (n // 3) % 3 - 1, n % 3 - 1)
-        x0, y0, z0 = 8 * low[0] + PAD, 8 * low[1] + PAD, 8 * low[2] + PAD
-        for i in range(max(0, -x0), min(8, SIZE - x0)):
-            for j in range(max(0, -y0), min(8, SIZE - y0)):
-                for k in range(max(0, -z0), min(8, SIZE - z0)):
-                    words[x0 + i, y0 + j, z0 + k] = voxels[slot, (i * 8 + j) * 8 + k] if slot >= 0 else 0
-
-
 @kernel
 def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
-    """How much the distance and the intensity bend near the surface in each octant of blocks.
+    """Octants of blocks ``start`` to ``stop``; the other arguments and results as of ``examine``.
 
     With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
     a; on a surface of curvature k the sum over the axes is about k times the voxel size, and linear interpolation
-    between voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice.
-
-    Args:
-        start, stop: Range of blocks.
-        geometry: (slots, 512) int32.
-        near: (n, 27) int32.
-        by_voxel: Voxels per step of the stored distance.
-        saturated: Distance from which on it may be cut off, voxels.
-        bend: (n, 8) float32 out: root mean square over the voxels near the surface of |D|, per voxel.
-        texture: (n, 8) float32 out: the same of the intensity (0..1) with steps of one voxel.
-        surface: (n, 8) uint8 out: whether the surface passes through the octant or touches it.
+    between voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice. The bend is the root
+    mean square over the voxels near the surface of |D|, that of the intensity the same with steps of one voxel.
     """
     words = np.empty((SIZE, SIZE, SIZE), np.int32)
     flat = words.reshape(-1)
     zero = np.float32(0)
     for row in range(start, stop):
-        padded(geometry, near[row], words)
+        surrounded(geometry, near[row], words)
         for octant in range(8):
             x0 = PAD + 4 * (octant >> 2)
             y0 = PAD + 4 * ((octant >> 1) & 1)
@@ -153,23 +126,12 @@ def _channel(value):
 
 @kernel
 def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geometry, fine_colors):
-    """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
-
-    A voxel is known where all the coarse voxels around it are, and has the least of their weights, at most PRIOR.
-
-    Args:
-        start, stop: Range of blocks.
-        geometry, colors: (coarse slots, 512) int32.
-        near: (n, 27) int32 coarse slots around the parent of each block.
-        octants: (n,) octant of the parent.
-        slots: (n,) int32 slots of the blocks.
-        fine_geometry, fine_colors: (fine slots, 512) int32, changed here.
-    """
+    """Blocks ``start`` to ``stop`` of ``prolong``."""
     words = np.empty((SIZE, SIZE, SIZE), np.int32)
     paint = np.empty((SIZE, SIZE, SIZE), np.int32)
     for row in range(start, stop):
-        padded(geometry, near[row], words)
-        padded(colors, near[row], paint)
+        surrounded(geometry, near[row], words)
+        surrounded(colors, near[row], paint)
         octant, slot = octants[row], slots[row]
         for n in range(512):
             i, j, k = n >> 6, (n >> 3) & 7, n & 7
@@ -207,13 +169,13 @@ def examine(
 
     Args:
         geometry: (slots, 512) int32 voxels of one level.
-        near: (n, 27) int32 slots of the blocks and their neighbours (``core/map/fine_blocks.py``), -1 = none.
+        near: (n, 27) int32 slots of the blocks and their neighbours, -1 = none.
         by_voxel: Voxels per step of the stored distance.
         saturated: Distance from which on it may be cut off, voxels.
 
     Returns:
         (n, 8) each: bend of the distance, per voxel, and of the intensity (0..1), float32, and whether the surface
-        touches the octant, uint8; see ``examine_range``.
+        passes through the octant or touches it, uint8.
     """
     bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
     surface = np.empty((len(near), 8), dtype=np.uint8)
@@ -235,6 +197,8 @@ def prolong(
     fine_colors: NDArray[np.int32],
 ) -> None:
     """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
+
+    A voxel is known where all the coarse voxels around it are, and has the least of their weights, at most PRIOR.
 
     Args:
         geometry, colors: (coarse slots, 512) int32.

@@ -20,10 +20,11 @@ from dudmap.core.backends.cpu.registration import NUM_SUMS, normal_equations
 from dudmap.core.backends.descent import Descent, DescentRules, descend
 from dudmap.core.backends.parameters import (
     BLOCK,
+    BlockVisit,
     DepthView,
-    FreeSpace,
     FusedBlocks,
     FusionParameters,
+    LevelImage,
     MapSample,
     NormalEquations,
     RegistrationParameters,
@@ -54,20 +55,10 @@ class WarpBackend(CpuBackend):
     # -- integrate ---------------------------------------------------------------------------------------------------
 
     def fuse(
-        self,
-        grid: VoxelGrid,
-        view: DepthView,
-        touched: TouchedBlocks,
-        candidates: NDArray[np.int32],
-        fused: NDArray[np.uint8],
-        turn: int,
-        count: int,
-        free_space: FreeSpace | None,
-        parameters: FusionParameters,
+        self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
         """See ``Backend.fuse``; the CPU packs the pixels, finds the blocks in view, and observes free space."""
-        arguments = view, touched, candidates, fused, turn, count, free_space, parameters
-        (slots, _, empty), repeats, pixels = self._fused(grid, *arguments, averages=False)
+        (slots, _, empty), repeats, pixels = self._fused(grid, view, touched, visit, parameters, averages=False)
         p, (height, width) = struct(parameters), view.depth.shape
         with self._using():
             geometry, colors = resident(grid.geometry, self.device), resident(grid.colors, self.device)
@@ -86,33 +77,24 @@ class WarpBackend(CpuBackend):
     def register(
         self,
         grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
+        image: LevelImage,
         T_world_camera: NDArray[np.float64],
         first: NormalEquations | None,
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
         """See ``Backend.register``; 32 sums come down per step."""
-        at = self._linearization(grid, depth, intensity, weights, intrinsics, parameters)
+        at = self._linearization(grid, image, parameters)
         return descend(lambda T: at(to_lattice(T, grid.voxel_size, grid.origin)), T_world_camera, first, rules)
 
     def _linearization(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        parameters: RegistrationParameters,
+        self, grid: VoxelGrid, image: LevelImage, parameters: RegistrationParameters
     ) -> Callable[[NDArray[np.float32]], NormalEquations]:
         """Normal equations of an image as a function of its pose in the lattice; the images go up once for all."""
-        shape, p, camera = depth.shape, struct(parameters), camera_of(intrinsics)
-        threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
+        shape, p, camera = image.depth.shape, struct(parameters), camera_of(image.intrinsics)
+        threads = -(-image.depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
         with self._using():
-            image, lattice = (self._up(depth), self._up(intensity), self._up(weights)), self._lattice(grid)
+            images, lattice = [self._up(one) for one in image[:3]], self._lattice(grid)
             partial = self._empty((NUM_SUMS, threads))
             parts, sums = self._empty((NUM_SUMS, GROUPS), wp.float64), self._empty(NUM_SUMS, wp.float64)
 
@@ -120,7 +102,7 @@ class WarpBackend(CpuBackend):
             with self._using():
                 residuals = self._empty((2, *shape))
                 self._launch(
-                    surface.linearize, threads, *image, camera, motion_of(T_grid_camera), lattice,
+                    surface.linearize, threads, *images, camera, motion_of(T_grid_camera), lattice,
                     float(grid.voxel_size), float(grid.sdf_unit), p, PER_THREAD, residuals, partial,
                 )  # fmt: skip
                 self._launch(surface.add_up, parts.shape, partial, GROUPS, parts)
@@ -130,19 +112,14 @@ class WarpBackend(CpuBackend):
         return at
 
     def sample(
-        self,
-        grid: VoxelGrid,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        T_grid_camera: NDArray[np.float32],
-        free_after: int,
+        self, grid: VoxelGrid, image: LevelImage, T_grid_camera: NDArray[np.float32], free_after: int
     ) -> MapSample:
         """See ``Backend.sample``."""
         with self._using():
-            out = self._empty(depth.shape), self._empty(depth.shape), self._empty(depth.shape, wp.uint8)
+            shape = image.depth.shape
+            out = self._empty(shape), self._empty(shape), self._empty(shape, wp.uint8)
             self._launch(
-                surface.sample, depth.shape, self._up(depth), self._up(intensity), camera_of(intrinsics),
+                surface.sample, shape, self._up(image.depth), self._up(image.intensity), camera_of(image.intrinsics),
                 motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._up(grid.free_count),
                 free_after, *out,
             )  # fmt: skip

@@ -156,39 +156,3 @@ def measure_range(row_from, row_to, exact, cosines, smooth, offsets, key, model,
             reading = z + sigma * (0.65 * (c + d) + 0.394 * white)
             if nearest <= reading <= farthest:
                 depth[v, u] = np.float32(reading)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def multipath(row_from, row_to, points, normals, patches, gain, wave_number, ratio):
-    """Measured over true depth (H, W) in the rows [row_from, row_to); see ``depth_faults.with_multipath``.
-
-    points, normals (H, W, 3) float32, camera frame; patches (Q, 9) float32: point, normal, distance from the camera,
-    area and irradiance; gain = reflectance / pi; wave_number of the modulation, rad/m of path.
-    """
-    _, width, _ = points.shape
-    for v in range(row_from, row_to):
-        for u in range(width):
-            px, py, pz = points[v, u, 0], points[v, u, 1], points[v, u, 2]
-            nx, ny, nz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
-            ratio[v, u] = 1
-            d = np.sqrt(px * px + py * py + pz * pz)
-            direct = -(px * nx + py * ny + pz * nz) / max(d * d * d, np.float32(1e-9))
-            if pz <= 0 or direct <= np.float32(0.02) / (d * d):
-                continue
-            real, imaginary = np.float32(1.0), np.float32(0.0)
-            for q in range(patches.shape[0]):
-                rx, ry, rz = patches[q, 0] - px, patches[q, 1] - py, patches[q, 2] - pz
-                out = rx * nx + ry * ny + rz * nz
-                back = -(rx * patches[q, 3] + ry * patches[q, 4] + rz * patches[q, 5])
-                if out <= 0 or back <= 0:
-                    continue
-                squared = rx * rx + ry * ry + rz * rz
-                r = np.sqrt(squared)
-                # A patch is no point: its solid angle is bounded by smoothing 1 / r^2 with its area.
-                form = out * back / (squared * (squared + patches[q, 7]))
-                share = gain * patches[q, 8] / direct * form * patches[q, 7]
-                if share > np.float32(1e-4):
-                    phase = wave_number * (patches[q, 6] + r - d)
-                    real += share * np.cos(phase)
-                    imaginary += share * np.sin(phase)
-            ratio[v, u] = 1 + np.float32(0.5) * np.arctan2(imaginary, real) / (wave_number * d)

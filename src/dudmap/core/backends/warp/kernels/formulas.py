@@ -15,10 +15,12 @@ import warp as wp
 from numba.core.dispatcher import Dispatcher
 
 from dudmap.core.backends.cpu import sampling
+from dudmap.core.backends.threads import Scalar
 from dudmap.core.formulas import pixel, residual, voxel
 
 wp.set_module_options({"enable_backward": False})
 
+Formula = Dispatcher | Scalar | types.FunctionType
 Motion = wp.types.vector(12, wp.float32)
 """The elements of a rigid motion (3, 4), row by row."""
 
@@ -75,13 +77,13 @@ _OF_NUMPY = {
     np.sqrt: wp.sqrt, np.exp: wp.exp,
 }  # fmt: skip
 _OWN = {"bits": bits, "upper_half": upper_half}
-_compiled: dict[Dispatcher | types.FunctionType, wp.Function] = {}
+_compiled: dict[Formula, wp.Function] = {}
 
 
-def warp_function(formula: Dispatcher | types.FunctionType) -> wp.Function:
+def warp_function(formula: Formula) -> wp.Function:
     """The function of Warp with the text of a formula that Numba compiles, or a plain one, and of all that it calls."""
     if formula not in _compiled:
-        function = formula.py_func if isinstance(formula, Dispatcher) else formula
+        function = formula if isinstance(formula, types.FunctionType) else formula.py_func
         names = {**function.__globals__, "bit_and": bit_and, "bit_or": bit_or, **_OWN}
         for name in function.__code__.co_names:
             if name in function.__globals__ and name not in _OWN:
@@ -95,7 +97,7 @@ def warp_function(formula: Dispatcher | types.FunctionType) -> wp.Function:
 
 def _counterpart(value: object) -> object:
     """What Warp has for a global of a formula."""
-    if isinstance(value, Dispatcher | types.FunctionType):
+    if isinstance(value, Formula):
         return warp_function(value)
     if value is np or value is math:
         return _NUMPY

@@ -1,4 +1,4 @@
-"""The instrument for systematic errors of the registration."""
+"""Systematic errors of the registration: no term of it may pull from the true pose."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,9 +8,8 @@ import pytest
 
 from dudmap import Config
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import DatasetError
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.bias import bias_table, measure_pulls
+from registration_errors import measure_pulls
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
@@ -63,15 +62,3 @@ def test_colours_that_alternate_sideways_spread_the_poses_that_colour_wants(room
 
     assert sideways(shifted["colour"]) > 1.0 > 2 * sideways(exact_pulls["colour"])
     assert np.allclose(shifted["distances"], exact_pulls["distances"], atol=1e-6)
-
-
-def test_table_has_a_row_for_each_term(exact_pulls):
-    table = bias_table(exact_pulls)
-    assert [row.split("|")[1].strip() for row in table.splitlines()[2:]] == ["distances", "colour", "both"]
-
-
-def test_a_recording_without_true_poses_is_refused(room):
-    untrue: Any = Displaced(room, 0)
-    untrue.ground_truth = None
-    with pytest.raises(DatasetError, match="has no true poses"):
-        measure_pulls(untrue, Config())

@@ -8,9 +8,8 @@ import pytest
 from dudmap import Config
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import DatasetError
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.bias import first_second_table, measure_first_second
+from registration_errors import measure_first_second
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 FRAMES = 6
@@ -60,17 +59,3 @@ def test_an_error_is_measured_and_the_world_frame_does_not_matter(room, runs):
     same, other = measure_first_second(moved, Config(), 3), measure_first_second(turned, Config(), 3)
     assert same[1].rotation_deg == pytest.approx(runs[1].rotation_deg[:3], abs=1e-6)
     assert other[1].rotation_deg[1:] == pytest.approx(1.0, abs=0.1)
-
-
-def test_table_averages_over_runs(runs):
-    doubled = [run._replace(rotation_deg=7 * run.rotation_deg) for run in runs]
-    rows = first_second_table([runs, doubled]).splitlines()[2:]
-    assert [row.split("|")[1].strip() for row in rows] == ["distances", "both", "colour"]
-    assert f"{5 * runs[0].rotation_deg[1]:.3f} deg" in rows[0]
-
-
-def test_a_recording_without_true_poses_is_refused(room):
-    untrue: Any = Turned(room, 0.0)
-    untrue.ground_truth = None
-    with pytest.raises(DatasetError, match="has no true poses"):
-        measure_first_second(untrue, Config())

@@ -1,9 +1,5 @@
-"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map.
+"""Systematic errors of the registration: the mean pull of each term at the true pose, and the first frames of a map."""
 
-A recording without true poses is a ``DatasetError``.
-"""
-
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +15,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.tracker import Tracker
-from dudmap.errors import DatasetError
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.measure import grid
 
 ITERATIONS = 8
 """Gauss-Newton steps of each registration."""
@@ -42,8 +36,7 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> dict[s
             vector (deg), camera axes.
     """
     truth = sequence.ground_truth
-    if truth is None:
-        raise DatasetError(f"{sequence.name} has no true poses; benchmark bias needs a recording with groundtruth.txt")
+    assert truth is not None
     preprocess = Preprocessor(sequence.camera, config.preprocess)
     volume = TsdfVolume(preprocess.camera, config.volume, config.sensor, config.preprocess.depth_max)
     frames: list[tuple[Level, NDArray[np.float64]]] = []
@@ -57,8 +50,6 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> dict[s
             Frame(observation.timestamp, observation.depth, observation.rgb), se3.inverse(T_first) @ T_truth
         )
         frames.append((Pyramid.of(observation, preprocess.camera, config).fine, T_truth))
-    if len(frames) < 2:
-        raise DatasetError(f"{sequence.name} has true poses for {len(frames)} frames; benchmark bias needs at least 2")
     tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
     T_world_first = se3.inverse(frames[0][1])
     corrections: dict[str, list[NDArray[np.float64]]] = {"distances": [], "colour": [], "both": []}
@@ -97,21 +88,8 @@ def _registered(
     return T
 
 
-def bias_table(pulls: Mapping[str, NDArray[np.float64]]) -> str:
-    """Markdown table of the mean corrections and their spread."""
-    head = ["term", "mean x, y, z (mm)", "mean rotation x, y, z (deg)", "spread (mm)", "spread (deg)"]
-    rows = []
-    for term, corrections in pulls.items():
-        mean, spread = corrections.mean(axis=0), corrections.std(axis=0)
-        parts = [(mean[:3], 2), (mean[3:], 3), (spread[:3], 2), (spread[3:], 3)]
-        rows.append([term, *(", ".join(f"{value:+.{digits}f}" for value in cell) for cell, digits in parts)])
-    return grid(head, rows, words=5)
-
-
 FRAMES = 30
 """Number of frames, one second of most sensors."""
-SHOWN = (1, 2, 5, 10, 20, 29)
-"""Frames of the table; the first one defines the world frame and has no error."""
 MOSTLY_COLOR = 100.0
 """Factor of the colour weight with which distances hardly count."""
 
@@ -135,8 +113,7 @@ def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAME
     Both trajectories begin with the first camera: what its noise does to the world frame is no error.
     """
     truth = sequence.ground_truth
-    if truth is None:
-        raise DatasetError(f"{sequence.name} has no true poses; benchmark first-second needs them")
+    assert truth is not None
     weight = config.tracker.color_weight
     found = []
     for term, color_weight in (("distances", 0.0), ("both", weight), ("colour", MOSTLY_COLOR * weight)):
@@ -153,13 +130,3 @@ def measure_first_second(sequence: Sequence, config: Config, frames: int = FRAME
                 errors[index] = np.degrees(angle), 1000 * np.linalg.norm(error[:3, 3])
         found.append(FirstSecond(term, errors[:, 0], errors[:, 1]))
     return found
-
-
-def first_second_table(runs: list[list[FirstSecond]]) -> str:
-    """Markdown table of the root mean square errors over runs, degrees and millimetres per frame."""
-    shown, rows = [n for n in SHOWN if n < len(runs[0][0].rotation_deg)], []
-    for column in zip(*runs, strict=True):
-        rotation = np.sqrt(np.nanmean([run.rotation_deg**2 for run in column], axis=0))
-        translation = np.sqrt(np.nanmean([run.translation_mm**2 for run in column], axis=0))
-        rows.append([column[0].term, *(f"{rotation[n]:.3f} deg, {translation[n]:.2f} mm" for n in shown)])
-    return grid(["term", *(f"frame {n}" for n in shown)], rows, words=len(shown) + 1)
