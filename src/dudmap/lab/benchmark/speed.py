@@ -54,7 +54,10 @@ def speed_figures(
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
     """
-    figures: list[SpeedFigure] = []
+    figures, compared = list[SpeedFigure](), list[SpeedFigure]()
+    if open3d is not None:  # first, since the other program may not start
+        announce("Open3D's dense SLAM and ours in turn")
+        compared = _open3d_figures(open3d, recording, frames)
     announce("frames at 1, 2 and 0.5 cm voxels")
     for voxel, target in FRAME_TARGETS.items():
         row = _measured(time_frames, (voxel, frames))
@@ -75,10 +78,7 @@ def speed_figures(
     figures.append(SpeedFigure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
     announce("starting")
     figures += _start_times()
-    if open3d is not None:
-        announce("Open3D's dense SLAM and ours in turn")
-        figures += _open3d_figures(open3d, recording, frames)
-    return figures
+    return figures + compared
 
 
 def _open3d_figures(python: Path, recording: Path | None, frames: int) -> list[SpeedFigure]:
