@@ -191,6 +191,14 @@ def spoil_empty(folder):
     return empty
 
 
+def spoil_result(folder):
+    result = folder.with_name("result")
+    (result / "thumbnails").mkdir(parents=True)
+    for name in ("metrics.json", "trajectory.txt", "thumbnails/1.0.color.jpg"):
+        (result / name).touch()
+    return result
+
+
 def spoil_times(folder):
     (folder / "rgb.txt").write_text("900.0 rgb/0.png\n")
 
@@ -221,6 +229,7 @@ def spoil_all_truncated(folder):
     [
         (spoil_missing, "there is no folder"),
         (spoil_empty, "is empty; expected a recording"),
+        (spoil_result, "is the result of a run; expected a recording (dudmap view shows results)"),
         (spoil_times, "no colour image lies within 20 ms of a depth image"),
         (spoil_nan, "depth.txt, line 1: the timestamp 'nan' is not a finite number of seconds"),
         (spoil_order, "depth.txt, line 2: the timestamp 1.000000 comes after 2.000000"),

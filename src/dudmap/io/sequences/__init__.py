@@ -266,6 +266,8 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
         raise DatasetError(f"there is no folder or file {path}; expected a recording")
     if path.is_dir() and not any(path.iterdir()):
         raise DatasetError(f"the folder {path} is empty; expected a recording")
+    if all((path / name).is_file() for name in ("metrics.json", "trajectory.txt")):
+        raise DatasetError(f"{path} is the result of a run; expected a recording (dudmap view shows results)")
     found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
     if len(found) > 1:
         names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
