@@ -95,13 +95,20 @@ class FrontEnd(Stateful):
         levels, unverified = view.pyramid.tracked, prediction.unverified_mask
         tracker = self.blind_tracker if view.blind else self.tracker
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
+        split = max(1, len(levels) - 1)
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with view.timer("track"):
-                tracking = tracker.align(volume, levels, T_init, initial_weights(levels, None, excluded))
+                found = tracker.minimize(
+                    volume, levels[:split], T_init, initial_weights(levels[:split], None, excluded)
+                )
+            view = self.color_motion.refined(view, found.T_world_camera)
+            with view.timer("track"):
+                fine, exposure = view.pyramid.tracked[split - 1 :], found.exposure
+                weights = initial_weights(fine, None, excluded)
+                tracking = tracker.align(volume, fine, found.T_world_camera, weights, split - 1, exposure)
             labelled = self.config.dynamics.method != "none"
             labels = self._label(volume, view, prediction, tracking) if labelled else None
-            return PoseEstimate(tracking, labels, unverified)
-        split = max(1, len(levels) - 1)
+            return PoseEstimate(tracking, labels, unverified, view)
         with view.timer("track"):
             coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
             found = tracker.minimize(volume, coarse, T_init, weights)
