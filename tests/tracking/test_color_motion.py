@@ -101,9 +101,10 @@ def test_registered_colour_is_taken_as_it_is_bit_for_bit():
     assert np.array_equal(poses(exact, None), poses(exact, same))
 
 
-def test_the_frame_that_is_fused_is_the_one_that_was_registered():
+@pytest.mark.parametrize("setting", ["dynamics.method=em", "dynamics.method=none", "tracker.second_pass=false"])
+def test_the_frame_that_is_fused_is_the_one_that_was_registered(setting):
     faulty = recording(color_delay=0.03)
-    slam, made, given = Slam(SMALL, calibration=truth_of(faulty)), [], []
+    slam, made, given = Slam(SMALL, Config().override([setting]), calibration=truth_of(faulty)), [], []
     refined, registered = slam.color_motion.refined, slam.color_motion.registered
     slam.color_motion.refined = lambda view, T: made.append(refined(view, T)) or made[-1]
     slam.color_motion.registered = lambda view, T: given.append(view) or registered(view, T)
