@@ -124,7 +124,7 @@ def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd)
     known, before, after = ego_motion.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
     assert known.compare(0.0, *before) is None
-    known.update(0.0, np.eye(4), *before)
+    known.update(ego_motion.TrackedImage(0.0, np.eye(4), *before))
     motion = known.compare(0.1, *after)
     assert motion is not None
     assert known.compare(0.1, *after) is motion
@@ -181,8 +181,8 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
-    assert monitor.judge(view, well_known, lambda *_: None).reason == ""
-    assert "rest where the map" in monitor.judge(view, unknown, lambda *_: None).reason
+    assert monitor.judge(None, view, well_known, lambda *_: None).reason == ""
+    assert "rest where the map" in monitor.judge(None, view, unknown, lambda *_: None).reason
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd, followed):
@@ -338,7 +338,7 @@ def test_a_new_map_is_not_compared_with_images_of_the_one_before(monkeypatch):
     for start in (0.0, 0.2):  # the second map begins while the images of the first are still young
         segmenter.start(start)
         assert segmenter.slow_motion(start + 0.1, np.eye(4), None, None) is None
-        segmenter.update(start, np.eye(4), f"image at {start}", None)
+        segmenter.update(ego_motion.TrackedImage(start, np.eye(4), f"image at {start}", None))
     segmenter.slow_motion(0.35, np.eye(4), None, None)
     assert compared == ["image at 0.2"]
 

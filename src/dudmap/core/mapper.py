@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import OlderImage
+from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import exposed_color
@@ -104,11 +104,15 @@ class Bootstrap(Stateful):
         if self._frames:
             self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
 
-    def recolored(self, view: FrameView) -> StartFrame | None:
-        """The first frame with other colours; None if it is no longer remembered."""
-        if self._frames:
-            self._frames[0] = replace(self._frames[0], view=view)
-        return self._frames[0] if self._frames else None
+    @property
+    def first(self) -> FrameView | None:
+        """The first frame; None if it is no longer remembered."""
+        return self._frames[0].view if self._frames else None
+
+    def recolored(self, view: FrameView) -> StartFrame:
+        """The first frame, which is remembered, with other colours."""
+        self._frames[0] = replace(self._frames[0], view=view)
+        return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
         """The first frame with the mask it should have been fused with; None where the map is right as it is.
@@ -144,7 +148,7 @@ class Bootstrap(Stateful):
         out = []
         for frame in frames:
             before = frame.view
-            older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
+            older = TrackedImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
             intervals = (now - before.timestamp) / interval
             T_world_camera = last.estimate.T_world_camera
             motion = older.motion_to(last.view.pyramid, last.view.segmentation(), T_world_camera, intervals)
@@ -198,7 +202,7 @@ class Mapper:
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
-        first = self._color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        first = self._color_motion.first_frame(self._bootstrap.first, view.timestamp, estimate.T_world_camera)
         self._begin_anew(None if first is None else self._bootstrap.recolored(first), view)
 
     def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:

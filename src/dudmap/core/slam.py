@@ -196,7 +196,7 @@ class Slam(SlamResults, Stateful):
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        verdict = self.monitor.judge(view, estimate, prediction.image_pose)
+        verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
@@ -281,7 +281,6 @@ class Slam(SlamResults, Stateful):
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-        self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
@@ -310,6 +309,7 @@ class Slam(SlamResults, Stateful):
         if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
+            self.predictor.ego_motion.reset()
             self.relocalizer.found()
             self.redundancy.reset()
             return self._start_map(replace(view, blind=False))
@@ -353,7 +353,7 @@ class Slam(SlamResults, Stateful):
         """Learn the calibration of the colour camera; returns whether a new one is in use from the next frame on."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
         if calibrated:  # the pose of the last image is that of colours elsewhere
-            self.monitor.images.reset()
+            self.predictor.ego_motion.reset()
         return calibrated
 
     def _result(

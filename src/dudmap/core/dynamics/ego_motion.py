@@ -5,7 +5,7 @@ A new map knows no free space, and whoever is in view is part of it. Each image 
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,8 @@ the map is young, images are kept at intervals of the shorter one."""
 
 
 @dataclass(eq=False)
-class OlderImage:
-    """A tracked image that later ones are compared with.
+class TrackedImage:
+    """Image of a tracked frame, which later ones are compared with.
 
     Attributes:
         timestamp: Seconds.
@@ -36,6 +36,8 @@ class OlderImage:
         pyramid: Its images.
         segmentation: Its segments, at the resolution of the labels.
         moving: (h, w) bool, its pixels that are known to move; None for none.
+        blind: Whether its intensities say nothing.
+        gain: Of its exposure.
     """
 
     timestamp: float
@@ -43,6 +45,8 @@ class OlderImage:
     pyramid: Pyramid
     segmentation: Segmentation
     moving: NDArray[np.bool_] | None = None
+    blind: bool = False
+    gain: float = 1.0
 
     def motion_to(
         self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
@@ -95,21 +99,20 @@ class EgoMotionSegmenter(Stateful):
 
     Attributes:
         active: Whether the next frame is to be compared with the last one.
+        last: The last tracked frame.
     """
 
     active: Remembered[bool] = False
     _young_until: Remembered[float]
     _latest_end: Remembered[float]
     _started: Remembered[float]
-    _last_timestamp: Remembered[float]
-    _last: Remembered[tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None] = None
-    _older: Remembered[deque[OlderImage]]
+    last: Remembered[TrackedImage | None] = None
+    _older: Remembered[deque[TrackedImage]]
     _compared: Remembered[tuple[float, DominantMotion | None] | None] = None  # time and result of the last comparison
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self._young_until, self._latest_end = -np.inf, -np.inf
-        self._started = self._last_timestamp = -np.inf
+        self._young_until = self._latest_end = self._started = -np.inf
         self._older = deque()
 
     def start(self, timestamp: float) -> None:
@@ -131,35 +134,22 @@ class EgoMotionSegmenter(Stateful):
         """Whether the map is younger than the longest baseline over which slow motion is looked for."""
         return timestamp < self._started + min(LONGEST_BASELINE, self.seconds)
 
-    def update(
-        self,
-        timestamp: float,
-        T_world_camera: NDArray[np.float64],
-        pyramid: Pyramid,
-        segmentation: Segmentation,
-        moving: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Take over a tracked frame as the one that the next is compared with.
-
-        Args:
-            timestamp: Seconds.
-            T_world_camera: (4, 4) its pose.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
-            moving: (h, w) bool, its moving pixels, if known.
-        """
-        self._last, self._last_timestamp, self._compared = (pyramid, segmentation, moving), timestamp, None
-        young = self.map_is_young(timestamp)
-        hidden = moving is not None and is_majority_dynamic(moving, pyramid.labelled)
+    def update(self, frame: TrackedImage) -> None:
+        """Take over a tracked frame as the one that the next is compared with; with a blind one nothing is."""
+        self.last, self._compared, self.active = frame, None, False
+        if frame.blind:
+            return
+        young = self.map_is_young(frame.timestamp)
+        hidden = frame.moving is not None and is_majority_dynamic(frame.moving, frame.pyramid.labelled)
         self.active = young or (hidden and self.seconds > 0 and self.started)
         if not young:
             self._older.clear()
-        elif not self._older or timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
-            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation, moving))
+        elif not self._older or frame.timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
+            self._older.append(replace(frame))
 
     def reset(self) -> None:
         """Drop the last frame: nothing is compared before the next ``update``."""
-        self._last, self._compared, self.active = None, None, False
+        self.last, self._compared, self.active = None, None, False
 
     def compare(
         self,
@@ -178,11 +168,12 @@ class EgoMotionSegmenter(Stateful):
             segmentation: Its segments, at the resolution of the labels.
             T_expected: (4, 4) predicted motion of the static world; None: none.
         """
-        if self._last is None:
+        last = self.last
+        if last is None or last.blind:
             return None
         if self._compared is None or self._compared[0] != timestamp:
-            last, segmentation_last, moving = self._last
-            motion = dominant_motion(last, pyramid, (segmentation_last, segmentation), moving, T_expected)
+            segmentations = last.segmentation, segmentation
+            motion = dominant_motion(last.pyramid, pyramid, segmentations, last.moving, T_expected)
             self._compared = timestamp, motion
             if (
                 motion is not None
@@ -209,10 +200,10 @@ class EgoMotionSegmenter(Stateful):
         while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
             self._older.popleft()
         older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
-        if not older or not self.map_is_young(timestamp):
+        if not older or self.last is None or not self.map_is_young(timestamp):
             return None
         oldest, newest = older[0], older[-1]
-        interval = timestamp - self._last_timestamp
+        interval = timestamp - self.last.timestamp
         ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
         motion = oldest.motion_to(pyramid, segmentation, T_world_camera, ages[0])
         if motion is None:

@@ -133,8 +133,6 @@ class FrontEnd(Stateful):
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
-        with view.timer("check"):
-            self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
         with view.timer("label"):

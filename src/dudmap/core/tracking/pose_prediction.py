@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion
+from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion, TrackedImage
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry import se3
@@ -148,13 +148,13 @@ class PosePredictor(Stateful):
         """Set the image that the next one is compared with: a frame whose pose is accepted."""
         if self.ego_motion.seconds == 0:
             return
-        if view.blind:
-            self.ego_motion.reset()
-            return
         with view.timer("parallax"):
             dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-            T = estimate.T_world_camera
-            self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+            image = TrackedImage(
+                view.timestamp, estimate.T_world_camera, view.pyramid, view.segmentation(), dynamic, view.blind,
+                estimate.exposure[0],
+            )  # fmt: skip
+            self.ego_motion.update(image)
 
     def _slow_motion(
         self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
