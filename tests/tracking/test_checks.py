@@ -9,7 +9,7 @@ import pytest
 from dudmap import Config, Slam
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
-from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 

@@ -18,8 +18,7 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
 

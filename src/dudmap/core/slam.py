@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
-from dudmap.core.color_calibration import ColorCalibration
+from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame, FrameArrays
 from dudmap.core.frames.preprocess import Preprocessor
@@ -28,16 +28,13 @@ from dudmap.core.places.loop_verification import LoopQuery
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.core.result import FrameResult
-from dudmap.core.slam_results import SlamArguments, SlamResults
+from dudmap.core.result import FrameResult, SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView, StageTimer
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
+from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import ConfigError

@@ -5,6 +5,7 @@ A new map knows no free space, and whoever is in view is part of it. Each image 
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,8 @@ from dudmap.core.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 
+ImagePose = Callable[[], NDArray[np.float64] | None]
+"""Computes the pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
 """Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
 the map is young, images are kept at intervals of the shorter one."""

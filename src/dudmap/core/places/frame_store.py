@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import exposed_color
-from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.scratch_store import ScratchStore
 from dudmap.core.state import Remembered, Stateful

@@ -13,13 +13,13 @@ from dudmap.config import Config
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas, TimedPose
 from dudmap.core.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
 from dudmap.core.places.map_rebuilding import view_distances
 from dudmap.core.places.place_recognition import PlaceMatch
-from dudmap.core.tracking.estimate import static_weights
+from dudmap.core.tracking.frame_view import static_weights
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 

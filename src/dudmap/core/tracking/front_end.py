@@ -10,14 +10,12 @@ from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.pyramid import reduced
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, MotionModel, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
 

@@ -6,7 +6,6 @@ something else. Shape alone does not tell: walls and desks resemble each other, 
 
 import statistics
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -18,7 +17,7 @@ from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.reprojection import reproject
 from dudmap.core.dynamics.detector import noise_parameters
-from dudmap.core.dynamics.ego_motion import TrackedImage
+from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import reduced
 from dudmap.core.geometry import se3
@@ -32,13 +31,10 @@ from dudmap.core.tracking.checks import (
     Limits,
     first_failure,
 )
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
+from dudmap.core.tracking.pose_prediction import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
 
-ImagePose = Callable[[], NDArray[np.float64] | None]
-"""Pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
 CLEARLY_LESS = 0.5
 """Another motion explains two images clearly better if its misregistration is below this share of the other: both are
 known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
