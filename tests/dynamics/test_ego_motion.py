@@ -123,14 +123,16 @@ def test_images_without_corners_tell_nothing(crowd):
 def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd):
     known, before, after = ego_motion.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
-    assert known.compare(0.0, *before) is None
-    known.update(ego_motion.TrackedImage(0.0, np.eye(4), *before))
-    motion = known.compare(0.1, *after)
+    before = ego_motion.TrackedImage(0.0, np.eye(4), *before)
+    after, later = (ego_motion.TrackedImage(time, np.eye(4), *after) for time in (0.1, 0.2))
+    assert known.compare(before) is None
+    known.update(before)
+    motion = known.compare(after)
     assert motion is not None
-    assert known.compare(0.1, *after) is motion
-    assert known.compare(0.2, *after) is not motion
+    assert known.compare(after) is motion
+    assert known.compare(later) is not motion
     known.reset()
-    assert known.compare(0.1, *after) is None
+    assert known.compare(after) is None
     assert not known.active
 
 
@@ -337,9 +339,9 @@ def test_a_new_map_is_not_compared_with_images_of_the_one_before(monkeypatch):
     segmenter = ego_motion.EgoMotionSegmenter(1.0)
     for start in (0.0, 0.2):  # the second map begins while the images of the first are still young
         segmenter.start(start)
-        assert segmenter.slow_motion(start + 0.1, np.eye(4), None, None) is None
+        assert segmenter.slow_motion(ego_motion.TrackedImage(start + 0.1, np.eye(4), None, None)) is None
         segmenter.update(ego_motion.TrackedImage(start, np.eye(4), f"image at {start}", None))
-    segmenter.slow_motion(0.35, np.eye(4), None, None)
+    segmenter.slow_motion(ego_motion.TrackedImage(0.35, np.eye(4), None, None))
     assert compared == ["image at 0.2"]
 
 

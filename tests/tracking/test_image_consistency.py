@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dudmap import Config, Slam
-from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import MAX_IMAGE_SHIFT
@@ -43,7 +42,7 @@ def images():
 
 def tracked(view, **attributes):
     """The first frame as it is remembered."""
-    return TrackedImage(0.0, np.eye(4), view.pyramid, view.segmentation(), **attributes)
+    return view.tracked_at(np.eye(4), **attributes)
 
 
 def is_supported(images, first, view, estimate, image_pose=lambda *_: None):

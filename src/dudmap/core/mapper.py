@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import exposed_color
@@ -141,18 +140,15 @@ class Bootstrap(Stateful):
         if not self._frames:
             return []
         last, frames = self._frames[-1], [frame for frame in self._frames[:-1] if not frame.fused]
-        now = last.view.timestamp
-        interval = (now - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
+        now = last.view.tracked_at(last.estimate.T_world_camera)
+        interval = (now.timestamp - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
         self._frames = []
         out = []
         for frame in frames:
-            before = frame.view
-            older = TrackedImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
-            intervals = (now - before.timestamp) / interval
-            T_world_camera = last.estimate.T_world_camera
-            motion = older.motion_to(last.view.pyramid, last.view.segmentation(), T_world_camera, intervals)
+            older = frame.view.tracked_at(frame.estimate.T_world_camera)
+            motion = older.motion_to(now, (now.timestamp - older.timestamp) / interval)
             if motion is not None and older.moving is not None:
-                moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
+                moving = full_size(older.moving, frame.view.labelled.depth, frame.view.observation.depth)
                 out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
         return out if last.fused else [*out, last]
 

@@ -31,11 +31,10 @@ the map is young, images are kept at intervals of the shorter one."""
 
 @dataclass(eq=False)
 class TrackedImage:
-    """Image of a tracked frame, which later ones are compared with.
+    """Image of a frame, at its pose or a prediction of it, which is compared with older ones and later with newer ones.
 
     Attributes:
-        timestamp: Seconds.
-        T_world_camera: (4, 4).
+        timestamp, T_world_camera: Seconds; (4, 4).
         pyramid: Its images.
         segmentation: Its segments, at the resolution of the labels.
         moving: (h, w) bool, its pixels that are known to move; None for none.
@@ -51,25 +50,15 @@ class TrackedImage:
     blind: bool = False
     gain: float = 1.0
 
-    def motion_to(
-        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
-    ) -> DominantMotion | None:
-        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image.
+    def motion_to(self, later: "TrackedImage", intervals: float) -> DominantMotion | None:
+        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image; None
+        if it cannot be determined. ``intervals`` of consecutive images lie between the two.
 
         What is seen to move in this image is left out of the estimates of the next comparisons.
-
-        Args:
-            pyramid: The later image.
-            segmentation: Its segments.
-            T_world_camera: (4, 4) prediction of its pose.
-            intervals: Number of intervals between consecutive images that lie between the two.
-
-        Returns:
-            None if it cannot be determined.
         """
-        T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
-        segmentations = self.segmentation, segmentation
-        motion = dominant_motion(self.pyramid, pyramid, segmentations, self.moving, T_expected, intervals)
+        T_expected = se3.inverse(later.T_world_camera) @ self.T_world_camera
+        segmentations = self.segmentation, later.segmentation
+        motion = dominant_motion(self.pyramid, later.pyramid, segmentations, self.moving, T_expected, intervals)
         if motion is not None:
             moving = propagate_to_segments(motion.before, whole_only=True)
             self.moving = moving if self.moving is None else self.moving | moving
@@ -154,52 +143,34 @@ class EgoMotionSegmenter(Stateful):
         """Drop the last frame: nothing is compared before the next ``update``."""
         self.last, self._compared, self.active = None, None, False
 
-    def compare(
-        self,
-        timestamp: float,
-        pyramid: Pyramid,
-        segmentation: Segmentation,
-        T_expected: NDArray[np.float64] | None = None,
-    ) -> DominantMotion | None:
-        """Motion of the static world since the last frame; None if it cannot be determined.
+    def compare(self, now: TrackedImage, T_expected: NDArray[np.float64] | None = None) -> DominantMotion | None:
+        """Motion of the static world since the last frame, expected to be ``T_expected`` (4, 4) if that is known; None
+        if it cannot be determined.
 
         The result is kept: a second call with the same timestamp returns the same object.
-
-        Args:
-            timestamp: Seconds, of the new frame.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
-            T_expected: (4, 4) predicted motion of the static world; None: none.
         """
         last = self.last
         if last is None or last.blind:
             return None
-        if self._compared is None or self._compared[0] != timestamp:
-            segmentations = last.segmentation, segmentation
-            motion = dominant_motion(last.pyramid, pyramid, segmentations, last.moving, T_expected)
-            self._compared = timestamp, motion
+        if self._compared is None or self._compared[0] != now.timestamp:
+            segmentations = last.segmentation, now.segmentation
+            motion = dominant_motion(last.pyramid, now.pyramid, segmentations, last.moving, T_expected)
+            self._compared = now.timestamp, motion
             if (
                 motion is not None
-                and self.map_is_young(timestamp)
-                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
+                and self.map_is_young(now.timestamp)
+                and exceeds_noise_share(motion.moving_after, now.pyramid.labelled)
             ):
-                self._young_until = min(timestamp + self.seconds, self._latest_end)
+                self._young_until = min(now.timestamp + self.seconds, self._latest_end)
         return self._compared[1]
 
-    def slow_motion(
-        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, segmentation: Segmentation
-    ) -> SlowMotion | None:
+    def slow_motion(self, now: TrackedImage) -> SlowMotion | None:
         """Comparison with an older image; None once the map is not young, or where they follow no common motion.
 
         Where that shows something to move, the newest of the older images is compared, too: what came into view since
         the oldest one was taken moves in neither comparison otherwise.
-
-        Args:
-            timestamp: Seconds, of the new frame.
-            T_world_camera: (4, 4) prediction of its pose.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
         """
+        timestamp = now.timestamp
         while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
             self._older.popleft()
         older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
@@ -208,15 +179,15 @@ class EgoMotionSegmenter(Stateful):
         oldest, newest = older[0], older[-1]
         interval = timestamp - self.last.timestamp
         ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
-        motion = oldest.motion_to(pyramid, segmentation, T_world_camera, ages[0])
+        motion = oldest.motion_to(now, ages[0])
         if motion is None:
             return None
-        T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
+        now = replace(now, T_world_camera=oldest.T_world_camera @ se3.inverse(motion.T_after_before))
         moving, static = propagate_to_segments(motion.after, whole_only=True), motion.static_after
         first = oldest.moving if oldest.timestamp == self._started else None
-        if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
-            motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
+        if newest is not oldest and exceeds_noise_share(moving, now.pyramid.labelled):
+            motion = newest.motion_to(now, ages[1])
             if motion is not None:
                 moving = moving | propagate_to_segments(motion.after, whole_only=True)
                 static = static | motion.static_after
-        return SlowMotion(T_world_camera, moving, static & ~moving, first)
+        return SlowMotion(now.T_world_camera, moving, static & ~moving, first)

@@ -3,10 +3,12 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation
@@ -91,6 +93,10 @@ class FrameView:
     def labelled(self) -> Level:
         """Pyramid level whose pixels are labelled."""
         return self.pyramid.labelled
+
+    def tracked_at(self, T_world_camera: NDArray[np.float64], **attributes: Any) -> TrackedImage:  # noqa: ANN401
+        """Image of the frame at a pose (4, 4), to be compared with others."""
+        return TrackedImage(self.timestamp, T_world_camera, self.pyramid, self.segmentation(), **attributes)
 
     @property
     def textureless(self) -> bool:

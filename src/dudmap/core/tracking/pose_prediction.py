@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config, TrackerConfig
 from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion, TrackedImage
+from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.pyramid import is_majority_dynamic
 from dudmap.core.geometry import se3
@@ -265,10 +265,8 @@ class PosePredictor(Stateful):
             return
         with view.timer("parallax"):
             dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-            image = TrackedImage(
-                view.timestamp, estimate.T_world_camera, view.pyramid, view.segmentation(), dynamic, view.blind,
-                estimate.exposure[0],
-            )  # fmt: skip
+            gain, _ = estimate.exposure
+            image = view.tracked_at(estimate.T_world_camera, moving=dynamic, blind=view.blind, gain=gain)
             self.ego_motion.update(image)
 
     def _slow_motion(
@@ -286,7 +284,7 @@ class PosePredictor(Stateful):
         """
         if is_majority_dynamic(moving, view.labelled):
             return None
-        slow = self.ego_motion.slow_motion(view.timestamp, T_world_camera, view.pyramid, view.segmentation())
+        slow = self.ego_motion.slow_motion(view.tracked_at(T_world_camera))
         return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
@@ -294,8 +292,9 @@ class PosePredictor(Stateful):
         if self.ego_motion.seconds == 0:
             return None
         with view.timer("parallax"):
-            T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
-            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
+            T_world_camera = self.motion.predict(view.timestamp)
+            T_expected = se3.inverse(T_world_camera) @ self.motion.T_world_camera
+            return self.ego_motion.compare(view.tracked_at(T_world_camera), T_expected)
 
     def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
         return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)
