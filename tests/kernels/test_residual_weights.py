@@ -41,7 +41,7 @@ OWNERS = {
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
-        "core/map/fusion_parameters.py:fusion_parameters",  # hands them on, as do all that follow
+        "core/map/volume.py:fusion_parameters",  # hands them on, as do all that follow
         "core/tracking/tracker.py:_chi_square",
         "core/dynamics/detector.py:noise_parameters",
         "core/calibration/adjustment.py:__init__",

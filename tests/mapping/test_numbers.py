@@ -15,8 +15,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import LOCAL_GRID
-from dudmap.core.map.fusion_parameters import fusion_parameters
-from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume import TsdfVolume, fusion_parameters
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult

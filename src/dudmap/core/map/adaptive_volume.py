@@ -22,12 +22,11 @@ from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.fine_blocks import FineBlocks, two_levels
-from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
 from dudmap.core.map.level_meshes import level_meshes
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.refinement import prolonged, refine
-from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume import DEPTH_MIN, TsdfVolume, fusion_parameters
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 
 

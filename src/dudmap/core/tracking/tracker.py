@@ -23,8 +23,7 @@ from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
-from dudmap.core.tracking.gradient_agreement import MIN_AGREEMENT, GradientAgreement
-from dudmap.core.tracking.observability import COMPLETE, Observability, gradient_noise
+from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, GradientAgreement, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
 """Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
