@@ -6,8 +6,8 @@ import pytest
 from dudmap.config import Config
 from dudmap.core.formulas.damping import damped_step
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume

@@ -9,8 +9,7 @@ from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import exposed_color
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.frames.observation import exposed_color, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas

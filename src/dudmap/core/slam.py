@@ -12,8 +12,8 @@ from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame, FrameArrays
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.frames.stream_check import Rejection, StreamCheck
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera

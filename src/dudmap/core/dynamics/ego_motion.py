@@ -18,7 +18,7 @@ from dudmap.core.dynamics.dominant_motion import (
     propagate_to_segments,
 )
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.pyramid import Pyramid, is_majority_dynamic
+from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 

@@ -36,6 +36,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.block_window import BlockWindow
+from dudmap.core.map.fine_blocks import two_levels
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -315,7 +316,8 @@ class TsdfVolume(PagedMap):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
+        finer = two_levels(self.levels)
+        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, finer)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-from dudmap.core.frames.pyramid import is_majority_dynamic
+from dudmap.core.frames.observation import is_majority_dynamic
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas

@@ -10,8 +10,7 @@ from dudmap.core.backends.median import median
 from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level, Observation
-from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.frames.observation import Level, Observation, Pyramid
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.observation import Level, Observation
-from dudmap.core.frames.pyramid import Pyramid, reduced
+from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced
 from dudmap.core.state import CACHE
 from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult

@@ -9,7 +9,7 @@ from dudmap.config import Config
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.frames.observation import reduced
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful

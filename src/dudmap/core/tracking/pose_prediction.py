@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config, TrackerConfig
 from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
 from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.pyramid import is_majority_dynamic
+from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful

@@ -18,8 +18,7 @@ from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.reprojection import reproject
 from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.frames.observation import Level, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import (
