@@ -124,11 +124,11 @@ class LoopVerifier:
         nodes = [
             n
             for n in self.atlas.kept_nodes(keyframe.submap)
-            if history.timestamps[n] <= keyframe.last_seen
-            and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+            if history.frames[n].timestamp <= keyframe.last_seen
+            and agree(history.frames[n].T_world_camera, place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
         ]
         T_camera_world = se3.inverse(place.T_world_camera)
-        distances = [np.linalg.norm((T_camera_world @ history.Ts_world_camera[n])[:3, 3]) for n in nodes]
+        distances = [np.linalg.norm((T_camera_world @ history.frames[n].T_world_camera)[:3, 3]) for n in nodes]
         nearest = sorted(nodes[i] for i in np.argsort(distances, kind="stable")[:LOCAL_FRAMES])
         if not nearest:
             return None
