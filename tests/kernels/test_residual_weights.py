@@ -49,7 +49,7 @@ OWNERS = {
     ("noise.base", "noise.scale"): {
         "core/formulas/pixel.py",
         "core/backends/cpu/evidence.py:weigh_readings",  # hand them on
-        "core/backends/cpu/image_comparison.py:compare_images",
+        "core/backends/cpu/reprojection.py:compare_images",
     },
 }
 """Parameters of a formula, and the files or functions that may name them; everybody else calls the formula."""

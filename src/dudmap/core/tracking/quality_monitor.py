@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
-from dudmap.core.backends.cpu.image_comparison import compare_images
-from dudmap.core.backends.cpu.reprojection import reproject
+from dudmap.core.backends.cpu.reprojection import compare_images, reproject
 from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
 from dudmap.core.frames.observation import Level, reduced
