@@ -180,7 +180,8 @@ class KeyframeCollector(Stateful):
         if self._pending is not None:
             middle, T, mask = self._pending
             before = self._before
-            if before is not None and now - before[0] <= self.max_gap and self._is_due(middle.timestamp):
+            due = self.keyframes[-1].timestamp + self._interval - 1e-3 if self.keyframes else -np.inf
+            if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
                 velocity = central_velocity(before, (now, T_world_camera))
                 self.keyframes.append(keyframe(middle, self.given, T, velocity, mask))
                 if len(self.keyframes) > MAX_KEYFRAMES:
@@ -198,6 +199,3 @@ class KeyframeCollector(Stateful):
         self.interrupt()
         self.keyframes.clear()
         self._interval = INTERVAL
-
-    def _is_due(self, timestamp: float) -> bool:
-        return not self.keyframes or timestamp - self.keyframes[-1].timestamp >= self._interval - 1e-3

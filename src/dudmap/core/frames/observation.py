@@ -102,11 +102,8 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
     import cv2
 
     gain, offset = exposure
-    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
-
-
-def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
-    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+    curve = np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, curve), dtype=np.uint8)
 
 
 def exposed(level: Level, exposure: tuple[float, float]) -> Level:

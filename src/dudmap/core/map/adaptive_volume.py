@@ -86,7 +86,8 @@ class AdaptiveVolume(TsdfVolume):
             children = level.children_of(slots)
             updated_children = self._average_finer(n, view, touched, children, count)
             updated = updated[~gone]
-            depths = self._depths(parents, updated, self.voxel_size / 2**n, view.T_world_camera)
+            centres = (parents.slot_coords[updated] + 0.5) * (self.block_size / 2**n)
+            depths = (centres - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
             self._note_change(
                 n, refine(level, parents, updated, depths, number, self.config, self.sensor, self._parameters_of(n))
             )
@@ -118,13 +119,6 @@ class AdaptiveVolume(TsdfVolume):
             level.blocks.written[slots] = self._frame_number
             slots = level.parents[slots]
         self.blocks.written[slots] = self._frame_number
-
-    def _depths(
-        self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Depth (n,) of the centres of blocks in the camera frame, metres."""
-        centres = (blocks.slot_coords[slots] + 0.5) * (8 * voxel_size)
-        return (centres - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
         """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""

@@ -66,6 +66,7 @@ class LoopCloser(Stateful):
     _failures: Remembered[int] = 0
     _newest_keyframe: Remembered[float | None] = None  # timestamp; their number ends at ``max_keyframes``
     _search: Remembered[LoopSearch | None] = None
+    # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
     _pending: Remembered[tuple[int, NDArray[np.float64]] | None] = None
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
@@ -75,7 +76,6 @@ class LoopCloser(Stateful):
         self.corrector = LoopCorrector(atlas)
         self.thinning = FrameThinning(config, atlas)
         self._executor: ThreadPoolExecutor | None = None
-        # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.

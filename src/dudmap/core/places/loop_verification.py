@@ -76,21 +76,13 @@ class LoopVerifier:
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place (or in the
         saved map that the place belongs to); None unless features, distances and intensities agree."""
-        limits = self.config.relocalization
         local = self._local_map(place)
         if local is None:
             return None
         exposure = query.tracking.exposure
         found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
-        if (
-            found.converged
-            and len(found.unobservable) == 0
-            and not monitor.misfit_reason(found)
-            and found.inlier_share >= limits.min_on_map
-            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
-        ):
-            return found.T_world_camera
-        return None
+        confirmed = place.is_confirmed(found, self.config.relocalization) and not monitor.misfit_reason(found)
+        return found.T_world_camera if confirmed else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
         """Whether the newest frame, too, fits the map of the time of a place better where a correction puts it.

@@ -20,6 +20,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
+from dudmap.core.tracking.tracker import TrackingResult
 
 COARSE_FEATURES = 64
 """Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
@@ -86,6 +87,16 @@ class PlaceMatch:
     keyframe: Keyframe
     T_world_camera: NDArray[np.float64]
     num_inliers: int
+
+    def is_confirmed(self, found: TrackingResult, limits: RelocalizationConfig, static_share: float = 1.0) -> bool:
+        """Whether the registration of the frame, this share of whose readings is static, confirms the pose that its
+        features give."""
+        return (
+            found.converged
+            and len(found.unobservable) == 0
+            and static_share * found.inlier_share >= limits.min_on_map
+            and agree(found.T_world_camera, self.T_world_camera, limits.max_distance, limits.max_angle_deg)
+        )
 
 
 class KeyframeDatabase(Stateful):

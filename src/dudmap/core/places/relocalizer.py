@@ -11,7 +11,6 @@ from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.frames.observation import is_majority_dynamic
-from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.state import Remembered, Stateful
@@ -84,9 +83,8 @@ class Relocalizer(Stateful):
         """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
 
         Candidates in the current submap are tried first, those with more matching features before others. The first
-        is taken whose registration converges, is accepted, has at least ``relocalization.min_on_map`` of the frame's
-        readings static and on the map, and stays within ``relocalization.max_distance`` and ``max_angle_deg`` of the
-        pose given by the features. The view's timer receives the time of feature matching as stage ``recognise``.
+        is taken that its registration confirms and whose registration is accepted. The view's timer receives the time
+        of feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:
@@ -106,13 +104,7 @@ class Relocalizer(Stateful):
             estimate = register(volume, T_features)
             tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
-            if (
-                tracking.converged
-                and len(tracking.unobservable) == 0
-                and accept(tracking)
-                and static_share * tracking.inlier_share >= limits.min_on_map
-                and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)
-            ):
+            if candidate.is_confirmed(tracking, limits, static_share) and accept(tracking):
                 return Relocalization(estimate, submap)
         return None
 

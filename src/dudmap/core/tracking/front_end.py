@@ -118,7 +118,9 @@ class FrontEnd(Stateful):
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], unverified)
             pose, exposure = found.T_world_camera, found.exposure
-            color_weight = tracker.config.color_weight * self._motion_discount(volume, view, pose)
+            velocity, time_sigma = self.motion.velocity_to(view.timestamp, pose), self.config.sensor.color_time_sigma
+            discount = motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
+            color_weight = tracker.config.color_weight * discount
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.blind:
             tracking = replace(tracking, color_residual=np.nan)
@@ -142,12 +144,6 @@ class FrontEnd(Stateful):
         if self.motion.lost(timestamp):
             self.detector.reset()
             self.last_dynamic = None
-
-    def _motion_discount(self, volume: TsdfVolume, view: FrameView, T_world_camera: NDArray[np.float64]) -> float:
-        """Factor of the weight of the intensities at the velocity that leads to a pose (4, 4)."""
-        velocity = self.motion.velocity_to(view.timestamp, T_world_camera)
-        time_sigma = self.config.sensor.color_time_sigma
-        return motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
 
     def _labels_unchanged(self, labels: Labels) -> bool:
         """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not
