@@ -116,7 +116,7 @@ def calls(
     as_json: o.JsonOption = False,
 ) -> None:
     """Count the kernel launches, barriers, Python calls and source files of an ordinary frame, and time its stages."""
-    from dudmap.lab.benchmark.calls import count_calls, stage_table, summary
+    from dudmap.lab.benchmark.calls import count_calls, memory_rate, stage_table, summary
     from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
@@ -124,7 +124,7 @@ def calls(
     costs = count_calls(source, o.read_config(None, None, assignments), max_frames)
     tree = summary(costs)
     text = ", ".join(f"{value:.0f} {name}" for name, value in tree.items())
-    answer(tree, f"{text}\n{stage_table(costs)}", as_json=as_json)
+    answer(tree, f"{text}\n{stage_table(costs, memory_rate())}", as_json=as_json)
 
 
 @app.command()

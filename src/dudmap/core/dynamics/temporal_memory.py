@@ -260,13 +260,15 @@ def _still(
     """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
     ``unmarked``: and that no frame took to be dynamic."""
     labels, still = segments.labels, np.arange(segments.count + 1) > 0
-    found = _reprojected(level, T_world_camera, frames)
     size = np.bincount(labels[chosen], minlength=segments.count + 1)
-    for n, frame in enumerate(frames):
+    for frame in frames:
+        found = _reprojected(level, T_world_camera, [frame])
         if unmarked and frame.dynamic.any():
-            marked = chosen & _seen_marked(found, n)
+            marked = chosen & _seen_marked(found, 0)
             still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
-    stand_still(segments, chosen, found.gap, found.difference, still)
+        stand_still(segments, chosen, found.gap[0], found.difference[0], still)
+        if not still.any():  # what moves has mostly left its place since the oldest one
+            break
     return chosen & still[labels]
 
 

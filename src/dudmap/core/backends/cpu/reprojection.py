@@ -15,6 +15,8 @@ NEAREST = np.float32(0.05)
 """Points nearer to the camera plane than this, or behind it, are not projected, metres."""
 LEAST_WEIGHT = np.float32(0.25)
 """Least sum of the bilinear weights of the pixels with a reading: a quarter, the weight of each at equal distance."""
+PARTS = 2
+"""Bands of rows of each older frame."""
 
 
 class Reprojection(NamedTuple):
@@ -52,19 +54,20 @@ def reproject(
     shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
     gap, difference = np.empty((2, *shape), np.float32)
     out = Reprojection(gap, difference, np.empty(shape, np.uint8))
-    run_team(reproject_all, shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
+    run_team(reproject_all, PARTS * shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
     return out
 
 
 @kernel
 def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_marks, gap, difference, marks):
-    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes one older frame at a time."""
-    num_bands = len(older)
+    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes some rows at a time."""
+    num_bands = PARTS * len(older)
     band, _ = first_band(leads, team, 0, num_bands)
     while band != NO_BAND:
-        reproject_difference(
-            depth, intensity, intrinsics, Ts[band], older[band, 0], older[band, 1], old_marks[band], gap[band],
-            difference[band], marks[band],
+        n, part, h = band // PARTS, band % PARTS, len(depth)
+        reproject_rows(
+            part * h // PARTS, (part + 1) * h // PARTS, depth, intensity, intrinsics, Ts[n], older[n, 0], older[n, 1],
+            old_marks[n], gap[n], difference[n], marks[n],
         )  # fmt: skip
         done(team)
         band, _ = take(team, num_bands)
@@ -74,10 +77,10 @@ def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_mark
 
 
 @scalar
-def reproject_difference(
-    depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
+def reproject_rows(
+    start, stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):  # fmt: skip
-    """Differences to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
+    """Differences of some rows to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
@@ -87,7 +90,7 @@ def reproject_difference(
     stored = np.empty((4, w), np.float32)
     last_u, last_v = np.float32(w - 1), np.float32(h - 1)
     flat_depth, flat_intensity, flat_marks = old_depth.reshape(-1), old_intensity.reshape(-1), old_marks.reshape(-1)
-    for v in range(h):
+    for v in range(start, stop):
         row_y = (np.float32(v) - intrinsics[3]) * by_fy
         row = depth[v]
         for u in range(w):
