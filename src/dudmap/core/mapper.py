@@ -44,7 +44,7 @@ class StartFrame:
 
 
 class Bootstrap(Stateful):
-    """Knows the first frames of a map, and what of them must be taken back.
+    """The first frames of a map, parts of which must be taken out of it again.
 
     A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
     not declare dynamic, and motion that is slow shows only after a while. What moved is taken out of the first frame as
@@ -112,9 +112,9 @@ class Bootstrap(Stateful):
         return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
-        """The first frame with the mask it should have been fused with; None where the map is right as it is.
+        """The first frame with a mask to which what moved in it is added; None where the map holds nothing of that.
 
-        The others then count as not fused.
+        The later frames then count as not fused, since the map is made anew.
 
         Args:
             moving_before: (h, w) bool, label resolution, what a later image shows to have moved in the first; None if
@@ -132,7 +132,7 @@ class Bootstrap(Stateful):
         return first
 
     def released(self) -> list[StartFrame]:
-        """The frames that are to be fused yet, without what has moved until the last of them; they are forgotten.
+        """The frames that are still to be fused, without what has moved until the last of them; they are forgotten.
 
         A frame that follows no common motion with the last one is left out.
         """
@@ -186,7 +186,7 @@ class Mapper:
         self._predictor, self._color_motion, self._redundancy = predictor, color_motion, redundancy
         self._localize = localize
 
-    def revise_start(self, view: FrameView, prediction: PosePrediction) -> None:
+    def revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
         """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
         can be seen, fuse the frames that were held back until then."""
         self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
@@ -216,7 +216,7 @@ class Mapper:
         if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
-    def refine_start(self, tracker: Tracker) -> NDArray[np.float64] | None:
+    def refine_first_poses(self, tracker: Tracker) -> NDArray[np.float64] | None:
         """Once the map has seen enough, register the frames of its first moments again and make it anew of them.
 
         The first frames were registered to a map of few others, whose noise they followed. In the map of all of them

@@ -122,8 +122,8 @@ class Slam(SlamResults, Stateful):
         if prior is not None:
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
-            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
-            self.monitor.go_on_from(saved_map.registrations)
+            self.atlas.continue_in(saved_map, self.camera, max_blocks)
+            self.monitor.continue_from(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
@@ -189,9 +189,9 @@ class Slam(SlamResults, Stateful):
         view = replace(view, blind=True) if self._is_blind(view) else view
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
-            self._refine_start()
+            self._refine_first_poses()
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
-        self.mapper.revise_start(view, prediction)
+        self.mapper.revise_first_frame(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
         verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
@@ -204,7 +204,7 @@ class Slam(SlamResults, Stateful):
         self._accept(view, estimate)
         unobserved, ambiguous = estimate.unobserved_motion, self.predictor.ambiguity(view, prediction, estimate)
         uncertain = unobserved or ambiguous
-        fuse = self._is_news(view, estimate, uncertain)
+        fuse = self._adds_information(view, estimate, uncertain)
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
@@ -250,10 +250,10 @@ class Slam(SlamResults, Stateful):
             self.front_end.lose(view.timestamp)
         return view
 
-    def _refine_start(self) -> None:
+    def _refine_first_poses(self) -> None:
         """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
         wanted = self.prior_map is None and not self.live
-        if wanted and (correction := self.mapper.refine_start(self.tracker)) is not None:
+        if wanted and (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
             self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
@@ -319,7 +319,7 @@ class Slam(SlamResults, Stateful):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _is_news(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
+    def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
         """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
         with view.timer("similarity"):
             known = view.blind or uncertain or self.localize

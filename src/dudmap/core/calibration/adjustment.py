@@ -75,7 +75,7 @@ def select_pairs(keyframes: Sequence[ColorKeyframe], count: int) -> list[Pair]:
 
 
 def select_across(before: Sequence[ColorKeyframe], after: Sequence[ColorKeyframe], count: int) -> list[Pair]:
-    """The same of one frame each of two groups."""
+    """Up to ``count`` such pairs of one frame of each of two groups."""
     second, first = np.indices((len(after), len(before))).reshape(2, -1)
     return _drawn([*before, *after], first, len(before) + second, count)
 
@@ -114,7 +114,7 @@ COST_SCALES = (0.01, 1.0)
 """Standard deviations of intensity (0..1) and depth differences (over sigma(z)) for the cost of a pair, fixed so that
 costs are comparable; 0.01 is the noise of common colour cameras."""
 FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
-"""The same at the start of an adjustment, which estimates them, and the least."""
+"""Those that an adjustment, which estimates them, starts with, and the lower bound of both."""
 HUBER = 1.345
 """Constant of the robust weight, standard deviations: 95 % efficiency for Gaussian errors."""
 ITERATIONS, COARSE_ITERATIONS = 6, 4
@@ -130,7 +130,7 @@ only lead to the next."""
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What an adjustment has come to, and where another may begin.
+    """State of an adjustment, with which another may begin.
 
     Attributes:
         calibration: Current estimate.

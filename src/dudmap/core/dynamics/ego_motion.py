@@ -67,7 +67,7 @@ class TrackedImage:
 
 @dataclass(frozen=True, eq=False)
 class SlowMotion:
-    """What an image and an older one tell.
+    """Motion between an older image and a new one that is too slow to be seen from image to image.
 
     Attributes:
         T_world_camera: (4, 4) pose of the new image, from that of the older one.

@@ -72,7 +72,7 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 NO_WEIGHTS = np.empty((0, 0), np.float32)
-"""Of an image that is only sampled."""
+"""Weights of an image that is only sampled."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -256,7 +256,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def _local_grid(self) -> VoxelGrid:
-        """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
+        """Blocks with coordinates from the window's local origin, near to which 32-bit arithmetic is precise."""
         grid, origin = self.grid, self.window.local_origin
         if not origin.any():
             return grid
@@ -302,7 +302,7 @@ class TsdfVolume(PagedMap):
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
-    def see_farther(self, depth: float) -> None:
+    def extend_range(self, depth: float) -> None:
         """Let views reach ``depth`` metres, or as far as the largest window permits; for maps only looked at."""
         spread = 2 * self._reach / self.depth_max  # the window covers depth_max
         longest = ((MAX_WINDOW - 8) * self.block_size - 2 * self.band.limit) / spread

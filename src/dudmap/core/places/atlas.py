@@ -99,7 +99,7 @@ class Atlas(Stateful):
         keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
         return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
-    def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
+    def continue_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
         """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera;
         ``max_blocks`` as of ``TsdfVolume``."""
         self.saved = self.current
@@ -267,7 +267,7 @@ class Atlas(Stateful):
         return [] if self.history is None else self.history.in_submap(submap)
 
     def kept_nodes(self, submap: int) -> list[int]:
-        """Those of them whose images are kept."""
+        """Numbers of the stored frames of a submap whose images are kept."""
         return [] if self.history is None else self.history.kept_of(submap)
 
     def correct(

@@ -152,7 +152,7 @@ class FrameStore(Stateful):
         return [number for number, frame in enumerate(self.frames) if frame.submap == submap]
 
     def kept_of(self, submap: int) -> list[int]:
-        """Those of them whose images were not removed."""
+        """Numbers of the frames of a submap whose images were not removed."""
         return [number for number in self.in_submap(submap) if self.frames[number].count]
 
     def remove_submap(self, submap: int) -> None:

@@ -133,8 +133,8 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
 
 
 def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) -> tuple[list[int], list[int]]:
-    """Of the ``kept`` poses (k,) of a path (n, 4, 4), the indices of those with the view of pose ``b``, where a loop
-    ends: those before and those after the farthest point of the way from ``a`` to ``b``, about as many of each."""
+    """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, where a loop from ``a``
+    closes: of the old pass, which ends where the path is farthest from there, and of the new one, about as many."""
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
     new = after[nearest_views(Ts[after], Ts[b], max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before)))]

@@ -52,7 +52,7 @@ class PlacedFeatures:
 
 
 NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
-"""Those of an image without texture."""
+"""Features of an image without texture."""
 
 
 @dataclass(eq=False)

@@ -232,7 +232,7 @@ class QualityMonitor(Stateful):
         """The registrations that new ones are compared with."""
         return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
 
-    def go_on_from(self, history: RegistrationHistory) -> None:
+    def continue_from(self, history: RegistrationHistory) -> None:
         """Compare new registrations with those of an earlier run in the same map."""
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
@@ -281,7 +281,7 @@ class QualityMonitor(Stateful):
         return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
     def limits(self, mode: str, *, mostly_dynamic: bool = False) -> Limits:
-        """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
+        """Configuration and medians of earlier registrations, from which limits follow; NaN before there are enough."""
         config, (residual, overlap, color) = self.config, self._usual
         share = config.dynamics.max_share
         return Limits(config.tracker, config.sensor, share, mode, mostly_dynamic, 1000 * residual, overlap, color)
