@@ -9,7 +9,7 @@ from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import exposed_color, reduced
+from dudmap.core.frames.observation import Level, exposed_color, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
@@ -43,6 +43,33 @@ class StartFrame:
     fused: bool
 
 
+@dataclass(frozen=True, eq=False)
+class FusedFrame:
+    """A fused frame whose pose is estimated once more.
+
+    Attributes:
+        frame: Depth and colour.
+        level: Finest level of the registration.
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that make the colours those of the map.
+        dynamic_mask: (H, W) bool, pixels that were not fused.
+    """
+
+    frame: Frame
+    level: Level
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    dynamic_mask: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> "FusedFrame":
+        """What of a frame is needed."""
+        observation, fine = view.observation, view.pyramid.fine
+        frame = Frame(observation.timestamp, observation.depth, observation.rgb)
+        level = Level(fine.camera, fine.depth, fine.intensity)  # without the images it is made from
+        return cls(frame, level, estimate.T_world_camera, estimate.exposure, dynamic_mask)
+
+
 class Bootstrap(Stateful):
     """The first frames of a map, parts of which must be taken out of it again.
 
@@ -59,7 +86,7 @@ class Bootstrap(Stateful):
 
     textureless: Remembered[bool] = False
     _frames: Remembered[list[StartFrame]]
-    _window: Remembered[list[StartFrame]]
+    _window: Remembered[list[FusedFrame]]
     _num_fused: Remembered[int] = 0
 
     def __init__(self) -> None:
@@ -75,26 +102,27 @@ class Bootstrap(Stateful):
 
     def start(self, view: FrameView, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember the frame that a map was made of."""
-        first = StartFrame(view, PoseEstimate.at_origin(), dynamic_mask, fused=True)
-        self._frames, self._window, self._num_fused = [first], [first], 1
+        estimate = PoseEstimate.at_origin()
+        self._frames, self._num_fused = [StartFrame(view, estimate, dynamic_mask, fused=True)], 1
+        self._window = [FusedFrame.of(view, estimate, dynamic_mask)]
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember what was fused after the first frame, or that the map began anew with it."""
         if not self._window:
             return
-        if view.timestamp <= self._window[0].view.timestamp:
+        if view.timestamp <= self._window[0].frame.timestamp:
             self._window, self._num_fused = [], 0
         if self._num_fused % WINDOW_STEP == 0:
-            self._window.append(StartFrame(view, estimate, dynamic_mask, fused=True))
+            self._window.append(FusedFrame.of(view, estimate, dynamic_mask))
         self._num_fused += 1
 
-    def complete_window(self) -> list[StartFrame]:
+    def complete_window(self) -> list[FusedFrame]:
         """Every ``WINDOW_STEP``-th fused frame, in the order of time, once these are ``WINDOW``; they are forgotten
         then. Before, none."""
         if not self._window or self._num_fused < WINDOW:
             return []
         window, self._window = self._window, []
-        return sorted(window, key=lambda frame: frame.view.timestamp)
+        return sorted(window, key=lambda fused: fused.frame.timestamp)
 
     def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
         """Remember another frame of the first moments."""
@@ -234,26 +262,24 @@ class Mapper:
         if not window or self._localize or atlas.current == atlas.saved or atlas.current in atlas.rebuildings:
             return None
         volume, Ts, time_sigma = atlas.volume, [], self._config.sensor.color_time_sigma
-        for view, estimate, mask in ((frame.view, frame.estimate, frame.dynamic_mask) for frame in window):
-            level, T_world_camera = view.pyramid.fine, estimate.T_world_camera
-            discount = motion_discount(level, atlas.velocity_at(view.timestamp), time_sigma, volume.voxel_size)
-            found = tracker.align(
-                volume, [level], T_world_camera, initial_weights([level], None, [mask]), len(view.pyramid.tracked) - 1,
-                estimate.exposure, tracker.config.color_weight * discount,
-            )  # fmt: skip
+        finest = len(self._config.tracker.widths) - 1
+        for fused in window:
+            level, velocity = fused.level, atlas.velocity_at(fused.frame.timestamp)
+            color_weight = tracker.config.color_weight
+            color_weight *= motion_discount(level, velocity, time_sigma, volume.voxel_size)
+            weights = initial_weights([level], None, [fused.dynamic_mask])
+            found = tracker.align(volume, [level], fused.T_world_camera, weights, finest, fused.exposure, color_weight)
             if not found.converged:
                 return None
             Ts.append(found.T_world_camera)
-        before = np.stack([frame.estimate.T_world_camera for frame in window])
+        before = np.stack([fused.T_world_camera for fused in window])
         after = before[0] @ se3.inverse(Ts[0]) @ np.stack(Ts)  # the first camera is the world
         atlas.make_room()
         new = atlas.make_volume()
-        for frame, T in zip(window, after, strict=True):
-            observation = frame.view.observation
-            color = exposed_color(observation.rgb, frame.estimate.exposure)
-            again = Frame(observation.timestamp, observation.depth, color)
-            new.integrate(again, T, self._static(frame.dynamic_mask, observation.depth), WINDOW_STEP)
-        stamps = np.array([frame.view.timestamp for frame in window])
+        for fused, T in zip(window, after, strict=True):
+            frame = replace(fused.frame, color=exposed_color(fused.frame.color, fused.exposure))
+            new.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
+        stamps = np.array([fused.frame.timestamp for fused in window])
         corrections = after @ se3.inverse(before)
         atlas.move(stamps, corrections, new)
         self._redundancy.apply_correction(corrections[-1])
