@@ -13,8 +13,8 @@ from dudmap.core.backends.cpu.evidence import (
     moving_pixels,
     weigh_readings,
 )
-from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.labeling import opened
+from dudmap.core.backends.cpu.reprojection import compare_images
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, moving_segments, stand_still
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.parameters import SURFACE, MapSample, single

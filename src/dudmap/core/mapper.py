@@ -7,19 +7,16 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import OlderImage
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import exposed_color
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.frames.observation import exposed_color, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
 
@@ -104,11 +101,15 @@ class Bootstrap(Stateful):
         if self._frames:
             self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
 
-    def recolored(self, view: FrameView) -> StartFrame | None:
-        """The first frame with other colours; None if it is no longer remembered."""
-        if self._frames:
-            self._frames[0] = replace(self._frames[0], view=view)
-        return self._frames[0] if self._frames else None
+    @property
+    def first(self) -> FrameView | None:
+        """The first frame; None if it is no longer remembered."""
+        return self._frames[0].view if self._frames else None
+
+    def recolored(self, view: FrameView) -> StartFrame:
+        """The first frame, which is remembered, with other colours."""
+        self._frames[0] = replace(self._frames[0], view=view)
+        return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
         """The first frame with the mask it should have been fused with; None where the map is right as it is.
@@ -138,18 +139,15 @@ class Bootstrap(Stateful):
         if not self._frames:
             return []
         last, frames = self._frames[-1], [frame for frame in self._frames[:-1] if not frame.fused]
-        now = last.view.timestamp
-        interval = (now - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
+        now = last.view.tracked_at(last.estimate.T_world_camera)
+        interval = (now.timestamp - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
         self._frames = []
         out = []
         for frame in frames:
-            before = frame.view
-            older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
-            intervals = (now - before.timestamp) / interval
-            T_world_camera = last.estimate.T_world_camera
-            motion = older.motion_to(last.view.pyramid, last.view.segmentation(), T_world_camera, intervals)
+            older = frame.view.tracked_at(frame.estimate.T_world_camera)
+            motion = older.motion_to(now, (now.timestamp - older.timestamp) / interval)
             if motion is not None and older.moving is not None:
-                moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
+                moving = full_size(older.moving, frame.view.labelled.depth, frame.view.observation.depth)
                 out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
         return out if last.fused else [*out, last]
 
@@ -198,7 +196,7 @@ class Mapper:
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
-        first = self._color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        first = self._color_motion.first_frame(self._bootstrap.first, view.timestamp, estimate.T_world_camera)
         self._begin_anew(None if first is None else self._bootstrap.recolored(first), view)
 
     def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment, Fit
+from dudmap.core.calibration.adjustment import Adjustment, Fit, PairSet, select_across, select_pairs
 from dudmap.core.calibration.keyframes import ColorKeyframe
-from dudmap.core.calibration.pairs import PairSet, select_across, select_pairs
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
 
 GROUPS: dict[str, tuple[str, ...]] = {

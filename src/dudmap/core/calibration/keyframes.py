@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from dudmap.core.backends.median import median
 from dudmap.core.frames.color_registration import recorded_intensity
 from dudmap.core.frames.observation import Observation
-from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -89,7 +88,7 @@ def keyframe(
 
     level = halvings_to(GEOMETRY_WIDTH, observation.camera)
     camera = observation.camera.scaled(level)
-    depth, _ = halved(observation, level)
+    depth, _ = observation.halved(level)
     moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
     readings = depth[moving & (depth > 0)]
     distance = float(median(readings)) if len(readings) else 1.0

@@ -220,7 +220,9 @@ class BlockTree:
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
-    """The finer levels of a map, at most two, as views and meshes read them."""
+    """The finer levels of a map, at most two, as views read them."""
+    if not levels:
+        return FinerLevels()
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
     arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels]
     return FinerLevels(*zip(*arrays, *missing, strict=True))

@@ -15,8 +15,7 @@ from dudmap.core.objects.object_fusion import ObjectFusion
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover, ObjectTracker
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MOST_WAITING = 30
 """Frames whose moving objects nobody has asked for yet: 0.2 MB each."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_thinning import FrameThinning
 from dudmap.core.places.loop_correction import LoopCorrector

@@ -13,13 +13,13 @@ from dudmap.config import Config
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas, TimedPose
 from dudmap.core.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
 from dudmap.core.places.map_rebuilding import view_distances
 from dudmap.core.places.place_recognition import PlaceMatch
-from dudmap.core.tracking.estimate import static_weights
+from dudmap.core.tracking.frame_view import static_weights
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
@@ -124,11 +124,11 @@ class LoopVerifier:
         nodes = [
             n
             for n in self.atlas.kept_nodes(keyframe.submap)
-            if history.timestamps[n] <= keyframe.last_seen
-            and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+            if history.frames[n].timestamp <= keyframe.last_seen
+            and agree(history.frames[n].T_world_camera, place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
         ]
         T_camera_world = se3.inverse(place.T_world_camera)
-        distances = [np.linalg.norm((T_camera_world @ history.Ts_world_camera[n])[:3, 3]) for n in nodes]
+        distances = [np.linalg.norm((T_camera_world @ history.frames[n].T_world_camera)[:3, 3]) for n in nodes]
         nearest = sorted(nodes[i] for i in np.argsort(distances, kind="stable")[:LOCAL_FRAMES])
         if not nearest:
             return None

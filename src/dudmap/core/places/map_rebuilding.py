@@ -78,7 +78,7 @@ class MapRebuilding:
         many."""
         unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self.start and n not in self.shown])
         unknown = unknown.astype(int)
-        points = _looked_at(np.reshape([self.history.Ts_world_camera[n] for n in unknown], (-1, 4, 4)))
+        points = _looked_at(np.reshape([self.history.frames[n].T_world_camera for n in unknown], (-1, 4, 4)))
         here = _looked_at(T_world_camera)
         added: list[int] = []
         while len(unknown) and len(added) < count:

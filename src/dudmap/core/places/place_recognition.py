@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.core.backends.threads import submit
 from dudmap.core.frames.observation import Observation
-from dudmap.core.geometry.alignment import agree, rigid_ransac
+from dudmap.core.geometry.alignment import rigid_ransac
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
 

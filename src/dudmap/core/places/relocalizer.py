@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-from dudmap.core.frames.pyramid import is_majority_dynamic
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.frames.observation import is_majority_dynamic
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]

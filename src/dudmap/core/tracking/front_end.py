@@ -9,15 +9,13 @@ from dudmap.config import Config
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
-from dudmap.core.frames.pyramid import reduced
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.frames.observation import reduced
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, MotionModel, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
 
@@ -133,8 +131,6 @@ class FrontEnd(Stateful):
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
-        with view.timer("check"):
-            self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
         with view.timer("label"):

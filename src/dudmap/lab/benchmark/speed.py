@@ -254,7 +254,6 @@ def time_iteration(frames: int) -> Row:
     """
     os.environ["DUDMAP_THREADS"] = "1"
     from dudmap.core.frames.observation import Level
-    from dudmap.core.frames.pyramid import halved
 
     sequence = _room(frames)
     slam = None
@@ -262,7 +261,7 @@ def time_iteration(frames: int) -> Row:
         pass
     assert slam is not None
     halvings = round(np.log2(slam.camera.width / 320))
-    depth, intensity = halved(slam.preprocess(sequence[frames - 1]), halvings)
+    depth, intensity = slam.preprocess(sequence[frames - 1]).halved(halvings)
     level = Level(slam.camera.scaled(halvings), depth, intensity)
     pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
     slam.volume.look_at(pose)
