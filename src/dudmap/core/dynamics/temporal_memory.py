@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
 from dudmap.core.backends.cpu.reprojection import Reprojection, reproject
-from dudmap.core.backends.cpu.segment_motion import SegmentImage, stand_still
-from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
+from dudmap.core.backends.cpu.segment_motion import stand_still
 from dudmap.core.dynamics.segments import Segmentation, scaled_side
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
@@ -219,57 +218,13 @@ class TemporalMemory(Stateful):
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
             return np.zeros_like(dynamic)
-        segments = segmentation.with_noise(sigma, least_sigma)
-        return _still(frames, level, T_world_camera, segments, dynamic)
-
-    def stayed(
-        self,
-        timestamp: float,
-        level: Level,
-        T_world_camera: NDArray[np.float64],
-        segmentation: Segmentation,
-        sigma: NDArray[np.float32],
-        moving: NDArray[np.bool_],
-        least_sigma: float = 0.0,
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) that images show to move, but whose segment is where older frames have seen it.
-
-        Corners go astray where colours lie beside their depth. The frames are older than images are compared over, so
-        that a motion that they show would have shown; a frame in which the segment was taken to move proves nothing.
-
-        Args:
-            timestamp, level, T_world_camera, segmentation, sigma, least_sigma: As for ``settled``.
-            moving: (h, w) bool.
-        """
-        frames = [frame for frame in self._recent_frames if timestamp - frame.timestamp >= LONGEST_BASELINE]
-        if not frames or not moving.any():
-            return np.zeros_like(moving)
-        segments = segmentation.with_noise(sigma, least_sigma)
-        return _still(frames, level, T_world_camera, segments, moving, unmarked=True)
-
-
-def _still(
-    frames: Sequence[RememberedFrame],
-    level: Level,
-    T_world_camera: NDArray[np.float64],
-    segments: SegmentImage,
-    chosen: NDArray[np.bool_],
-    *,
-    unmarked: bool = False,
-) -> NDArray[np.bool_]:
-    """Those of the chosen pixels (h, w) whose segment has stood still (``stand_still``) since every one of the frames;
-    ``unmarked``: and that no frame took to be dynamic."""
-    labels, still = segments.labels, np.arange(segments.count + 1) > 0
-    size = np.bincount(labels[chosen], minlength=segments.count + 1)
-    for frame in frames:
-        found = _reprojected(level, T_world_camera, [frame])
-        if unmarked and frame.dynamic.any():
-            marked = chosen & _seen_marked(found, 0)
-            still &= np.bincount(labels[marked], minlength=segments.count + 1) < DYNAMIC_SHARE * size
-        stand_still(segments, chosen, found.gap[0], found.difference[0], still)
-        if not still.any():  # what moves has mostly left its place since the oldest one
-            break
-    return chosen & still[labels]
+        segments, still = segmentation.with_noise(sigma, least_sigma), np.arange(segmentation.count + 1) > 0
+        for frame in frames:
+            found = _reprojected(level, T_world_camera, [frame])
+            stand_still(segments, dynamic, found.gap[0], found.difference[0], still)
+            if not still.any():  # what moves has mostly left its place since the oldest one
+                break
+        return dynamic & still[segments.labels]
 
 
 def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> Reprojection:
