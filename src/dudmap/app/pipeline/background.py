@@ -9,8 +9,9 @@ from dudmap.core.objects.moving_objects import MOST_WAITING
 
 WAITING = 2
 """Jobs that wait at most for the other thread: each holds the images of a frame."""
-POSTPONED = MOST_WAITING - 2
-"""Jobs that wait at most for an idle moment: the moving objects of a second, of which no more are kept."""
+POSTPONED = MOST_WAITING
+"""Jobs that wait at most for an idle moment: those of a second. A live run without idle moments so gives up the moving
+objects of its older frames (``MovingObjects``), not frames."""
 
 
 class Background:
