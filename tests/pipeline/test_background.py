@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from dudmap.app.pipeline.background import WAITING, Background
+from dudmap.app.pipeline.background import POSTPONED, WAITING, Background
 
 
 def test_jobs_are_done_in_order_in_one_other_thread():
@@ -47,3 +47,28 @@ def test_an_error_of_the_caller_is_not_replaced():
 
     with pytest.raises(KeyError, match="first"):
         fail(Background())
+
+
+def test_postponed_jobs_are_done_when_the_caller_has_time_and_at_the_end():
+    done = []
+    with Background(postponed=True) as background:
+        for n in range(POSTPONED + 2):
+            background.do(lambda n=n: done.append((n, threading.get_ident())))
+        assert done == [(0, threading.get_ident())], "too many waited"
+        assert background.next()
+        assert [n for n, _ in done] == [0, 1]
+    assert [n for n, _ in done] == list(range(POSTPONED + 2))
+    assert not background.next()
+
+
+def test_postponed_jobs_are_done_when_the_caller_is_interrupted():
+    done = []
+
+    def interrupted():
+        with Background(postponed=True) as background:
+            background.do(lambda: done.append(1))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert done == [1]

@@ -21,6 +21,7 @@ from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.keyframes import keyframe
 from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.dominant_motion import reproject, rigid_motion
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -31,8 +32,8 @@ SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_tra
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 BESIDE = "labels", "several voxel sizes"
 """Parts of all that a second process compiles, which take about as long as the others."""
-BESIDE_RUN = "labels", "mesh"
-"""Parts that it compiles while a run begins."""
+BESIDE_RUN = "motion between images", "labels", "mesh"
+"""Parts that it compiles while a run begins, in the order in which the frames need them."""
 
 
 def room(count: int) -> list[Frame]:
@@ -64,6 +65,10 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
             slam = Slam(CAMERA, Config().override([variant, *SMALL]))
             for frame in frames:
                 slam.process(frame)
+
+    def image_motion() -> None:
+        points = np.random.default_rng(0).uniform(1, 2, (60, 3))
+        rigid_motion(points, reproject(start, points, CAMERA), CAMERA, start)
 
     def labels() -> None:
         slam, detector = Slam(CAMERA, config), DynamicDetector(config.dynamics, config.sensor)
@@ -113,6 +118,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("map file", save_and_load),
         ("variants of the method", variants),
         ("synthetic frames", synthetic_frames),
+        ("motion between images", image_motion),
         ("labels", labels),
         ("several voxel sizes", several_voxel_sizes),
     ]

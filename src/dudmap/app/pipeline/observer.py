@@ -29,7 +29,7 @@ class RunObserver:
     All methods are called in the thread of the run, between two frames, when nothing changes the map.
 
     Attributes:
-        beside: Whether ``frame`` is called in another thread, in the order of the frames, while later ones are
+        beside: Whether ``frame`` may be called in another thread, in the order of the frames, while later ones are
             processed: for observers that do not look at the map.
     """
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -257,7 +258,8 @@ class Job:
                 else:
                     observer.start(state.slam, self.out, options.max_frames)
             mask_folder = self.out if options.save_masks and number == options.passes - 1 else None
-            with closing(self._frames(state)) as frames, Background() as background:
+            live = isinstance(self.sequence, LiveCamera)
+            with Background(postponed=live) as background, closing(self._frames(state, background)) as frames:
                 for frame in frames:
                     process_source(
                         frame, state.slam, state.record, self.display, mask_folder, background, self.observers
@@ -270,7 +272,7 @@ class Job:
         if store is not None:
             store.end(state)
 
-    def _frames(self, state: RunState) -> Generator[SourceFrame]:
+    def _frames(self, state: RunState, background: Background) -> Generator[SourceFrame]:
         """The frames of a pass that are left."""
         count, source, slam = self.options.max_frames, self.sequence, state.slam
         if isinstance(source, LiveCamera):
@@ -278,7 +280,7 @@ class Job:
             first = self._next_system(state)
             for frame in source.preview(PREVIEW):
                 first.process(frame)
-            return arriving(source, slam, self.masks, self.recorder)
+            return arriving(source, slam, self.masks, self.recorder, background.next)
         assert count is not None
         return read_ahead(source, count, self.options.ahead, self.masks, slam, state.next)
 
@@ -402,8 +404,7 @@ def process_source(
                 except OSError as error:
                     display.once(f"images for the report cannot be written: {error}; {MAKE_ROOM}")
 
-    def complete() -> None:
-        record.add_movers(row, result)
+    def keep_images() -> None:
         if mask_folder is not None and not result.rejected:
             try:
                 save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
@@ -411,7 +412,15 @@ def process_source(
                 display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
         tell(beside=True)
 
-    background.do(complete)
+    def complete() -> None:
+        record.add_movers(row, result)
+        keep_images()
+
+    if record.dropped is None:
+        background.do(complete)
+    else:  # what is postponed holds no images
+        keep_images()
+        background.do(partial(record.add_movers, row, result))
     tell(beside=False)
     if result.calibrated:
         display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")

@@ -121,8 +121,9 @@ class ObjectTracker(Stateful):
         if pixels is None or not objects:
             self._last = None
             return []
-        boxes = [trimmed_box(pixels.points[indices]) for indices in objects]
-        centroids = [pixels.points[indices].mean(axis=0, dtype=np.float64) for indices in objects]
+        clouds = [pixels.points[indices] for indices in objects]
+        boxes = [trimmed_box(points) for points in clouds]
+        centroids = [points.mean(axis=0, dtype=np.float64) for points in clouds]
         tracks = self._associate(timestamp, objects, centroids, boxes, pixels.predicted_id)
         frame = _instance_frame(timestamp, level, pixels, objects, tracks)
         known_displacements: dict[int, NDArray[np.float64]] = {}
@@ -192,13 +193,16 @@ class ObjectTracker(Stateful):
 
     def _split(self, indices: NDArray[np.int64], pixels: MovingPixels) -> list[NDArray[np.int64]]:
         """A region, split between the established objects that are predicted in it if there are several."""
+        least = MIN_SHARE * pixels.shape[0] * pixels.shape[1]
+        if len(indices) < 2 * least or len(self._tracks) < 2:
+            return [indices]
         predicted = pixels.predicted_id[indices]
         counts = np.bincount(predicted)
         ids = [
             track.id
             for track in self._tracks
             if track.id < len(counts)
-            and counts[track.id] >= MIN_SHARE * pixels.shape[0] * pixels.shape[1]
+            and counts[track.id] >= least
             and self._is_established(track, float(pixels.area[indices[predicted == track.id]].sum()))
         ]
         return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)

@@ -86,10 +86,10 @@ def connected_regions(
         return None
     tolerance = np.float32(0.02) + np.float32(0.02) * level.depth
     regions, count = labeling.grow_regions(moving, moving, level.depth, tolerance)
-    number = regions.reshape(-1)
+    flat = np.flatnonzero(moving)
+    number, depth = regions.reshape(-1)[flat], level.depth.reshape(-1)[flat]
     sizes = np.bincount(number, minlength=count + 1)
-    sizes[0] = 0
-    area = np.square(level.depth.reshape(-1)) / np.float32(level.camera.fx * level.camera.fy)
+    area = np.square(depth) / np.float32(level.camera.fx * level.camera.fy)
     areas = np.bincount(number, area, minlength=count + 1)
     areas[sizes < MIN_SHARE * moving.size] = 0
     kept = np.argsort(-areas, kind="stable")[:MAX_REGIONS]
@@ -98,17 +98,17 @@ def connected_regions(
         return None
     rank = np.full(count + 1, len(kept), dtype=np.int64)
     rank[kept] = np.arange(len(kept))
-    flat = np.flatnonzero(moving)
-    flat = flat[np.argsort(rank[number[flat]], kind="stable")][: sizes[kept].sum()]
+    order = np.argsort(rank[number], kind="stable")[: sizes[kept].sum()]
+    flat = flat[order]
     stops = np.cumsum(sizes[kept])
     ranges = [(int(stop - size), int(stop)) for stop, size in zip(stops, sizes[kept], strict=True)]
     v, u = np.divmod(flat, moving.shape[1])
     T = T_world_camera.astype(np.float32)
-    points = level.camera.points(u, v, level.depth.reshape(-1)[flat]) @ T[:3, :3].T + T[:3, 3]
+    points = level.camera.points(u, v, depth[order]) @ T[:3, :3].T + T[:3, 3]
     return MovingPixels(
         flat,
         np.asarray(points, np.float32),
-        np.asarray(area[flat], np.float32),
+        np.asarray(area[order], np.float32),
         predicted_ids[v // 2, u // 2],
         ranges,
         level.camera.shape,

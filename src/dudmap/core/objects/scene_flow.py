@@ -48,7 +48,7 @@ def displacements(
     number = now.ids.reshape(-1)[flat]
     chosen = [
         of[:: max(1, len(of) // PAIRED_PIXELS)]
-        for of in (flat[number == i] for i in np.unique(number) if int(i) in known)
+        for of in (flat[number == i] for i in sorted(known))
         if len(of) >= FEWEST_PIXELS
     ]
     if not chosen:
@@ -69,8 +69,8 @@ def displacements(
     plausible = np.linalg.norm(displacement, axis=1) < max_jump  # false for NaN, where a neighbour is another object's
     displacement, number = displacement[plausible], number[plausible]
     return {
-        int(i): median(displacement[number == i]).astype(np.float64)
-        for i in np.unique(number)
+        i: median(displacement[number == i]).astype(np.float64)
+        for i in sorted(known)
         if np.count_nonzero(number == i) >= FEWEST_PIXELS
     }
 

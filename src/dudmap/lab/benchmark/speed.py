@@ -130,14 +130,20 @@ from dudmap.config import Config
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.io.sequences import open_sequence
+from dudmap.lab.warmup import run_compiled_beside
 
 class First(RunObserver):
     def frame(self, index, read, result, ms):
         if index == 1:
-            print("pose", flush=True)
+            beside.__exit__(None, None, None)
             os._exit(0)
 
-run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False, observers=(First(),))
+beside = run_compiled_beside()
+with beside:
+    run(
+        open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False,
+        observers=(First(),),
+    )
 """
 """Program that ends at the first computed pose, that of the second frame; the first one is the identity."""
 
