@@ -120,10 +120,13 @@ def score_pair(
         mine = sorted(
             (c for c, owner in zip(found, owners, strict=True) if owner == number), key=lambda c: -len(c.points)
         )
-        false += [c.kind for c in mine[1:] if true.kind != "unknown"]
         if true.kind == "unknown":
             continue
         row: dict[str, Any] = {"thing": true.thing, "kind": true.kind, "size": true.size, "found": None}
+        if not true.common and {c.kind for c in mine[:2]} == {"disappeared", "appeared"}:
+            row["kind"] = mine[0].kind  # it showed other sides: nobody can know that it is one thing
+            del mine[1]
+        false += [c.kind for c in mine[1:]]
         if mine:
             row |= {"found": mine[0].kind, "iou": _iou(surface(mine[0]), surface(true))}
             if mine[0].T_after_before is not None and not np.array_equal(true.T_after_before, np.eye(4)):
