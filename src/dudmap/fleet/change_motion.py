@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
@@ -118,7 +118,7 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     ``up`` (3,) is the direction about which things turn most.
     """
     coarse, fine = (_Meeting(missing, new, count) for count in (COARSE, FINE))
-    starts = coarse.ranked(_starts(*coarse.sources, up))
+    starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
     centre = np.eye(4)
     centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
     first = [

@@ -20,15 +20,14 @@ from dudmap.core.backends.cpu.evidence import (
     static_sigma,
     weigh_readings,
 )
-from dudmap.core.backends.cpu.segment_motion import moving_segments
+from dudmap.core.backends.cpu.segment_motion import moving_segments, stand_still
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
-from dudmap.core.dynamics.background_model import BackgroundModel
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
-from dudmap.core.dynamics.temporal_memory import TemporalMemory
+from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
 from dudmap.core.frames.observation import Level, exposed
-from dudmap.core.map.volume import FREE, MapSample, TsdfVolume
+from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
@@ -189,9 +188,7 @@ class DynamicDetector(Stateful):
             if config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None and moving.any():
-                least = config.noise_threshold / 3
-                image = timestamp, level, T_world_camera, segmentation(), sigma
-                dynamic = dynamic | (moving & ~self.memory.stayed(*image, moving, least))
+                dynamic = dynamic | (moving & ~self._stands_on_map(frame, moving, segmentation()))
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -258,6 +255,23 @@ class DynamicDetector(Stateful):
             segmentation = replace(segmentation, labels=labels, count=count)
         settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic, least)
         return dynamic & ~settled, segmentation
+
+    def _stands_on_map(
+        self, frame: _Comparison, moving: NDArray[np.bool_], segmentation: Segmentation
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) that images show to move, but whose segment stands where the map has it (``stand_still``).
+
+        Corners go astray on silhouettes, in blur and on patterns that repeat. What of the moving part of a segment lies
+        on the map decides for all of it: the rest has come into view.
+        """
+        sample, (gain, offset) = frame.sample, frame.exposure
+        distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))
+        difference = sample.difference + (np.float32(1 - gain) * frame.level.intensity - np.float32(offset))
+        difference[np.isnan(difference)] = 0  # a surface without a colour
+        segments = segmentation.with_noise(frame.sigma, self.config.noise_threshold / 3)
+        still = np.arange(segments.count + 1) > 0
+        stand_still(segments, moving & (sample.occupancy == SURFACE), distance, difference, still)
+        return moving & still[segments.labels]
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
         """Pixels (h, w) far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019).

@@ -321,7 +321,15 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
     return TrueChange(
-        thing.name, kind, thing.size, thing.T_after_before, *changed, THINGS[thing.name][2], at, bool(common)
+        thing.name,
+        kind,
+        thing.size,
+        thing.T_after_before,
+        changed[0],
+        changed[1],
+        THINGS[thing.name][2],
+        at,
+        bool(common),
     )
 
 
