@@ -13,7 +13,9 @@ from dudmap.cli import app
 from dudmap.core.geometry import se3
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.fleet import change_benchmark
 from dudmap.fleet.change_benchmark import draw_pair, figures, score_pair
+from dudmap.fleet.change_colors import recolored_pieces
 from dudmap.fleet.change_evidence import BEHIND, CONFIRMED, DENIED, Visit
 from dudmap.fleet.change_objects import Piece, is_hidden_between
 from dudmap.fleet.change_watch import WATCH_FILE, ChangeWatch
@@ -111,6 +113,9 @@ def test_a_picture_with_other_colours_is_found_and_other_light_is_not():
     pair = Pair("poster:recoloured", 3, other_light=True, paths=("slow", "slow"))
     assert [thing["found"] for thing in pair.score["things"]] == ["recoloured"]
     assert pair.score["false"] == []
+    assert recolored_pieces(pair.found[1], 0.02, MIN_SIZE)
+    far = replace(pair.found[1], blur=10 * pair.found[1].blur)  # pixels that are larger than what is compared
+    assert recolored_pieces(far, 0.02, MIN_SIZE) == []
 
 
 def test_up_is_found(changed):
@@ -213,6 +218,11 @@ def test_the_score_counts_missed_false_and_wrong_kinds(changed):
     missed = score_pair(others, changed.truth, changed.maps[0].T_scene_world)
     assert [thing["found"] for thing in missed["things"]] == [None, "disappeared"]
     assert score_pair(changed.changes, changed.truth[1:], changed.maps[0].T_scene_world)["false"] == ["moved"]
+    moved = next(change for change in changed.changes if change.kind == "moved")
+    apart = [replace(moved, kind="disappeared", after=None), replace(moved, kind="appeared", before=None)]
+    for common, false in ((True, 1), (False, 0)):  # what showed other sides is rightly found as two
+        true = replace(changed.truth[0], common=common)
+        assert len(score_pair(apart, [true], changed.maps[0].T_scene_world)["false"]) == false
     wrong = [replace(change, kind="recoloured") for change in changed.changes]
     assert figures([score_pair(wrong, changed.truth, changed.maps[0].T_scene_world)])["kind_right"] == 0.0
 
@@ -248,6 +258,17 @@ def test_parts_are_joined_only_where_no_free_space_was_seen_between(changed):
     floating = Piece(np.arange(5), front + np.random.default_rng(1).normal(0, 0.01, (50, 3)), 0.01)
     assert is_hidden_between(piece(seen), behind, visit)
     assert not is_hidden_between(floating, behind, visit)  # the camera looked through the space between
+
+
+def test_given_changes_take_the_place_of_drawn_ones(tmp_path, monkeypatch):
+    told = []
+    row = {"scene": "desk", "seed": 1, "people": False, "things": [], "false": []}
+    monkeypatch.setattr(change_benchmark, "measure_pair", lambda pair, *_: told.append(pair) or dict(row))
+    words = ["benchmark", "changes", "--count", "2", "--changes", "box:moved", "--size", "0.1", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert [(pair["changes"], pair["size"]) for pair in told] == [([("box", "moved")], 0.1)] * 2
+    assert "| unchanged_pairs | 2 |" in done.output
 
 
 def test_a_fifth_of_the_pairs_has_no_change():

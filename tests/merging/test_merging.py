@@ -1,6 +1,7 @@
 """Merging of maps: samples against an analytic distance, exact sums, relative poses of rendered rooms, refusals."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DudmapError, MapError
+from dudmap.fleet import map_merging
 from dudmap.fleet.agreement import agreement
 from dudmap.fleet.map_fusion import BlockSums, block_sums, fuse_maps, fused
-from dudmap.fleet.map_merging import compare_maps
+from dudmap.fleet.map_merging import Hypothesis, compare_maps
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, surface_points
 from dudmap.fleet.merge import merge_runs
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
@@ -178,6 +180,20 @@ def test_two_maps_of_one_room_are_joined_at_the_true_pose(room):
     swapped = compare_maps(other.saved, room.saved)
     back = swapped.T_a_b @ pair.T_a_b
     assert np.linalg.norm(back[:3, 3]) < 0.005
+
+
+def test_maps_are_recognised_in_the_order_in_which_they_can_be(room, monkeypatch):
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    other = replace(room.saved, keyframes=room.saved.keyframes[:2])
+
+    def only_in(a, b, *_):
+        return [Hypothesis(T, 2, 50)] if len(a) > len(b) else []
+
+    monkeypatch.setattr(map_merging, "relative_poses", only_in)
+    monkeypatch.setattr(map_merging, "decided", lambda a, b, found, **_: found)
+    assert np.array_equal(compare_maps(room.saved, other)[0].T_a_b, T)
+    assert np.allclose(compare_maps(other, room.saved)[0].T_a_b, se3.inverse(T))
 
 
 @pytest.mark.parametrize(

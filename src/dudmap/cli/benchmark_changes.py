@@ -20,6 +20,11 @@ def changes(
         Path | None,
         Option(help="Put things into, and cut them out of, the second half of a real recording.", metavar="PATH"),
     ] = None,
+    changes: Annotated[
+        str | None,
+        Option(help="These in each pair, as for `synth`; none: nothing changed.", metavar="THING:KIND,..."),
+    ] = None,
+    size: Annotated[float | None, Option(help="Longest edge of boxes, balls and bins.", metavar="M")] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -29,6 +34,7 @@ def changes(
     """
     from dudmap.fleet.change_benchmark import figures, measure_changes
     from dudmap.io.sequences import open_sequence
+    from dudmap.lab.synthetic.visits import parsed_changes
 
     def told(row: dict[str, Any]) -> None:
         hits = sum(thing["found"] is not None for thing in row["things"])
@@ -36,7 +42,9 @@ def changes(
         say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
 
     recording = None if into is None else open_sequence(into)
+    given: dict[str, Any] = {} if changes is None else {"changes": parsed_changes(changes)}
+    given |= {} if size is None else {"size": size}
     config = o.read_config(None, None, assignments)
-    rows, text = measure_changes(seed, count, config, out, min_size, told, recording)
+    rows, text = measure_changes(seed, count, config, out, min_size, told, recording, given)
     tree = {"rows": rows, "figures": figures(rows), "out": out}
     answer(tree, f"{text}\nwritten to {out}", as_json=as_json)

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from dudmap.core.map import morton
 from dudmap.fleet.change_evidence import CONFIRMED, DEVIATIONS, Evidence
-from dudmap.fleet.change_objects import Piece, connected, is_wide
+from dudmap.fleet.change_objects import Piece, connected, facing, is_wide
 
 CELL, CELL_VOXELS = 0.05, 4
 """Edge of the cells in which colours are averaged, metres, and in voxels at least: several pixels."""
@@ -58,7 +58,9 @@ def recolored_pieces(
         share = len(piece.vertices) / max(len(inside), 1)
         is_large = piece.area > min_size**2 and is_wide(piece.points, min_size, min_size)
         rows = found.mesh.colors[piece.vertices].astype(float), found.other_color[piece.vertices].astype(float)
-        if share > solid and is_large and _is_paint(*rows, light):
+        vertices, cosines = facing(found, piece)
+        is_sharp = np.median(found.blur[vertices] / np.maximum(cosines, 1e-3)) < edge  # pixels on it are smaller
+        if share > solid and is_large and is_sharp and _is_paint(*rows, light):
             out.append((piece, float(share)))
     return out
 

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.se3 import agree
-from dudmap.fleet.change_evidence import CONFIRMED, Evidence, Visit
+from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 
@@ -22,9 +22,9 @@ Array = NDArray[np.float64]
 PAIRS, STARTS, TRIED = 20_000, 400, 12
 """Pairs of points that are drawn, those of a like colour and slope that give a motion, and the best motions that are
 registered."""
-COARSE, FINE, REFINED = 300, 1500, 4
+RANKED, COARSE, FINE, REFINED = 60, 300, 1500, 4
 """Points of a surface in the first step and when a pose is judged, and poses that are refined."""
-ICP_ROUNDS, STOP = 25, 1e-3
+ICP_ROUNDS, STOP = 12, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
 COLOR_LENGTH = 0.3
 """Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
@@ -46,15 +46,11 @@ of the shares of red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
 """Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
 two that are one: things of one make have the same texture, any others have about none."""
-RING = 0.15
-"""Width of the ring around a thing in which the planes that it stands on are looked for, metres."""
-LEAST_PLANE = 0.15
-"""Share of the surface in that ring from which on a plane is what a thing stands on or before."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Surface of a thing in one map: what the other map denies, and what belongs to it and is no background.
+    """Surface of a thing in one map: what the other map denies, and what is beside it or belongs to it.
 
     Attributes:
         points, normals: (n, 3) float64, common frame.
@@ -70,27 +66,20 @@ class Body:
     tolerance: float
 
     @classmethod
-    def of(cls, found: Evidence, piece: Piece, box: Array, reach: float) -> "Body":
-        """The surface around a piece and in a box (2, 3), without the planes that go on around it; and so far (m) from
-        the box what hangs together with the piece and the other map does not confirm: it may be hidden there."""
+    def of(cls, found: Evidence, piece: Piece) -> "Body":
+        """The surface in the box of a piece; and its length beside it what hangs together with it and the other map
+        does not confirm: it may be hidden there."""
         points, margin = found.points, float(np.median(found.tolerance[piece.vertices]))
 
         def within(far: float) -> NDArray[np.bool_]:
-            return np.all((points > box[0] - far) & (points < box[1] + far), axis=1)
+            return np.all((points > piece.box[0] - far) & (points < piece.box[1] + far), axis=1)
 
-        wide, near = within(RING), within(margin)
-        hidden = within(reach) & np.isin(found.parts, np.unique(found.parts[piece.vertices]))
-        inside = np.flatnonzero((near & wide) | hidden)
-        around = np.flatnonzero(wide & (found.state == CONFIRMED) & ~near)
-        keep = np.ones(len(inside), bool)
-        for normal, offset in _planes(points[around], found.mesh.normals[around].astype(float), margin):
-            flat = (np.abs(points[inside] @ normal - offset) < 2 * margin) & (found.mesh.normals[inside] @ normal > 0.8)
-            keep &= ~flat
-        numbers = np.union1d(inside[keep], piece.vertices)
-        denied, mesh = np.isin(numbers, piece.vertices), found.mesh
+        hidden = within(piece.length) & np.isin(found.parts, np.unique(found.parts[piece.vertices]))
+        numbers, mesh = np.flatnonzero(within(margin) | hidden), found.mesh
         return cls(
-            points[numbers], mesh.normals[numbers].astype(float), mesh.colors[numbers].astype(float), denied, margin
-        )
+            points[numbers], mesh.normals[numbers].astype(float), mesh.colors[numbers].astype(float),
+            np.isin(numbers, piece.vertices), margin,
+        )  # fmt: skip
 
     @cached_property
     def tree(self) -> KDTree:
@@ -106,29 +95,6 @@ class Body:
         if len(self.points) <= count:
             return self
         return self.chosen(np.sort(np.random.default_rng(1).choice(len(self.points), count, replace=False)))
-
-
-def _planes(points: Array, normals: Array, margin: float) -> list[tuple[Array, float]]:
-    """Normals (3,) and offsets of up to three planes that hold a share of some surface (n, 3)."""
-    out, left = [], np.ones(len(points), bool)
-    tried = np.random.default_rng(1).permutation(len(points))[:100]
-    for _ in range(3):
-        best = None
-        for number in tried:
-            on = (
-                left
-                & (np.abs((points - points[number]) @ normals[number]) < margin)
-                & (normals @ normals[number] > 0.9)
-            )
-            if best is None or on.sum() > best.sum():
-                best = on
-        if best is None or best.sum() < max(LEAST_PLANE * len(points), 10):
-            break
-        normal = normals[best].mean(axis=0)
-        normal /= np.linalg.norm(normal)
-        out.append((normal, float(np.median(points[best] @ normal))))
-        left &= ~best
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +118,9 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     ``up`` (3,) is the direction about which things turn most.
     """
     coarse, fine = (_Meeting(missing, new, count) for count in (COARSE, FINE))
-    a, b = coarse.sources
-    starts = sorted(_starts(a, b, up), key=lambda T: -coarse.share(T, max(0.1 * coarse.size, 3 * coarse.gate)))
+    starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
     centre = np.eye(4)
-    centre[:3, 3] = a.points.mean(axis=0)
+    centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
     first = [
         coarse.registered(T, 0.3 * coarse.size) for T in _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
     ]
@@ -186,8 +151,11 @@ class _Meeting:
         rows, shares = [], []
         for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
-            near = np.asarray(tree.query(np.hstack([points, self.shade * own.colors]))[1])
-            use = np.linalg.norm(points - other.points[near], axis=1) < gate
+            far = np.hypot(gate, self.shade * COLOR_GATE * np.sqrt(3))
+            near = np.asarray(tree.query(np.hstack([points, self.shade * own.colors]), distance_upper_bound=far)[1])
+            known = near < len(other.points)
+            near = np.where(known, near, 0)
+            use = known & (np.linalg.norm(points - other.points[near], axis=1) < gate)
             use &= (normals * other.normals[near]).sum(axis=1) > 0.5
             shares.append((use & (np.abs(own.colors - other.colors[near]).max(axis=1) < COLOR_GATE)).mean())
             met = other.points[near[use]]
@@ -197,6 +165,18 @@ class _Meeting:
             rows.append(ends)
         p, q, n = (np.concatenate(part) for part in zip(*rows, strict=True))
         return p, q, n, np.array(shares)
+
+    def ranked(self, starts: list[Array]) -> list[Array]:
+        """Motions (4, 4), those first that bring most of some points of both surfaces near the other's."""
+        scores, Ts = np.zeros(len(starts)), np.array(starts).reshape(-1, 4, 4)
+        gate = max(0.1 * self.size, 3 * self.gate)
+        for own, tree, T in zip(self.sources, self.trees, (Ts, np.linalg.inv(Ts)), strict=True):
+            some = own.sample(RANKED)
+            points = np.einsum("kij,nj->kni", T[:, :3, :3], some.points) + T[:, None, :3, 3]
+            colors = np.broadcast_to(self.shade * some.colors, points.shape)
+            gap = tree.query(np.concatenate([points, colors], axis=2).reshape(-1, 6), distance_upper_bound=gate)[0]
+            scores += np.isfinite(gap).reshape(len(starts), -1).mean(axis=1)
+        return [starts[n] for n in np.argsort(-scores, kind="stable")]
 
     def share(self, T: Array, gate: float) -> float:
         """Mean share of both surfaces that meet the other."""
@@ -209,7 +189,7 @@ class _Meeting:
             if len(p) < 10:
                 break
             step = _icp_step(p, q, n)
-            T, gate = se3.exp(step) @ T, 0.85 * gate
+            T, gate = se3.exp(step) @ T, 0.7 * gate
             if np.linalg.norm(step) < STOP:
                 break
         return T

@@ -94,16 +94,19 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
         return False
     if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
         return False
-    if np.median(_facing(found, piece.vertices[:: max(1, len(piece.vertices) // 500)])) < LEAST_FACING:
+    if np.median(facing(found, piece)[1]) < LEAST_FACING:
         return False
     blur = float(np.median(found.blur[piece.vertices]))
     return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
 
 
-def _facing(found: Evidence, vertices: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Cosine (n,) of the angle at which some keyframe sees each of some vertices best; negative from behind."""
+def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Some vertices (n,) of a piece and the cosine (n,) of the angle at which some view sees each best; negative from
+    behind."""
+    vertices = piece.vertices[:: max(1, len(piece.vertices) // 500)]
     rays = found.cameras[:, None] - found.points[vertices]
-    return (((rays * found.mesh.normals[vertices]).sum(axis=2)) / np.linalg.norm(rays, axis=2)).max(axis=0)
+    cosines = (rays * found.mesh.normals[vertices]).sum(axis=2) / np.linalg.norm(rays, axis=2)
+    return vertices, cosines.max(axis=0)
 
 
 def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:

@@ -27,8 +27,6 @@ from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
 from dudmap.io.exporting.gravity import CONE, PARALLEL
 
 Array = NDArray[np.float64]
-NEAR = 0.3
-"""Gap between surfaces of one thing that moved by less than its size, metres: they then are its opposite faces."""
 ON_SURFACE = 0.02
 """Gap to a change beside which other colours are those that it has left at the border, metres."""
 LEAST_UNKNOWN = 0.25
@@ -113,15 +111,15 @@ def _moved(
 
     Pieces between which something may be hidden are looked at apart and as one."""
     offered = [
-        [(p, is_certain(p, one, size)) for p in side + [q for q in assembled(side, own, 0.0) if q not in side]]
+        [(p, Body.of(one, p), is_certain(p, one, size)) for p in dict.fromkeys(side + assembled(side, own, 0.0))]
         for side, one, own in zip(pieces, found, visits, strict=True)
-    ]  # fmt: skip
+    ]
     up, motions = vertical(visits[0]), list[tuple[Motion, Piece, Piece]]()
-    for old, old_certain in offered[0]:
-        for now, now_certain in offered[1]:
+    for old, missing, old_certain in offered[0]:
+        for now, new, now_certain in offered[1]:
             near = gap_between(old, now) < max(old.length, now.length)  # a fragment may be of any thing farther off
             tried = (old_certain and now_certain) or ((old_certain or now_certain) and near)
-            motion = _motion(visits, found, old, now, up) if tried else None
+            motion = motion_between(*visits, missing, new, up) if tried else None
             if motion is not None:
                 motions.append((motion, old, now))
     out: list[Change] = []
@@ -144,24 +142,6 @@ def _moved(
             pieces[side][:] = [p for p in left if p not in parts]
         out.append(Change("moved", things[0], things[1], motion.fit, T))
     return out
-
-
-def _motion(
-    visits: tuple[Visit, Visit], found: tuple[Evidence, Evidence], old: Piece, now: Piece, up: Array
-) -> Motion | None:
-    """The motion from a missing piece to a new one, None if they are two things."""
-    boxes = [(old.box, now.box)]
-    if gap_between(old, now) < NEAR:  # the faces that it left and those that it reached may be opposite ones
-        both = np.stack([np.minimum(old.box[0], now.box[0]), np.maximum(old.box[1], now.box[1])])
-        boxes.append((both, both))
-    best: Motion | None = None
-    length = max(old.length, now.length)
-    for pair in boxes:
-        bodies = [Body.of(one, piece, box, length) for one, piece, box in zip(found, (old, now), pair, strict=True)]
-        motion = motion_between(*visits, bodies[0], bodies[1], up)
-        if motion is not None and (best is None or motion.explained > best.explained):
-            best = motion
-    return best
 
 
 def vertical(visit: Visit) -> Array:

@@ -13,7 +13,7 @@ from dudmap.atomic_file import write_text, writing
 from dudmap.core.geometry import se3
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
-from dudmap.fleet.agreement import MIN_OVERLAP
+from dudmap.fleet.agreement import MIN_AREA, MIN_OVERLAP
 from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_report import change_page, tinted
 from dudmap.fleet.changes import Change, find_changes, mesh_of
@@ -126,7 +126,9 @@ def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], N
     pair = compare_maps(maps[0], maps[1], changed=True)
     if pair.T_a_b is None:
         shared = pair.agreement
-        too_small = "" if shared is None or shared.enough else f"; at least {MIN_OVERLAP:.0%} is needed"
+        too_small = (
+            "" if shared is None or shared.enough else f"; at least {MIN_AREA:g} m2 and {MIN_OVERLAP:.0%} are needed"
+        )
         raise MapError(f"{maps[0].folder} and {maps[1].folder} cannot be compared: {pair.reason}{too_small}")
     return pair.tree(), pair.T_a_b
 

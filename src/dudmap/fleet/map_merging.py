@@ -154,11 +154,16 @@ def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
     Raises:
         MapError: A map has no surface.
     """
-    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
-    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    found = _recognised(a, b) or [replace(one, T_a_b=se3.inverse(one.T_a_b)) for one in _recognised(b, a)]
     if not found:
         return MapPair(None, NOT_RECOGNISED)
     return decided(MapSurface.of(a), MapSurface.of(b), found, changed=changed)
+
+
+def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
+    """Relative poses at which enough places of b are known in a; the other way round others may be."""
+    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
+    return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
 
 def decided(

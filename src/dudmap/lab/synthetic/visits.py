@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from dudmap.atomic_file import write_text
 from dudmap.core.geometry import se3
@@ -50,6 +51,7 @@ class TrueChange:
         before, after: Points (n, 3) of its surface that one visit saw and where the other looked through, or in both
             its surface for a change of the colour alone, metres.
         symmetric: Whether rotations about its vertical axis leave its shape as it is.
+        common: Whether both visits saw enough of the same sides of it to tell that it is one thing.
         at: (3,) its centre before, or after if it was not there before.
     """
 
@@ -61,11 +63,13 @@ class TrueChange:
     after: Array
     symmetric: bool
     at: Array
+    common: bool = True
 
     def tree(self) -> dict[str, Any]:
         """For a JSON file."""
         return {
             "thing": self.thing, "kind": self.kind, "size": round(self.size, 3), "symmetric": self.symmetric,
+            "common": self.common,
             "T_after_before": self.T_after_before.tolist(), "centre": self.at.round(4).tolist(),
             "before": self.before.round(4).tolist(), "after": self.after.round(4).tolist(),
         }  # fmt: skip
@@ -292,33 +296,41 @@ def _is_same(a: Primitive, b: Primitive) -> bool:
 def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
     """What the visits could see of a change: surface of one of them that the other saw, or looked through."""
     recoloured = thing.kind == "recoloured"
-    seen = []
+    changed, shown, areas = [], [], []
     for own, other, solids in zip(recordings, recordings[::-1], (thing.before, thing.after), strict=True):
-        surface = _surface(solids, thing.size, own) if solids else None
-        if surface is None:
-            seen.append((np.empty((0, 3)), 0.0))
+        if not solids:
+            changed.append(np.empty((0, 3)))
+            areas.append(0.0)
             continue
-        count = _views(surface, own) >= VIEWS
-        count &= (_views(surface, other) if recoloured else _looks_through(surface, other)) >= VIEWS
-        points = surface.vertices[count].astype(float)
-        share = surface.area() / max(len(surface.vertices), 1) * len(points)
-        seen.append((points, share))
+        surface = tessellate(solids, min(0.02, thing.size / 12), own.scene.extent, own.renderer.atlas)
+        vertices, seen = surface.vertices.astype(float), _views(surface, own) >= VIEWS
+        through = (_views(surface, other) if recoloured else _looks_through(surface, other)) >= VIEWS
+        changed.append(vertices[seen & through])
+        shown.append(vertices[seen])
+        areas.append(surface.area() / max(len(vertices), 1))
     edges = np.sort(np.ptp(_samples(thing.before or thing.after), axis=0))
     kind = "moved" if thing.kind == "opened" else thing.kind
-    enough = [area > LEAST_SEEN * edges[1] * edges[2] * (0.3 if kind == "moved" else 1) for _, area in seen]
+    least = LEAST_SEEN * edges[1] * edges[2] * (0.3 if kind == "moved" else 1)
+    enough, common = [area * len(points) > least for area, points in zip(areas, changed, strict=True)], True
     if kind == "moved" and not all(enough):
         kind = "disappeared" if enough[0] else "appeared" if enough[1] else "unknown"
+    elif kind == "moved":
+        moved = shown[0] @ thing.T_after_before[:3, :3].T + thing.T_after_before[:3, 3]
+        common = areas[0] * (KDTree(shown[1]).query(moved)[0] < CLEAR).sum() > least
     elif not any(enough):
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
     return TrueChange(
-        thing.name, kind, thing.size, thing.T_after_before, seen[0][0], seen[1][0], THINGS[thing.name][2], at
+        thing.name,
+        kind,
+        thing.size,
+        thing.T_after_before,
+        changed[0],
+        changed[1],
+        THINGS[thing.name][2],
+        at,
+        bool(common),
     )
-
-
-def _surface(solids: list[Primitive], size: float, recording: SyntheticSequence) -> Mesh:
-    detail = min(0.02, size / 12)
-    return tessellate(solids, detail, recording.scene.extent, recording.renderer.atlas)
 
 
 def _shots(recording: SyntheticSequence) -> list[tuple[Array, NDArray[np.float32]]]:
