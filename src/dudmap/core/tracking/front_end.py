@@ -200,6 +200,7 @@ class FrontEnd(Stateful):
                 view.segmentation,
                 prediction.moving,
                 tracking.exposure,
+                prediction.slow,
             )
             if view.blind:
                 labels = replace(labels, hidden=None)
