@@ -13,7 +13,7 @@ from dudmap.core.backends.cpu.evidence import (
     noise_limit,
 )
 from dudmap.core.backends.cpu.exposure import fit_exposure
-from dudmap.core.backends.cpu.image_comparison import AGREEING_SIGMAS
+from dudmap.core.backends.cpu.reprojection import AGREEING_SIGMAS
 from dudmap.core.backends.cpu.segment_motion import (
     COMMON_DISTANCE,
     COMMON_MISMATCH,

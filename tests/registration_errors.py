@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level, exposed
+from dudmap.core.frames.observation import Level, Pyramid, exposed
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam

@@ -73,7 +73,7 @@ VIEWS = {
 """What is compared of objects that hold more: spare room, threads, files, and what is of one process."""
 BACKENDS = {"CpuBackend", "WarpBackend"}
 PROCESS = {
-    "map_id", "_executor", "timings", "_detector", "_halvings", "_recorded_halvings", "_since", "postponed", "pass_ms",
+    "map_id", "_executor", "timings", "_detector", "_halvings", "_recorded_halvings", "_since", "_finding", "pass_ms",
 }  # fmt: skip
 """Names of attributes that are of one process, or follow from others."""
 

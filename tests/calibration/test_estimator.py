@@ -9,10 +9,9 @@ import pytest
 
 from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment, Fit
+from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.core.calibration.keyframes import KeyframeCollector, keyframe
-from dudmap.core.calibration.pairs import Pair, PairSet
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor

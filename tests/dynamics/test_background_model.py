@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.core.dynamics.background_model import BackgroundModel
+from dudmap.core.dynamics.temporal_memory import BackgroundModel
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera

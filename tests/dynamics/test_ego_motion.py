@@ -17,8 +17,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.mapper import Mapper
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import RELATIVE, first_failure
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.frame_view import PoseEstimate
+from dudmap.core.tracking.pose_prediction import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.lab import synthetic
@@ -123,14 +123,16 @@ def test_images_without_corners_tell_nothing(crowd):
 def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd):
     known, before, after = ego_motion.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
-    assert known.compare(0.0, *before) is None
-    known.update(0.0, np.eye(4), *before)
-    motion = known.compare(0.1, *after)
+    before = ego_motion.TrackedImage(0.0, np.eye(4), *before)
+    after, later = (ego_motion.TrackedImage(time, np.eye(4), *after) for time in (0.1, 0.2))
+    assert known.compare(before) is None
+    known.update(before)
+    motion = known.compare(after)
     assert motion is not None
-    assert known.compare(0.1, *after) is motion
-    assert known.compare(0.2, *after) is not motion
+    assert known.compare(after) is motion
+    assert known.compare(later) is not motion
     known.reset()
-    assert known.compare(0.1, *after) is None
+    assert known.compare(after) is None
     assert not known.active
 
 
@@ -181,8 +183,8 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
-    assert monitor.judge(view, well_known, lambda *_: None).reason == ""
-    assert "rest where the map" in monitor.judge(view, unknown, lambda *_: None).reason
+    assert monitor.judge(None, view, well_known, lambda *_: None).reason == ""
+    assert "rest where the map" in monitor.judge(None, view, unknown, lambda *_: None).reason
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd, followed):
@@ -337,9 +339,9 @@ def test_a_new_map_is_not_compared_with_images_of_the_one_before(monkeypatch):
     segmenter = ego_motion.EgoMotionSegmenter(1.0)
     for start in (0.0, 0.2):  # the second map begins while the images of the first are still young
         segmenter.start(start)
-        assert segmenter.slow_motion(start + 0.1, np.eye(4), None, None) is None
-        segmenter.update(start, np.eye(4), f"image at {start}", None)
-    segmenter.slow_motion(0.35, np.eye(4), None, None)
+        assert segmenter.slow_motion(ego_motion.TrackedImage(start + 0.1, np.eye(4), None, None)) is None
+        segmenter.update(ego_motion.TrackedImage(start, np.eye(4), f"image at {start}", None))
+    segmenter.slow_motion(ego_motion.TrackedImage(0.35, np.eye(4), None, None))
     assert compared == ["image at 0.2"]
 
 

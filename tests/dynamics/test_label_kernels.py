@@ -13,8 +13,8 @@ from dudmap.core.backends.cpu.evidence import (
     moving_pixels,
     weigh_readings,
 )
-from dudmap.core.backends.cpu.image_comparison import compare_images
 from dudmap.core.backends.cpu.labeling import opened
+from dudmap.core.backends.cpu.reprojection import compare_images
 from dudmap.core.backends.cpu.segment_motion import SegmentImage, moving_segments, stand_still
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.parameters import SURFACE, MapSample, single
@@ -116,9 +116,9 @@ def test_segments_that_stand_still(scene):
     differences = np.where(np.isnan(gaps), np.float32(np.nan), 0.01 * smooth(rng, 1))
     dynamic, settled = depth > 0, np.ones(33, bool)
     first, second = (label_oracle.still(segments, dynamic, *older) for older in zip(gaps, differences, strict=True))
-    stand_still(segments, dynamic, gaps[:1], differences[:1], settled)
+    stand_still(segments, dynamic, gaps[0], differences[0], settled)
     assert np.array_equal(settled[1:], first)
-    stand_still(segments, dynamic, gaps, differences, settled)
+    stand_still(segments, dynamic, gaps[1], differences[1], settled)
     expected = first & second
     assert np.array_equal(settled[1:], expected)
     assert 0 < expected.sum() < first.sum() < 32

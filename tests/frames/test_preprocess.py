@@ -9,7 +9,6 @@ import pytest
 from dudmap.config import PreprocessConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -158,7 +157,7 @@ def test_any_values_give_finite_output(radius):
     for alpha in (1e-9, 0.012, 100.0):
         result = observe(depth, fill_holes=True, filter="bilateral", filter_alpha=alpha, filter_radius=radius)
         for level in range(4):
-            for image in halved(result, level):
+            for image in result.halved(level):
                 assert np.isfinite(image).all()
                 assert image.min() >= 0
         assert result.depth.max() <= 6.0 + 1e-4
@@ -215,7 +214,7 @@ def test_pyramid_matches_blocks():
     rng = np.random.default_rng(5)
     depth = rng.choice([0, 1.0, 1.01, 1.5, 3.0, 3.05], (48, 64)).astype(np.float32)
     result = observe(depth)
-    half, intensity = halved(result, 1)
+    half, intensity = result.halved(1)
     assert half.shape == intensity.shape == CAMERA.scaled(1).shape
     blocks = depth.reshape(24, 2, 32, 2).transpose(0, 2, 1, 3).reshape(24, 32, 4)
     for v in range(24):
@@ -225,15 +224,15 @@ def test_pyramid_matches_blocks():
             same = readings[readings <= near + 0.02 * max(1, near)]
             assert half[v, u] == pytest.approx(same.mean() if len(same) else 0, abs=1e-6)
     assert np.allclose(intensity, result.intensity.reshape(24, 2, 32, 2).mean(axis=(1, 3)), atol=1e-6)
-    assert halved(result, 0)[0] is result.depth
-    assert halved(result, 3)[0].shape == (6, 8)
-    assert halved(result, 2)[0] is halved(result, 2)[0]
+    assert result.halved(0)[0] is result.depth
+    assert result.halved(3)[0].shape == (6, 8)
+    assert result.halved(2)[0] is result.halved(2)[0]
 
 
 def test_pyramid_of_odd_sizes():
     camera = Camera(60.0, 60.0, 31.5, 23.5, 61, 45)
     for level in range(2):
-        depth, intensity = halved(observe(np.ones((45, 61)), camera), level)
+        depth, intensity = observe(np.ones((45, 61)), camera).halved(level)
         assert depth.shape == intensity.shape == camera.scaled(level).shape
         assert np.allclose(depth, 1)
 

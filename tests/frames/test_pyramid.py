@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.pyramid import is_majority_dynamic, reduced
+from dudmap.core.frames.observation import Level, is_majority_dynamic, reduced
 from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)

@@ -8,8 +8,8 @@ from dudmap.config import Config
 from dudmap.core.backends.cpu.filtering import intensity
 from dudmap.core.backends.device import make_backend
 from dudmap.core.backends.parameters import LevelImage, RegistrationParameters
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.tracker import NO_STEP, Tracker

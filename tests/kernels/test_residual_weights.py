@@ -41,7 +41,7 @@ OWNERS = {
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
-        "core/map/fusion_parameters.py:fusion_parameters",  # hands them on, as do all that follow
+        "core/map/volume.py:fusion_parameters",  # hands them on, as do all that follow
         "core/tracking/tracker.py:_chi_square",
         "core/dynamics/detector.py:noise_parameters",
         "core/calibration/adjustment.py:__init__",
@@ -49,7 +49,7 @@ OWNERS = {
     ("noise.base", "noise.scale"): {
         "core/formulas/pixel.py",
         "core/backends/cpu/evidence.py:weigh_readings",  # hand them on
-        "core/backends/cpu/image_comparison.py:compare_images",
+        "core/backends/cpu/reprojection.py:compare_images",
     },
 }
 """Parameters of a formula, and the files or functions that may name them; everybody else calls the formula."""

@@ -10,8 +10,8 @@ from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, run_
 from dudmap.core.backends.descent import descend
 from dudmap.core.backends.parameters import LevelImage, to_lattice
 from dudmap.core.backends.threads import kernel
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.tracker import Tracker

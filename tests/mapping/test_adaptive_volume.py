@@ -9,10 +9,9 @@ from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import AdaptiveVolume
-from dudmap.core.map.incremental_mesh import IncrementalMesh
+from dudmap.core.map.incremental_mesh import IncrementalMesh, VolumeMirror
 from dudmap.core.map.refinement import MAX_CALM, _drop_calm
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.volume_mirror import VolumeMirror
 from dudmap.core.places.saved_map import MAP_FILE
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic

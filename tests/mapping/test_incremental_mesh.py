@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from dudmap.core.geometry import se3
-from dudmap.core.map.incremental_mesh import EDGE, IncrementalMesh
+from dudmap.core.map.incremental_mesh import EDGE, IncrementalMesh, VolumeMirror
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.volume_mirror import VolumeMirror
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 

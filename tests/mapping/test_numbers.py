@@ -15,10 +15,9 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import LOCAL_GRID
-from dudmap.core.map.fusion_parameters import fusion_parameters
-from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume import TsdfVolume, fusion_parameters
 from dudmap.core.slam import Slam
-from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.fleet.map_fusion import MAX_COUNT, BlockSums, fused
 from dudmap.lab import synthetic

@@ -46,7 +46,7 @@ def test_the_poses_of_a_young_map_become_better_and_the_map_follows(room, monkey
     assert np.array_equal(Ts[WINDOW:], returned[WINDOW:])  # registered to the new map, they need no correction
     history = slam.atlas.history
     assert history is not None
-    stored = dict(zip(history.timestamps, history.Ts_world_camera, strict=True))
+    stored = {frame.timestamp: frame.T_world_camera for frame in history.frames}
     poses = dict(zip(slam.trajectory.timestamps.tolist(), Ts, strict=True))
     assert all(np.allclose(T, poses[stamp], atol=1e-9) for stamp, T in stored.items())
     assert all(np.allclose(one.T_world_camera, poses[one.timestamp]) for one in slam.atlas.keyframes.keyframes)

@@ -11,7 +11,6 @@ from dudmap.app.pipeline.run import run
 from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.core.frames.observation import Level
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
@@ -33,7 +32,7 @@ def fused(sequence, frames):
         observation = preprocess(sequence[i])
         T = sequence.ground_truth.Ts_world_camera[i]
         poses[observation.timestamp] = T
-        depth, intensity = halved(observation, 1)
+        depth, intensity = observation.halved(1)
         level = Level(sequence.camera.scaled(1), depth, intensity)
         numbers = sequence.mover_numbers(i)[1::2, 1::2]
         movers = []

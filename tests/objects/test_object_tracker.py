@@ -1,6 +1,8 @@
 """Movers: identity, place, extent and velocity of moving objects, against made-up images and the synthetic truth."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -152,13 +154,9 @@ def test_lines_of_the_file(tmp_path):
     movers = tuple(ObjectTracker(MoversConfig()).update(0.0, mask, level, np.eye(4)))
     record = RunRecord()
     for stamp, found in [(1.5, movers), (1.6, ())]:
-        record.add(
-            SimpleNamespace(
-                timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
-                blind=False, uncertain="", movers=found, dynamic_share=0.1, timings={}, labels=None,
-                unobservable=(), rejected="", repeats="", checks={},
-            ), 1.0, 1.0, None,
-        )  # fmt: skip
+        row = {}
+        record.add_movers(row, SimpleNamespace(timestamp=stamp, movers=found))
+        assert row["movers"] >= 0
     record.save_movers(tmp_path / "movers.jsonl")
     (line,) = (json.loads(text) for text in (tmp_path / "movers.jsonl").read_text().splitlines())
     assert line["timestamp"] == 1.5
@@ -166,6 +164,23 @@ def test_lines_of_the_file(tmp_path):
     assert set(row) == {"id", "centroid", "box", "velocity", "speed", "age", "pixels"}
     assert row["pixels"] == mask.sum()
     np.testing.assert_allclose(row["centroid"], [0.3, 0, 2], atol=0.01)
+
+
+def test_movers_are_found_once_whoever_asks():
+    objects = MovingObjects(Config())
+    update = objects.tracker.update
+    objects.tracker.update = lambda *arguments: time.sleep(0.01) or update(*arguments)
+    finders = [
+        objects.update(
+            SimpleNamespace(timestamp=k / 30, labelled=level),
+            SimpleNamespace(labels=SimpleNamespace(dynamic=mask), T_world_camera=np.eye(4)),
+        )
+        for k, (mask, level) in enumerate(board(0.01 * k) for k in range(8))
+    ]
+    with ThreadPoolExecutor(2) as threads:
+        found = [list(threads.map(lambda find: find(), order)) for order in (finders, finders[::-1])]
+    assert [one.id for (one,) in found[0]] == [1] * 8
+    assert all(one is other for one, other in zip(found[0], found[1][::-1], strict=True))
 
 
 def test_movers_are_found_when_they_are_asked_for():
@@ -188,20 +203,6 @@ def test_movers_are_found_when_they_are_asked_for():
         (expected,) = direct.update(k / 30, mask, level, np.eye(4))
         assert found[k][0].id == expected.id
         assert found[k][0].velocity.tolist() == expected.velocity.tolist()
-
-
-def test_a_live_run_adds_movers_when_there_is_time():
-    record = RunRecord(dropped=0)
-    result = SimpleNamespace(
-        timestamp=1.5, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
-        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="",
-        repeats="", checks={}, movers=(),
-    )  # fmt: skip
-    record.add(result, 1.0, 1.0, None)
-    assert "movers" not in record.rows[0]
-    assert record.catch_up()
-    assert record.rows[0]["movers"] >= 0
-    assert not record.catch_up()
 
 
 def test_a_walking_person_in_the_whole_system():

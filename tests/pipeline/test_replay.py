@@ -42,8 +42,8 @@ class FakeSequence:
         return None
 
 
-def in_real_time(timestamps, idle=lambda: False, **options):
-    return arriving(ReplayCamera(FakeSequence(timestamps, **options)), idle=idle)
+def in_real_time(timestamps, **options):
+    return arriving(ReplayCamera(FakeSequence(timestamps, **options)))
 
 
 def replayed(timestamps, reading_s):
@@ -104,22 +104,6 @@ def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
     assert all(np.diff(indices) >= 1)
     assert len(indices) < 25
     assert isinstance(arrivals[0], SourceFrame)
-
-
-def test_other_work_is_done_while_no_frame_waits():
-    done, left = [], [True] * 3
-
-    def idle():
-        done.append(arrived[-1] if arrived else None)
-        return bool(left and left.pop())
-
-    arrived = []
-    for arrival in in_real_time(np.array([0.0, 0.2, 0.26, 0.3]), idle):
-        arrived.append(arrival.number)
-        time.sleep(0.2 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
-    assert arrived == [0, 1, 2, 3]
-    assert not left
-    assert 1 not in done
 
 
 def test_stopping_early_stops_the_sensor():

@@ -36,7 +36,7 @@ def test_frames_come_back_as_they_were():
     for n, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
         assert history.add(frame, mask, shifted(0.1 * n), submap=n // 4)
     assert len(history) == 7
-    assert history.submaps == [0, 0, 0, 0, 1, 1, 1]
+    assert [frame.submap for frame in history.frames] == [0, 0, 0, 0, 1, 1, 1]
     for n, stored in enumerate(history):
         assert stored.frame.timestamp == frames[n].timestamp
         np.testing.assert_allclose(stored.frame.depth, frames[n].depth, atol=0.51 * DEPTH_UNIT)
@@ -53,7 +53,7 @@ def test_like_frames_count_towards_the_last_kept_one():
     history = FrameStore(CAMERA, distance=0.08, angle_deg=5.0, gap=4)
     kept = [history.add(frame, everything, shifted(x)) for x in (0, 0.05, 0.07, 0.09, 0.09, 0.09, 0.09, 0.09)]
     assert kept == [True, False, False, True, False, False, False, True]
-    assert history.counts == [3, 4, 1]
+    assert [frame.count for frame in history.frames] == [3, 4, 1]
     turn = shifted(0.09) @ se3.exp([0, 0, 0, 0, np.radians(5.5), 0])
     assert history.add(frame, everything, turn)
     assert history.add(frame, everything, turn, submap=1)  # another map
@@ -109,7 +109,7 @@ def test_poses_replace_the_stored_ones_and_counts_are_weights(room):
     assert (view.depth > 0)[:, :70][expected[:, :70]].mean() > 0.8
     once, thrice = TsdfVolume(room.camera), TsdfVolume(room.camera)
     history.reintegrate(once, [0], [Ts[0]])
-    history.counts[0] = 3
+    history.frames[0].count = 3
     history.reintegrate(thrice, [0], [Ts[0]])
     slots = once.active_slots
     np.testing.assert_array_equal(slots, thrice.active_slots)

@@ -124,7 +124,7 @@ def test_the_number_depends_on_the_space_and_not_on_the_time():
         walker.see(T)
     early, late = max(walker.stored[200:300]), max(walker.stored[500:])
     assert late <= 1.05 * early < 100
-    stored = np.array([walker.history.Ts_world_camera[n][0, 3] for n in walker.history.kept])
+    stored = np.array([walker.history.frames[n].T_world_camera[0, 3] for n in walker.history.kept])
     assert np.all(np.abs(stored[:, None] - np.arange(0, 0.51, 0.05)).min(axis=0) < 1e-9)  # no place is left out
 
 
@@ -156,7 +156,7 @@ def test_poses_of_removed_images_are_corrected_as_before():
     assert [n for n in walker.history.kept if n < 7] == [0, 5, 6]
     nodes = walker.atlas.nodes(0)
     assert nodes == list(range(ENOUGH + 13))
-    Ts_new = np.stack([at(T[0, 3], 0.1 * n) for n, T in enumerate(walker.history.Ts_world_camera)])
+    Ts_new = np.stack([at(frame.T_world_camera[0, 3], 0.1 * n) for n, frame in enumerate(walker.history.frames)])
     walker.atlas.correct(nodes, Ts_new, walker.atlas.make_volume())
     found = [round(pose.T_world_camera[1, 3], 9) for pose in walker.atlas.poses]
     np.testing.assert_allclose(found, 0.1 * np.arange(ENOUGH + 13))
@@ -183,7 +183,7 @@ def test_a_loop_after_many_visits_gives_as_good_a_map():
             walker.see(drift @ true[index], images[index], np.ones(camera.shape, bool), fuse=True, thin=thin)
         stored.append(len(walker.history.kept))
         nodes = walker.atlas.nodes(0)
-        T_old = walker.history.Ts_world_camera[nodes[-turn]]
+        T_old = walker.history.frames[nodes[-turn]].T_world_camera
         loop = Edge(nodes[-turn], nodes[-1], se3.inverse(T_old) @ true[-1], 0.005, 0.003)
         assert walker.corrector.correct(loop) is not None
         walker.atlas.complete()

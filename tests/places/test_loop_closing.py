@@ -71,7 +71,7 @@ def test_everything_moves_along_with_a_correction():
     np.testing.assert_allclose(motion, shifted(0.0, 0.04), atol=1e-12)
     assert [round(pose.T_world_camera[1, 3], 6) for pose in atlas.poses] == [0, 0.02, 0.03, 0.04]
     assert [round(known.T_world_camera[1, 3], 6) for known in atlas.keyframes.keyframes] == [0, 0.02, 0.04]
-    np.testing.assert_allclose(atlas.history.Ts_world_camera, Ts_new)
+    np.testing.assert_allclose([frame.T_world_camera for frame in atlas.history.frames], Ts_new)
     assert atlas.volume is volume_before  # views of the map stay connected
     assert atlas.volume.map_id == volume.map_id
 
@@ -167,7 +167,9 @@ def test_join_brings_one_map_into_the_other():
     trajectory = atlas.trajectory(0)
     np.testing.assert_allclose(trajectory.Ts_world_camera[:, 1, 3], [0, 0, 0, 0.5, 0.5])
     np.testing.assert_allclose(trajectory.Ts_world_camera[:, 0, 3], 0.01 * np.arange(5))
-    assert {known.submap for known in atlas.keyframes.keyframes} == set(atlas.history.submaps) == {0}
+    assert (
+        {known.submap for known in atlas.keyframes.keyframes} == {frame.submap for frame in atlas.history.frames} == {0}
+    )
 
 
 def turned(yaw, fps=15.0, camera=SMALL):

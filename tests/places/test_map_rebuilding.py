@@ -53,8 +53,8 @@ def walked(max_blocks=None, submaps=(COUNT,), volume=CONFIG):
 def corrected(atlas, rise):
     """Close a loop by which the path rises by so much per second; returns the new poses."""
     nodes = atlas.nodes(atlas.current)
-    Ts = np.stack([at(T[0, 3], rise * n) for n, T in enumerate(atlas.history.Ts_world_camera) if n in nodes])
-    before = np.array([atlas.history.Ts_world_camera[n] for n in nodes])
+    Ts = np.stack([at(atlas.history.frames[n].T_world_camera[0, 3], rise * n) for n in nodes])
+    before = np.array([atlas.history.frames[n].T_world_camera for n in nodes])
     near = [nodes[i] for i in nearest_views(before, before[-1], MAX_IMMEDIATE)]
     provisional = atlas.make_volume()
     atlas.history.reintegrate(provisional, near, [Ts[nodes.index(n)] for n in near])
@@ -126,7 +126,7 @@ def test_a_second_loop_in_the_meantime_begins_anew():
     assert len(atlas.rebuildings) == 1
     atlas.complete()
     assert not atlas.rebuildings
-    np.testing.assert_allclose([T[1, 3] for T in atlas.history.Ts_world_camera], 0.02 * np.arange(COUNT))
+    np.testing.assert_allclose([frame.T_world_camera[1, 3] for frame in atlas.history.frames], 0.02 * np.arange(COUNT))
     assert content(atlas.volume) == content(at_once(atlas))
 
 

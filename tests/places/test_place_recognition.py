@@ -10,8 +10,9 @@ from dudmap.config import Config, RelocalizationConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree, kabsch, rigid_ransac
+from dudmap.core.geometry.alignment import kabsch, rigid_ransac
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.slam import Slam

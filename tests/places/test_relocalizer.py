@@ -11,8 +11,7 @@ from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
 from dudmap.core.places.relocalizer import Relocalizer
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import StageTimer
+from dudmap.core.tracking.frame_view import PoseEstimate, StageTimer
 from dudmap.core.tracking.tracker import TrackingResult
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)

@@ -92,6 +92,26 @@ def test_yaml_of_ros(folder):
     assert intrinsics_of(open_sequence(folder)) == (60, 61, 31, 23)
 
 
+@pytest.mark.parametrize("camera", ["Camera", "Camera1"])
+def test_settings_of_orb_slam(folder, camera):
+    lines = [
+        "%YAML:1.0",
+        "",
+        f'{camera}.type: "PinHole"',
+        f"{camera}.fx: 60.0",
+        f"{camera}.fy: 61.0",
+        f"{camera}.cx: 31.0",
+    ]
+    lines += [f"{camera}.cy: 23.0", f"{camera}.k1: 0.1", "Camera2.fx: 99.0", "Camera2.fy: 99.0", "Viewer.ViewpointX: 0"]
+    (folder / "D435i.yaml").write_text("\n".join([*lines, "RGBD.DepthMapFactor: 2000.0", ""]))
+    (folder / "other.yaml").write_text("fx: 7\n")
+    sequence = open_sequence(folder)
+    assert intrinsics_of(sequence) == (60, 61, 31, 23)
+    assert sequence.camera.distortion == (0.1, 0, 0, 0, 0)
+    assert sequence.camera.depth_scale == 2000
+    assert sequence.sources["intrinsics"] == "D435i.yaml"
+
+
 def test_a_lens_of_another_model_is_not_ignored(folder):
     fisheye = ROS_CALIBRATION.replace("plumb_bob", "equidistant")
     (folder / "calibration.yaml").write_text(fisheye)

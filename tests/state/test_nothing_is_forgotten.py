@@ -34,7 +34,7 @@ NO_STATE = {
         "Mapper._bootstrap", "Mapper._redundancy", "Slam.mapper", "FrontEnd.detector", "FrontEnd.motion",
         "BlockTree.blocks", "Atlas.volume",
     ),
-    "settings of maps that are only looked at (``see_farther``)": (
+    "settings of maps that are only looked at (``extend_range``)": (
         "TsdfVolume.depth_max", "TsdfVolume._reach", "TsdfVolume._window_cells",
     ),
 }  # fmt: skip

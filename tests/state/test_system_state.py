@@ -112,7 +112,7 @@ def test_what_a_snapshot_does_not_copy_never_changes(tmp_path, settings):
         slam.process(dark(sequence[index]) if 12 <= index < 15 else sequence[index])
         snapshot = take_snapshot(parts_of(slam), database)
         taken += [(array, zlib.crc32(array.copy())) for array in map(snapshot.arrays.__getitem__, snapshot.constant)]
-    assert len(taken) > 1000
+    assert len(taken) > 500
     assert all(zlib.crc32(array.copy()) == before for array, before in taken)
 
 
@@ -128,7 +128,7 @@ def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch
     slam = Slam(sequence.camera, Config().override(settings))
     for frame in frames[:18]:
         slam.process(frame)
-    Ts = slam.atlas.history.Ts_world_camera
+    Ts = [frame.T_world_camera for frame in slam.atlas.history.frames]
     farther = se3.exp(np.array([0, 0, 0.003, 0, 0, 0]))
     last = len(Ts) - 1
     edge = Edge(0, last, farther @ se3.inverse(Ts[0]) @ Ts[last], 0.005, 0.003)

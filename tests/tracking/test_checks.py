@@ -9,7 +9,7 @@ import pytest
 from dudmap import Config, Slam
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
-from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 
@@ -88,13 +88,13 @@ def test_only_the_last_frame_overrules_an_unusual_residual(tracked, monkeypatch,
     worse = 1.1 * max(4 * np.median(slam.monitor.history.residuals), CONFIG.sensor.sigma(1.0))
     unusual = PoseEstimate(replace(estimate.tracking, residual=worse), estimate.labels)
     monkeypatch.setattr(slam.monitor.images, "compare", lambda *_: comparison)
-    reason = slam.monitor.judge(view, unusual, lambda *_: None).reason
+    reason = slam.monitor.judge(None, view, unusual, lambda *_: None).reason
     assert (reason == "") == accepted, reason
     if not accepted:
         assert "were to be expected" in reason
     for lost in (False, True):  # whatever happened before
         slam.monitor.recovering = lost
-        assert (slam.monitor.judge(view, unusual, lambda *_: None).reason == "") == accepted
+        assert (slam.monitor.judge(None, view, unusual, lambda *_: None).reason == "") == accepted
     slam.monitor.recovering = False
 
 
@@ -106,4 +106,4 @@ def test_where_most_of_the_view_moves_the_last_frame_overrules_nothing(tracked, 
     for share, accepted in ((0.3, True), (0.7, False)):
         dynamic = np.indices(view.labelled.depth.shape)[1] < share * view.labelled.camera.width
         unusual = PoseEstimate(replace(estimate.tracking, residual=worse), SimpleNamespace(dynamic=dynamic))
-        assert (slam.monitor.judge(view, unusual, lambda *_: None).reason == "") == accepted
+        assert (slam.monitor.judge(None, view, unusual, lambda *_: None).reason == "") == accepted

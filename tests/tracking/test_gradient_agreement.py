@@ -8,7 +8,7 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking import tracker as tracker_module
-from dudmap.core.tracking.gradient_agreement import GradientAgreement
+from dudmap.core.tracking.observability import GradientAgreement
 from dudmap.core.tracking.tracker import Tracker
 from textured_corner import SENSOR, corner, corner_map, level_of, ones
 

@@ -6,15 +6,15 @@ import pytest
 from dudmap.config import Config
 from dudmap.core.formulas.damping import damped_step
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import MAX_DRIFT
-from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, unobserved_motion
+from dudmap.core.tracking.pose_prediction import MotionModel
 from dudmap.core.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)

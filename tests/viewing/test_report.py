@@ -122,6 +122,8 @@ def test_figures_configuration_plots_and_losses_are_there(page, text):
     assert text.count("<svg") == 3
     for title in ("Time per stage", "Share of the readings", "Residuals"):
         assert title in said
+    assert ">0.1</text>" in text  # the densities of the residuals are numbers
+    assert "mathdefault" not in text
 
 
 def test_names_of_a_recording_are_no_markup(text):

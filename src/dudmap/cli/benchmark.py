@@ -107,27 +107,30 @@ def _print_world(row: dict[str, Any]) -> None:
 
 
 @app.command()
+@o.grouped
 def calls(
+    reading: o.ReadingOptions,
     recording: Annotated[Path | None, Argument(help="Recording; default: a synthetic room with a person.")] = None,
     max_frames: Annotated[int, Option(min=44, help="Number of frames; the first 40 are not counted.")] = 60,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
     """Count the kernel launches, barriers, Python calls and source files of an ordinary frame, and time its stages."""
-    from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.calls import count_calls, stage_table, summary
+    from dudmap.lab.benchmark.calls import count_calls, memory_rate, stage_table, summary
     from dudmap.lab.benchmark.suites import Entry
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
-    source = room.open() if recording is None else open_sequence(recording)
+    source = room.open() if recording is None else reading.open(recording)
     costs = count_calls(source, o.read_config(None, None, assignments), max_frames)
     tree = summary(costs)
     text = ", ".join(f"{value:.0f} {name}" for name, value in tree.items())
-    answer(tree, f"{text}\n{stage_table(costs)}", as_json=as_json)
+    answer(tree, f"{text}\n{stage_table(costs, memory_rate())}", as_json=as_json)
 
 
 @app.command()
+@o.grouped
 def faults(
+    reading: o.ReadingOptions,
     recording: Annotated[
         Path | None, Argument(help="Recording with true poses; default: a synthetic room with people.")
     ] = None,
@@ -140,11 +143,10 @@ def faults(
     as_json: o.JsonOption = False,
 ) -> None:
     """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
-    from dudmap.io.sequences import open_sequence
     from dudmap.lab.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
 
     config = o.read_config(None, None, assignments)
-    source = default_room(max_frames, width, seed) if recording is None else open_sequence(recording)
+    source = default_room(max_frames, width, seed) if recording is None else reading.open(recording)
     lines, failed, rows = [table_head(source.name, max_frames)], 0, []
     say(lines[0], err=as_json)
     for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], max_frames):
@@ -192,7 +194,9 @@ def gate(
 
 
 @app.command()
+@o.grouped
 def consistency(
+    reading: o.ReadingOptions,
     recording: Annotated[Path, Argument(help="Recording.")],
     trajectories: Annotated[
         list[Path] | None, Argument(help="Trajectories of it in TUM text, or folders of runs.")
@@ -203,10 +207,9 @@ def consistency(
     """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DatasetError
-    from dudmap.io.sequences import open_sequence
     from dudmap.lab.benchmark.consistency import measure_consistency
 
-    source = open_sequence(recording)
+    source = reading.open(recording)
     truth = {} if source.ground_truth is None else {"published": source.ground_truth}
     files = [path / "trajectory.txt" if path.is_dir() else path for path in trajectories or []]
     found = truth | {str(path): Trajectory.load(path) for path in files}

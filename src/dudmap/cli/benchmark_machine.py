@@ -63,12 +63,12 @@ def speed(
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Measure time and memory on this machine, which should be idle otherwise."""
+    """Measure time and memory on this machine, which should be idle otherwise, and what the stages of a frame cost."""
     from dudmap.lab.benchmark.measure import save
-    from dudmap.lab.benchmark.speed import markdown, speed_figures
+    from dudmap.lab.benchmark.speed import markdown, speed_figures, stages
 
     figures = speed_figures(20 if quick else 300, _announced, open3d, sequence)
-    text, tree = markdown(figures), {"figures": [figure._asdict() for figure in figures]}
+    text, tree = f"{markdown(figures)}\n{stages()}", {"figures": [figure._asdict() for figure in figures]}
     answer(save(None, text, out, "speed", tree), text, as_json=as_json, out=out)
 
 

@@ -7,19 +7,16 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import OlderImage
 from dudmap.core.dynamics.masks import full_size, grown_mask
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import exposed_color
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.frames.observation import Level, exposed_color, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
 
@@ -46,8 +43,35 @@ class StartFrame:
     fused: bool
 
 
+@dataclass(frozen=True, eq=False)
+class FusedFrame:
+    """A fused frame whose pose is estimated once more.
+
+    Attributes:
+        frame: Depth and colour.
+        level: Finest level of the registration.
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that make the colours those of the map.
+        dynamic_mask: (H, W) bool, pixels that were not fused.
+    """
+
+    frame: Frame
+    level: Level
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    dynamic_mask: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> "FusedFrame":
+        """What of a frame is needed."""
+        observation, fine = view.observation, view.pyramid.fine
+        frame = Frame(observation.timestamp, observation.depth, observation.rgb)
+        level = Level(fine.camera, fine.depth, fine.intensity)  # without the images it is made from
+        return cls(frame, level, estimate.T_world_camera, estimate.exposure, dynamic_mask)
+
+
 class Bootstrap(Stateful):
-    """Knows the first frames of a map, and what of them must be taken back.
+    """The first frames of a map, parts of which must be taken out of it again.
 
     A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
     not declare dynamic, and motion that is slow shows only after a while. What moved is taken out of the first frame as
@@ -62,7 +86,7 @@ class Bootstrap(Stateful):
 
     textureless: Remembered[bool] = False
     _frames: Remembered[list[StartFrame]]
-    _window: Remembered[list[StartFrame]]
+    _window: Remembered[list[FusedFrame]]
     _num_fused: Remembered[int] = 0
 
     def __init__(self) -> None:
@@ -78,42 +102,47 @@ class Bootstrap(Stateful):
 
     def start(self, view: FrameView, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember the frame that a map was made of."""
-        first = StartFrame(view, PoseEstimate.at_origin(), dynamic_mask, fused=True)
-        self._frames, self._window, self._num_fused = [first], [first], 1
+        estimate = PoseEstimate.at_origin()
+        self._frames, self._num_fused = [StartFrame(view, estimate, dynamic_mask, fused=True)], 1
+        self._window = [FusedFrame.of(view, estimate, dynamic_mask)]
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember what was fused after the first frame, or that the map began anew with it."""
         if not self._window:
             return
-        if view.timestamp <= self._window[0].view.timestamp:
+        if view.timestamp <= self._window[0].frame.timestamp:
             self._window, self._num_fused = [], 0
         if self._num_fused % WINDOW_STEP == 0:
-            self._window.append(StartFrame(view, estimate, dynamic_mask, fused=True))
+            self._window.append(FusedFrame.of(view, estimate, dynamic_mask))
         self._num_fused += 1
 
-    def complete_window(self) -> list[StartFrame]:
+    def complete_window(self) -> list[FusedFrame]:
         """Every ``WINDOW_STEP``-th fused frame, in the order of time, once these are ``WINDOW``; they are forgotten
         then. Before, none."""
         if not self._window or self._num_fused < WINDOW:
             return []
         window, self._window = self._window, []
-        return sorted(window, key=lambda frame: frame.view.timestamp)
+        return sorted(window, key=lambda fused: fused.frame.timestamp)
 
     def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
         """Remember another frame of the first moments."""
         if self._frames:
             self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
 
-    def recolored(self, view: FrameView) -> StartFrame | None:
-        """The first frame with other colours; None if it is no longer remembered."""
-        if self._frames:
-            self._frames[0] = replace(self._frames[0], view=view)
-        return self._frames[0] if self._frames else None
+    @property
+    def first(self) -> FrameView | None:
+        """The first frame; None if it is no longer remembered."""
+        return self._frames[0].view if self._frames else None
+
+    def recolored(self, view: FrameView) -> StartFrame:
+        """The first frame, which is remembered, with other colours."""
+        self._frames[0] = replace(self._frames[0], view=view)
+        return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
-        """The first frame with the mask it should have been fused with; None where the map is right as it is.
+        """The first frame with a mask to which what moved in it is added; None where the map holds nothing of that.
 
-        The others then count as not fused.
+        The later frames then count as not fused, since the map is made anew.
 
         Args:
             moving_before: (h, w) bool, label resolution, what a later image shows to have moved in the first; None if
@@ -131,25 +160,22 @@ class Bootstrap(Stateful):
         return first
 
     def released(self) -> list[StartFrame]:
-        """The frames that are to be fused yet, without what has moved until the last of them; they are forgotten.
+        """The frames that are still to be fused, without what has moved until the last of them; they are forgotten.
 
         A frame that follows no common motion with the last one is left out.
         """
         if not self._frames:
             return []
         last, frames = self._frames[-1], [frame for frame in self._frames[:-1] if not frame.fused]
-        now = last.view.timestamp
-        interval = (now - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
+        now = last.view.tracked_at(last.estimate.T_world_camera)
+        interval = (now.timestamp - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
         self._frames = []
         out = []
         for frame in frames:
-            before = frame.view
-            older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
-            intervals = (now - before.timestamp) / interval
-            T_world_camera = last.estimate.T_world_camera
-            motion = older.motion_to(last.view.pyramid, last.view.segmentation(), T_world_camera, intervals)
+            older = frame.view.tracked_at(frame.estimate.T_world_camera)
+            motion = older.motion_to(now, (now.timestamp - older.timestamp) / interval)
             if motion is not None and older.moving is not None:
-                moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
+                moving = full_size(older.moving, frame.view.labelled.depth, frame.view.observation.depth)
                 out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
         return out if last.fused else [*out, last]
 
@@ -188,7 +214,7 @@ class Mapper:
         self._predictor, self._color_motion, self._redundancy = predictor, color_motion, redundancy
         self._localize = localize
 
-    def revise_start(self, view: FrameView, prediction: PosePrediction) -> None:
+    def revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
         """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
         can be seen, fuse the frames that were held back until then."""
         self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
@@ -198,7 +224,7 @@ class Mapper:
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
-        first = self._color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        first = self._color_motion.first_frame(self._bootstrap.first, view.timestamp, estimate.T_world_camera)
         self._begin_anew(None if first is None else self._bootstrap.recolored(first), view)
 
     def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:
@@ -218,7 +244,7 @@ class Mapper:
         if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
-    def refine_start(self, tracker: Tracker) -> NDArray[np.float64] | None:
+    def refine_first_poses(self, tracker: Tracker) -> NDArray[np.float64] | None:
         """Once the map has seen enough, register the frames of its first moments again and make it anew of them.
 
         The first frames were registered to a map of few others, whose noise they followed. In the map of all of them
@@ -236,26 +262,24 @@ class Mapper:
         if not window or self._localize or atlas.current == atlas.saved or atlas.current in atlas.rebuildings:
             return None
         volume, Ts, time_sigma = atlas.volume, [], self._config.sensor.color_time_sigma
-        for view, estimate, mask in ((frame.view, frame.estimate, frame.dynamic_mask) for frame in window):
-            level, T_world_camera = view.pyramid.fine, estimate.T_world_camera
-            discount = motion_discount(level, atlas.velocity_at(view.timestamp), time_sigma, volume.voxel_size)
-            found = tracker.align(
-                volume, [level], T_world_camera, initial_weights([level], None, [mask]), len(view.pyramid.tracked) - 1,
-                estimate.exposure, tracker.config.color_weight * discount,
-            )  # fmt: skip
+        finest = len(self._config.tracker.widths) - 1
+        for fused in window:
+            level, velocity = fused.level, atlas.velocity_at(fused.frame.timestamp)
+            color_weight = tracker.config.color_weight
+            color_weight *= motion_discount(level, velocity, time_sigma, volume.voxel_size)
+            weights = initial_weights([level], None, [fused.dynamic_mask])
+            found = tracker.align(volume, [level], fused.T_world_camera, weights, finest, fused.exposure, color_weight)
             if not found.converged:
                 return None
             Ts.append(found.T_world_camera)
-        before = np.stack([frame.estimate.T_world_camera for frame in window])
+        before = np.stack([fused.T_world_camera for fused in window])
         after = before[0] @ se3.inverse(Ts[0]) @ np.stack(Ts)  # the first camera is the world
         atlas.make_room()
         new = atlas.make_volume()
-        for frame, T in zip(window, after, strict=True):
-            observation = frame.view.observation
-            color = exposed_color(observation.rgb, frame.estimate.exposure)
-            again = Frame(observation.timestamp, observation.depth, color)
-            new.integrate(again, T, self._static(frame.dynamic_mask, observation.depth), WINDOW_STEP)
-        stamps = np.array([frame.view.timestamp for frame in window])
+        for fused, T in zip(window, after, strict=True):
+            frame = replace(fused.frame, color=exposed_color(fused.frame.color, fused.exposure))
+            new.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
+        stamps = np.array([fused.frame.timestamp for fused in window])
         corrections = after @ se3.inverse(before)
         atlas.move(stamps, corrections, new)
         self._redundancy.apply_correction(corrections[-1])

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
-from dudmap.core.color_calibration import ColorCalibration
+from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame, FrameArrays
+from dudmap.core.frames.observation import Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid
 from dudmap.core.frames.stream_check import Rejection, StreamCheck
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -28,16 +28,13 @@ from dudmap.core.places.loop_verification import LoopQuery
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.core.result import FrameResult
-from dudmap.core.slam_results import SlamArguments, SlamResults
+from dudmap.core.result import FrameResult, SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView, StageTimer
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
+from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.errors import ConfigError
@@ -125,8 +122,8 @@ class Slam(SlamResults, Stateful):
         if prior is not None:
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
-            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
-            self.monitor.go_on_from(saved_map.registrations)
+            self.atlas.continue_in(saved_map, self.camera, max_blocks)
+            self.monitor.continue_from(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
@@ -192,11 +189,11 @@ class Slam(SlamResults, Stateful):
         view = replace(view, blind=True) if self._is_blind(view) else view
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
-            self._refine_start()
+            self._refine_first_poses()
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
-        self.mapper.revise_start(view, prediction)
+        self.mapper.revise_first_frame(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        verdict = self.monitor.judge(view, estimate, prediction.image_pose)
+        verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
@@ -207,7 +204,7 @@ class Slam(SlamResults, Stateful):
         self._accept(view, estimate)
         unobserved, ambiguous = estimate.unobserved_motion, self.predictor.ambiguity(view, prediction, estimate)
         uncertain = unobserved or ambiguous
-        fuse = self._is_news(view, estimate, uncertain)
+        fuse = self._adds_information(view, estimate, uncertain)
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
@@ -253,10 +250,10 @@ class Slam(SlamResults, Stateful):
             self.front_end.lose(view.timestamp)
         return view
 
-    def _refine_start(self) -> None:
+    def _refine_first_poses(self) -> None:
         """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
         wanted = self.prior_map is None and not self.live
-        if wanted and (correction := self.mapper.refine_start(self.tracker)) is not None:
+        if wanted and (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
             self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:
@@ -281,7 +278,6 @@ class Slam(SlamResults, Stateful):
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-        self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
@@ -310,6 +306,7 @@ class Slam(SlamResults, Stateful):
         if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
+            self.predictor.ego_motion.reset()
             self.relocalizer.found()
             self.redundancy.reset()
             return self._start_map(replace(view, blind=False))
@@ -322,7 +319,7 @@ class Slam(SlamResults, Stateful):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _is_news(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
+    def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
         """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
         with view.timer("similarity"):
             known = view.blind or uncertain or self.localize
@@ -353,7 +350,7 @@ class Slam(SlamResults, Stateful):
         """Learn the calibration of the colour camera; returns whether a new one is in use from the next frame on."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
         if calibrated:  # the pose of the last image is that of colours elsewhere
-            self.monitor.images.reset()
+            self.predictor.ego_motion.reset()
         return calibrated
 
     def _result(

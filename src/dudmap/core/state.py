@@ -21,7 +21,7 @@ class Stateful:
     """Remembers something from frame to frame."""
 
     def state(self) -> dict[str, Any]:
-        """What is remembered, by name; evaluated where it was being computed."""
+        """The remembered attributes by name; those that a thread is computing are waited for."""
         return {name: getattr(self, name) for name in remembered(type(self))}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -103,6 +103,7 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
         axes.plot(r, part, color=color, label=f"{name}: {100 * p:.1f} %, sigma {s:.2f}")
     axes.plot(r, sum(parts), color=REFERENCE, linewidth=1, linestyle="--", label="mixture")
     axes.set(xlabel="residual, standard deviations of the reading", ylabel="density", yscale="log")
+    axes.yaxis.set_major_formatter("{x:g}")  # powers would be written as formulas, which the report does not parse
     low = counts[counts > 0].min() / counts.sum() / widths.max() if counts.any() else 1e-6
     highest = counts.max() / max(counts.sum(), 1) / widths.min()
     axes.set_ylim(low / 2, 3 * max(highest, low))

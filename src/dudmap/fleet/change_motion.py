@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.fleet.change_evidence import CONFIRMED, Evidence, Visit
 from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed

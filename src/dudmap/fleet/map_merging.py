@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase
 from dudmap.core.places.saved_map import SavedMap

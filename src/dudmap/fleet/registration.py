@@ -19,7 +19,7 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_array
 
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map import morton
 from dudmap.core.places.place_recognition import Keyframe
 from dudmap.core.places.saved_map import MAP_FILE

@@ -18,9 +18,8 @@ import numpy as np
 from dudmap.app.doctor import compiled_kernels
 from dudmap.config import Config
 from dudmap.core.backends.threads import num_threads
-from dudmap.core.calibration.adjustment import Adjustment, Fit
+from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.keyframes import keyframe
-from dudmap.core.calibration.pairs import Pair, PairSet
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import Calibration

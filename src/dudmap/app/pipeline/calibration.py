@@ -21,7 +21,7 @@ from dudmap.core.calibration.estimator import (
 )
 from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.pyramid import HALVING_BAND
+from dudmap.core.frames.observation import HALVING_BAND
 from dudmap.core.geometry.calibration import PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError

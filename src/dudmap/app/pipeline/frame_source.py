@@ -101,11 +101,6 @@ class FrameQueue:
         self._held: list[SourceFrame] = []
         self._closed = False
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no item waits."""
-        return not self._held
-
     def put(self, item: SourceFrame) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
@@ -130,13 +125,11 @@ def arriving(
     slam: "Slam | None" = None,
     masks: "MaskFolder | None" = None,
     recorder: "Recorder | None" = None,
-    idle: Callable[[], bool] = lambda: False,
 ) -> Generator[SourceFrame]:
     """Frames of a camera, taken and prepared by a thread of their own; those for which the consumer leaves no room
     (``FrameQueue``) are dropped and counted in the next one. The camera is closed at the end.
 
-    The ``recorder`` receives all frames, dropped or not. ``idle`` is called while no frame waits: it does a few
-    milliseconds of other work and returns True, or has none.
+    The ``recorder`` receives all frames, dropped or not.
 
     Raises:
         CameraError: The camera stopped to deliver frames.
@@ -162,11 +155,7 @@ def arriving(
     with ThreadPoolExecutor(1, thread_name_prefix="dudmap-camera") as thread:
         future = thread.submit(deliver)
         try:
-            while True:
-                while queue.is_empty and idle():
-                    pass
-                if (frame := queue.take()) is None:
-                    break
+            while (frame := queue.take()) is not None:
                 yield frame._replace(dropped=frame.number - last - 1)
                 last = frame.number
             future.result()

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.atomic_file import atomic_file, write_text
-from dudmap.core.objects.moving_objects import MOST_WAITING
 from dudmap.core.result import FrameResult
 from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
@@ -41,7 +40,6 @@ class RunRecord:
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
-        postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
         counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
             directions of motion are observable.
         warnings: Sentences on what looked wrong in the recording before the run.
@@ -59,7 +57,6 @@ class RunRecord:
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
-    postponed: list[tuple[dict[str, Any], FrameResult]] = field(default_factory=list, metadata=CACHE)
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
@@ -111,28 +108,19 @@ class RunRecord:
             self.checks.append(frame | known)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
-        self.postponed.append((row, result))
-        if self.dropped is None or len(self.postponed) > MOST_WAITING:
-            self.catch_up()
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
-    def catch_up(self) -> bool:
-        """Add the moving objects of the first frame that lacks them; returns whether one did."""
-        if not self.postponed:
-            return False
-        (row, result), start = self.postponed.pop(0), time.perf_counter()
-        if result.movers:
-            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]}
+    def add_movers(self, row: dict[str, Any], result: FrameResult) -> None:
+        """Add the moving objects of a frame to its row of ``rows``, after those of the frames before; meanwhile another
+        thread may add later frames."""
+        start, movers = time.perf_counter(), result.movers
+        if movers:
+            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in movers]}
             self.movers.append(json.dumps(line))
         row["movers"] = round(1000 * (time.perf_counter() - start), 3)
-        return True
-
-    def _complete(self) -> None:
-        while self.catch_up():
-            pass
 
     def skip(self, error: "FrameError") -> None:
         """Count a frame that cannot be read or used."""
@@ -144,7 +132,6 @@ class RunRecord:
 
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
-        self._complete()
         _write_table(path, self.rows, "0")
 
     def save_checks(self, path: Path) -> None:
@@ -153,7 +140,6 @@ class RunRecord:
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
-        self._complete()
         write_text(path, "".join(f"{line}\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:

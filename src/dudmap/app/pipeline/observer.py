@@ -27,7 +27,13 @@ class RunObserver:
     """Observer of a run; this one does nothing.
 
     All methods are called in the thread of the run, between two frames, when nothing changes the map.
+
+    Attributes:
+        beside: Whether ``frame`` is called in another thread, in the order of the frames, while later ones are
+            processed: for observers that do not look at the map.
     """
+
+    beside = False
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""

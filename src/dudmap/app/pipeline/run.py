@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream of a camera begins."""
+MAKE_ROOM = "make room on the disk of the run folder"
 
 
 def run(
@@ -255,12 +257,14 @@ class Job:
                 else:
                     observer.start(state.slam, self.out, options.max_frames)
             mask_folder = self.out if options.save_masks and number == options.passes - 1 else None
-            with closing(self._frames(state)) as frames:
+            with closing(self._frames(state)) as frames, Background() as background:
                 for frame in frames:
-                    process_source(frame, state.slam, state.record, self.display, mask_folder, self.observers)
+                    process_source(
+                        frame, state.slam, state.record, self.display, mask_folder, background, self.observers
+                    )
                     state.next = frame.number + 1
                     if store is not None:
-                        store.frame(state, frame.read.frame)
+                        store.frame(state, frame.read.frame, background)
                     if len(state.record.rows) == options.max_frames:
                         break
         if store is not None:
@@ -274,7 +278,7 @@ class Job:
             first = self._next_system(state)
             for frame in source.preview(PREVIEW):
                 first.process(frame)
-            return arriving(source, slam, self.masks, self.recorder, state.record.catch_up)
+            return arriving(source, slam, self.masks, self.recorder)
         assert count is not None
         return read_ahead(source, count, self.options.ahead, self.masks, slam, state.next)
 
@@ -353,9 +357,11 @@ def process_source(
     record: RunRecord,
     display: RunProgress,
     mask_folder: Path | None,
+    background: Background,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> None:
-    """Process one frame, count it, save its mask, and report it."""
+    """Process one frame, count it, save its mask, and report it; what no later frame waits for is done in the
+    background."""
     index, read = source.number, source.read
     if record.dropped is not None:
         record.dropped += source.dropped
@@ -385,16 +391,28 @@ def process_source(
         record.masked += given_mask is not None
     delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
-    if mask_folder is not None and not result.rejected:
-        try:
-            save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
-        except OSError as error:
-            display.once(f"masks cannot be written: {error}; make room on the disk of the run folder")
-    for observer in observers:
-        try:
-            observer.frame(index, read, result, 1000 * (end - start))
-        except OSError as error:
-            display.once(f"images for the report cannot be written: {error}; make room on the disk of the run folder")
+    row = record.rows[-1]
+    read = read._replace(prepared=None)  # what waits in the background holds no pyramids
+
+    def tell(*, beside: bool) -> None:
+        for observer in observers:
+            if observer.beside == beside:
+                try:
+                    observer.frame(index, read, result, row["total"])
+                except OSError as error:
+                    display.once(f"images for the report cannot be written: {error}; {MAKE_ROOM}")
+
+    def complete() -> None:
+        record.add_movers(row, result)
+        if mask_folder is not None and not result.rejected:
+            try:
+                save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+            except OSError as error:
+                display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
+        tell(beside=True)
+
+    background.do(complete)
+    tell(beside=False)
     if result.calibrated:
         display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

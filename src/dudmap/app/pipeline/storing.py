@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.environment import versions
 from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
@@ -179,11 +180,12 @@ class RunStore:
         except sqlite3.Error as error:
             raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
 
-    def frame(self, state: RunState, frame: "Frame | Exception") -> None:
-        """A frame was processed; take a checkpoint if one is due."""
+    def frame(self, state: RunState, frame: "Frame | Exception", background: Background) -> None:
+        """A frame was processed; take a checkpoint if one is due, with all that the background does for the frames."""
         if not isinstance(frame, Exception):
             self._files.append(self._out / "masks" / f"{frame.timestamp:.6f}.png")
         if self.is_due:
+            background.wait()
             self.take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.core.map.incremental_mesh import Chunk, IncrementalMesh
-from dudmap.core.map.volume_mirror import VolumeMirror
+from dudmap.core.map.incremental_mesh import Chunk, IncrementalMesh, VolumeMirror
 
 if TYPE_CHECKING:
     from dudmap.core.map.volume import TsdfVolume

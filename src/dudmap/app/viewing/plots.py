@@ -32,7 +32,7 @@ def plots(run: RunFiles) -> dict[str, str]:
     if (run.folder / "residuals.npz").is_file():
         with _drawing("residuals") as (figure, picture):
             axes = figure.subplots()
-            figure.subplots_adjust(top=0.8)  # room for the legend
+            figure.subplots_adjust(left=0.13, top=0.8)  # room for numbers and legend
             draw_residuals(axes, run.folder / "residuals.npz")
         out["Residuals"] = picture[0]
     return out

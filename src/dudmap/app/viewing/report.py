@@ -66,6 +66,8 @@ class Thumbnails(RunObserver):
     one is removed.
     """
 
+    beside = True
+
     def __init__(self) -> None:
         self._out, self._count, self._next, self._step = Path(), None, 0, 1
         self._kept: list[list[Path]] = []

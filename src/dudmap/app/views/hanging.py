@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.geometry.mesh import Mesh, pieces
+from dudmap.core.geometry.mesh import Mesh, component_of_vertices
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.io.exporting.mesh_editing import face_areas
 
@@ -30,7 +30,7 @@ def hanging(mesh: Mesh) -> NDArray[np.bool_]:
     """Vertices (V,) of the pieces that hang in the air."""
     from scipy.spatial import KDTree
 
-    piece = pieces(mesh)
+    piece = component_of_vertices(mesh)
     area = np.bincount(piece[mesh.faces[:, 0]], face_areas(mesh), minlength=piece.max(initial=0) + 1)
     small = area[piece] < LARGEST
     if small.all() or not small.any():

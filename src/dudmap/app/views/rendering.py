@@ -172,7 +172,7 @@ def render_run(
     """
     camera = view_camera(run, size)
     if whole:
-        run.volume.see_farther(_farthest(run, trajectory))
+        run.volume.extend_range(_farthest(run, trajectory))
     if out.suffix.lower() == PICTURE and not out.is_dir():
         color, _ = _view(run, trajectory.Ts_world_camera[0], camera)
         write_image(out, color)

@@ -16,18 +16,18 @@ class DescentRules(NamedTuple):
     Attributes:
         basis: (6, m) directions of a twist along which the pose may move.
         damping: First damping, relative to the diagonal of H.
-        limit: Largest number of steps that are tried.
+        max_steps: Largest number of steps that are tried.
         stop: Norm of a step (m, rad) below which it is the last one.
         stop_gain: Relative change of the cost below which a short step is.
-        taken: Norm of a step below which it is made whatever it costs.
+        accept_below: Norm of a step below which it is accepted whatever its cost.
     """
 
     basis: NDArray[np.float64]
     damping: float
-    limit: int
+    max_steps: int
     stop: float
     stop_gain: float
-    taken: float
+    accept_below: float
 
 
 class Descent(NamedTuple):
@@ -64,7 +64,7 @@ def descend(
     """
     T, damping, used = T_world_camera, rules.damping, int(first is None)
     system = linearize(T) if first is None else first
-    for _ in range(rules.limit):
+    for _ in range(rules.max_steps):
         if not np.diag(system.H).max() > 0:
             break
         step = damped_step(system.H, system.b, rules.basis, damping)

@@ -9,10 +9,12 @@ import gc
 import hashlib
 import inspect
 import os
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cache, cached_property, partial, update_wrapper
+from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -20,6 +22,24 @@ from typing import Any, TypeVar
 from numba import njit
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
+
+
+def _import_numba() -> None:
+    """Import what Numba needs before its first kernel, without SciPy's linear algebra.
+
+    Numba imports it only to learn whether there is a BLAS, for products of vectors, which no kernel has. That takes as
+    long as loading all kernels of the first frames.
+    """
+    blas = "scipy.linalg.cython_blas"
+    if blas not in sys.modules:
+        sys.modules[blas] = None  # pyright: ignore[reportArgumentType] - so that its import fails
+        try:
+            import_module("numba.np.arraymath")
+        finally:
+            del sys.modules[blas]
+
+
+_import_numba()
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 _OPTIONS: dict[str, Any] = {

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment, Fit
+from dudmap.core.calibration.adjustment import Adjustment, Fit, PairSet, select_across, select_pairs
 from dudmap.core.calibration.keyframes import ColorKeyframe
-from dudmap.core.calibration.pairs import PairSet, select_across, select_pairs
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -163,8 +162,8 @@ class CalibrationEstimator:
         return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
-        """By how many of their standard deviations the estimates of all parameters from both halves of the time differ
-        (root mean square, 1 at least): by so much the standard deviations are too small."""
+        """Factor (at least 1) by which standard deviations are too small: the root mean square difference between the
+        parameters from both halves of the time, in standard deviations."""
         everything, finest = np.ones(NUM_PARAMETERS, dtype=bool), self.adjustment.levels[-1:]
         with ThreadPoolExecutor(self.workers) as pool:
             solved = pool.map(lambda n: self.adjustment.solve(halves[n], starts[n], everything, finest), (0, 1))
@@ -211,12 +210,12 @@ class CalibrationEstimator:
         return before, {}
 
     def _trial(self, halves: list[PairSet], before: "_Trial", names: Sequence[str]) -> "_Trial":
-        """What groups of parameters would explain in addition to those that are free."""
+        """Fits in which groups of parameters are free in addition to those that were."""
         free = before.free | mask_of([member for name in names for member in GROUPS[name]])
         return self._freed(halves, before.fits, free)
 
     def _freed(self, halves: list[PairSet], starts: list[Fit], free: NDArray[np.bool_]) -> "_Trial":
-        """Fits with some free parameters, from others on."""
+        """Fits of both halves with some free parameters, from these starts."""
         # only the geometry can displace the colours by so much that the smallest images have to begin
         levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
 

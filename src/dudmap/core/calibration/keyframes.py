@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from dudmap.core.backends.median import median
 from dudmap.core.frames.color_registration import recorded_intensity
 from dudmap.core.frames.observation import Observation
-from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -89,7 +88,7 @@ def keyframe(
 
     level = halvings_to(GEOMETRY_WIDTH, observation.camera)
     camera = observation.camera.scaled(level)
-    depth, _ = halved(observation, level)
+    depth, _ = observation.halved(level)
     moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
     readings = depth[moving & (depth > 0)]
     distance = float(median(readings)) if len(readings) else 1.0
@@ -181,7 +180,8 @@ class KeyframeCollector(Stateful):
         if self._pending is not None:
             middle, T, mask = self._pending
             before = self._before
-            if before is not None and now - before[0] <= self.max_gap and self._is_due(middle.timestamp):
+            due = self.keyframes[-1].timestamp + self._interval - 1e-3 if self.keyframes else -np.inf
+            if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
                 velocity = central_velocity(before, (now, T_world_camera))
                 self.keyframes.append(keyframe(middle, self.given, T, velocity, mask))
                 if len(self.keyframes) > MAX_KEYFRAMES:
@@ -199,6 +199,3 @@ class KeyframeCollector(Stateful):
         self.interrupt()
         self.keyframes.clear()
         self._interval = INTERVAL
-
-    def _is_due(self, timestamp: float) -> bool:
-        return not self.keyframes or timestamp - self.keyframes[-1].timestamp >= self._interval - 1e-3

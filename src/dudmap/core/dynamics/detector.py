@@ -23,10 +23,9 @@ from dudmap.core.backends.cpu.evidence import (
 from dudmap.core.backends.cpu.segment_motion import moving_segments, stand_still
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
-from dudmap.core.dynamics.background_model import BackgroundModel
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
-from dudmap.core.dynamics.temporal_memory import TemporalMemory
+from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
 from dudmap.core.frames.observation import Level, exposed
 from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
@@ -275,7 +274,7 @@ class DynamicDetector(Stateful):
         difference[np.isnan(difference)] = 0  # a surface without a colour
         segments = segmentation.with_noise(frame.sigma, self.config.noise_threshold / 3)
         still = np.arange(segments.count + 1) > 0
-        stand_still(segments, moving & (sample.occupancy == SURFACE), distance[None], difference[None], still)
+        stand_still(segments, moving & (sample.occupancy == SURFACE), distance, difference, still)
         return moving & still[segments.labels]
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:

@@ -14,17 +14,8 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.optical_flow import (
-    FLOW_WIDTH,
-    RETURN_PX,
-    WINDOW,
-    consistent_with_static,
-    lengths,
-    scaled_window,
-    track_forward_backward,
-)
-from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.frames.observation import FLOW_WIDTH, WINDOW, Level, Pyramid, scaled_window
+from dudmap.core.frames.optical_flow import RETURN_PX, consistent_with_static, lengths, track_forward_backward
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
@@ -230,7 +221,7 @@ def dominant_motion(
     Returns:
         None if too few corners follow one motion.
     """
-    fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
+    fine, fine_after, first, second = before.fine, after.fine, before.fine.grey, after.fine.grey
     camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
     points = before.corner_points

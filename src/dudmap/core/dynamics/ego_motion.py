@@ -5,7 +5,8 @@ A new map knows no free space, and whoever is in view is part of it. Each image 
 """
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +18,28 @@ from dudmap.core.dynamics.dominant_motion import (
     propagate_to_segments,
 )
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.pyramid import Pyramid, is_majority_dynamic
+from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 
+ImagePose = Callable[[], NDArray[np.float64] | None]
+"""Computes the pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
 """Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
 the map is young, images are kept at intervals of the shorter one."""
 
 
 @dataclass(eq=False)
-class OlderImage:
-    """A tracked image that later ones are compared with.
+class TrackedImage:
+    """Image of a frame, at its pose or a prediction of it, which is compared with older ones and later with newer ones.
 
     Attributes:
-        timestamp: Seconds.
-        T_world_camera: (4, 4).
+        timestamp, T_world_camera: Seconds; (4, 4).
         pyramid: Its images.
         segmentation: Its segments, at the resolution of the labels.
         moving: (h, w) bool, its pixels that are known to move; None for none.
+        blind: Whether its intensities say nothing.
+        gain: Of its exposure.
     """
 
     timestamp: float
@@ -43,26 +47,18 @@ class OlderImage:
     pyramid: Pyramid
     segmentation: Segmentation
     moving: NDArray[np.bool_] | None = None
+    blind: bool = False
+    gain: float = 1.0
 
-    def motion_to(
-        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
-    ) -> DominantMotion | None:
-        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image.
+    def motion_to(self, later: "TrackedImage", intervals: float) -> DominantMotion | None:
+        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image; None
+        if it cannot be determined. ``intervals`` of consecutive images lie between the two.
 
         What is seen to move in this image is left out of the estimates of the next comparisons.
-
-        Args:
-            pyramid: The later image.
-            segmentation: Its segments.
-            T_world_camera: (4, 4) prediction of its pose.
-            intervals: Number of intervals between consecutive images that lie between the two.
-
-        Returns:
-            None if it cannot be determined.
         """
-        T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
-        segmentations = self.segmentation, segmentation
-        motion = dominant_motion(self.pyramid, pyramid, segmentations, self.moving, T_expected, intervals)
+        T_expected = se3.inverse(later.T_world_camera) @ self.T_world_camera
+        segmentations = self.segmentation, later.segmentation
+        motion = dominant_motion(self.pyramid, later.pyramid, segmentations, self.moving, T_expected, intervals)
         if motion is not None:
             moving = propagate_to_segments(motion.before, whole_only=True)
             self.moving = moving if self.moving is None else self.moving | moving
@@ -71,7 +67,7 @@ class OlderImage:
 
 @dataclass(frozen=True, eq=False)
 class SlowMotion:
-    """What an image and an older one tell.
+    """Motion between an older image and a new one that is too slow to be seen from image to image.
 
     Attributes:
         T_world_camera: (4, 4) pose of the new image, from that of the older one.
@@ -95,21 +91,20 @@ class EgoMotionSegmenter(Stateful):
 
     Attributes:
         active: Whether the next frame is to be compared with the last one.
+        last: The last tracked frame.
     """
 
     active: Remembered[bool] = False
     _young_until: Remembered[float]
     _latest_end: Remembered[float]
     _started: Remembered[float]
-    _last_timestamp: Remembered[float]
-    _last: Remembered[tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None] = None
-    _older: Remembered[deque[OlderImage]]
+    last: Remembered[TrackedImage | None] = None
+    _older: Remembered[deque[TrackedImage]]
     _compared: Remembered[tuple[float, DominantMotion | None] | None] = None  # time and result of the last comparison
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self._young_until, self._latest_end = -np.inf, -np.inf
-        self._started = self._last_timestamp = -np.inf
+        self._young_until = self._latest_end = self._started = -np.inf
         self._older = deque()
 
     def start(self, timestamp: float) -> None:
@@ -131,98 +126,68 @@ class EgoMotionSegmenter(Stateful):
         """Whether the map is younger than the longest baseline over which slow motion is looked for."""
         return timestamp < self._started + min(LONGEST_BASELINE, self.seconds)
 
-    def update(
-        self,
-        timestamp: float,
-        T_world_camera: NDArray[np.float64],
-        pyramid: Pyramid,
-        segmentation: Segmentation,
-        moving: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Take over a tracked frame as the one that the next is compared with.
-
-        Args:
-            timestamp: Seconds.
-            T_world_camera: (4, 4) its pose.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
-            moving: (h, w) bool, its moving pixels, if known.
-        """
-        self._last, self._last_timestamp, self._compared = (pyramid, segmentation, moving), timestamp, None
-        young = self.map_is_young(timestamp)
-        hidden = moving is not None and is_majority_dynamic(moving, pyramid.labelled)
+    def update(self, frame: TrackedImage) -> None:
+        """Take over a tracked frame as the one that the next is compared with; with a blind one nothing is."""
+        self.last, self._compared, self.active = frame, None, False
+        if frame.blind:
+            return
+        young = self.map_is_young(frame.timestamp)
+        hidden = frame.moving is not None and is_majority_dynamic(frame.moving, frame.pyramid.labelled)
         self.active = young or (hidden and self.seconds > 0 and self.started)
         if not young:
             self._older.clear()
-        elif not self._older or timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
-            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation, moving))
+        elif not self._older or frame.timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
+            self._older.append(replace(frame))
 
     def reset(self) -> None:
         """Drop the last frame: nothing is compared before the next ``update``."""
-        self._last, self._compared, self.active = None, None, False
+        self.last, self._compared, self.active = None, None, False
 
-    def compare(
-        self,
-        timestamp: float,
-        pyramid: Pyramid,
-        segmentation: Segmentation,
-        T_expected: NDArray[np.float64] | None = None,
-    ) -> DominantMotion | None:
-        """Motion of the static world since the last frame; None if it cannot be determined.
+    def compare(self, now: TrackedImage, T_expected: NDArray[np.float64] | None = None) -> DominantMotion | None:
+        """Motion of the static world since the last frame, expected to be ``T_expected`` (4, 4) if that is known; None
+        if it cannot be determined.
 
         The result is kept: a second call with the same timestamp returns the same object.
-
-        Args:
-            timestamp: Seconds, of the new frame.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
-            T_expected: (4, 4) predicted motion of the static world; None: none.
         """
-        if self._last is None:
+        last = self.last
+        if last is None or last.blind:
             return None
-        if self._compared is None or self._compared[0] != timestamp:
-            last, segmentation_last, moving = self._last
-            motion = dominant_motion(last, pyramid, (segmentation_last, segmentation), moving, T_expected)
-            self._compared = timestamp, motion
+        if self._compared is None or self._compared[0] != now.timestamp:
+            segmentations = last.segmentation, now.segmentation
+            motion = dominant_motion(last.pyramid, now.pyramid, segmentations, last.moving, T_expected)
+            self._compared = now.timestamp, motion
             if (
                 motion is not None
-                and self.map_is_young(timestamp)
-                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
+                and self.map_is_young(now.timestamp)
+                and exceeds_noise_share(motion.moving_after, now.pyramid.labelled)
             ):
-                self._young_until = min(timestamp + self.seconds, self._latest_end)
+                self._young_until = min(now.timestamp + self.seconds, self._latest_end)
         return self._compared[1]
 
-    def slow_motion(
-        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, segmentation: Segmentation
-    ) -> SlowMotion | None:
+    def slow_motion(self, now: TrackedImage) -> SlowMotion | None:
         """Comparison with an older image; None once the map is not young, or where they follow no common motion.
 
         Where that shows something to move, the newest of the older images is compared, too: what came into view since
         the oldest one was taken moves in neither comparison otherwise.
-
-        Args:
-            timestamp: Seconds, of the new frame.
-            T_world_camera: (4, 4) prediction of its pose.
-            pyramid: Its images.
-            segmentation: Its segments, at the resolution of the labels.
         """
+        timestamp = now.timestamp
         while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
             self._older.popleft()
         older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
-        if not older or not self.map_is_young(timestamp):
+        if not older or self.last is None or not self.map_is_young(timestamp):
             return None
         oldest, newest = older[0], older[-1]
-        interval = timestamp - self._last_timestamp
+        interval = timestamp - self.last.timestamp
         ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
-        motion = oldest.motion_to(pyramid, segmentation, T_world_camera, ages[0])
+        motion = oldest.motion_to(now, ages[0])
         if motion is None:
             return None
-        T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
+        now = replace(now, T_world_camera=oldest.T_world_camera @ se3.inverse(motion.T_after_before))
         moving, static = propagate_to_segments(motion.after, whole_only=True), motion.static_after
         first = oldest.moving if oldest.timestamp == self._started else None
-        if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
-            motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
+        if newest is not oldest and exceeds_noise_share(moving, now.pyramid.labelled):
+            motion = newest.motion_to(now, ages[1])
             if motion is not None:
                 moving = moving | propagate_to_segments(motion.after, whole_only=True)
                 static = static | motion.static_after
-        return SlowMotion(T_world_camera, moving, static & ~moving, first)
+        return SlowMotion(now.T_world_camera, moving, static & ~moving, first)

@@ -82,6 +82,6 @@ def judged(cost, trial, length, damping, rules):
         rules: DescentRules.
     """
     settled = length < SHORT_STEP * rules.stop and abs(trial - cost) < rules.stop_gain * cost
-    if trial < cost or length < rules.taken:
+    if trial < cost or length < rules.accept_below:
         return True, max(damping / FACTOR, LEAST), settled
     return False, damping * FACTOR, settled

@@ -1,4 +1,4 @@
-"""A preprocessed frame, the levels of its image pyramid, and their exposure to the intensities of the map."""
+"""A preprocessed frame, its image pyramid and corners, and their exposure to the intensities of the map."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -6,9 +6,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import Config
+from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
+
+HALVING_BAND = 0.02
+"""Readings this far (m, and share of the depth) behind the nearest of a 2x2 block belong to the same surface."""
+CELLS = 40
+"""Corners across the image: the strongest of each cell."""
+WINDOW = 11
+"""Edge of the window that a corner is matched by, pixels of an image 320 wide."""
+FLOW_WIDTH = 320
+"""Image width that windows and flow of corners are given for; they grow in proportion to the width of an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +59,18 @@ class Observation:
         """Number of pixels with a depth."""
         return int(np.count_nonzero(self.readings))
 
+    def halved(self, times: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth and intensity (H >> times, W >> times) of ``camera.scaled(times)``, halved by 2x2 blocks.
+
+        Intensity is the mean of a block; depth the mean of its readings on the nearest surface. Each halving is
+        computed once.
+        """
+        halvings = self._halvings
+        while len(halvings) < times:
+            depth, intensity = halvings[-1] if halvings else (self.depth, self.intensity)
+            halvings.append(halve(depth, intensity, HALVING_BAND))
+        return halvings[times - 1] if times else (self.depth, self.intensity)
+
     @property
     def as_recorded(self) -> Frame:
         """Depth of the observation and colour as it was recorded."""
@@ -68,17 +91,19 @@ class Level:
         """Number of pixels with a depth."""
         return int(np.count_nonzero(self.depth))
 
+    @cached_property
+    def grey(self) -> NDArray[np.uint8]:
+        """Intensities (h, w) in grey values from 0 to 255."""
+        return np.clip(255 * self.intensity, 0, 255).astype(np.uint8)
+
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
     """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
     import cv2
 
     gain, offset = exposure
-    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
-
-
-def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
-    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+    curve = np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, curve), dtype=np.uint8)
 
 
 def exposed(level: Level, exposure: tuple[float, float]) -> Level:
@@ -92,3 +117,84 @@ def exposed(level: Level, exposure: tuple[float, float]) -> Level:
 def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
     """Gain and offset of two exposures applied one after the other."""
     return then[0] * first[0], then[0] * first[1] + then[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """Image pyramid of an observation, each level the camera's image halved several times: those of the registration,
+    coarse to fine, and that of the dynamic labels."""
+
+    tracked: list[Level]
+    labelled: Level
+
+    @classmethod
+    def of(cls, observation: Observation, camera: Camera, config: Config) -> "Pyramid":
+        """The levels whose widths are nearest to those configured."""
+        widths = *config.tracker.widths, config.dynamics.width
+        halvings = [max(0, round(np.log2(camera.width / width))) for width in widths]
+        levels = {n: Level(camera.scaled(n), *observation.halved(n)) for n in sorted(set(halvings))}
+        *tracked, labelled = (levels[n] for n in halvings)
+        return cls(tracked, labelled)
+
+    @property
+    def coarse(self) -> Level:
+        """Coarsest level of the registration."""
+        return self.tracked[0]
+
+    @property
+    def fine(self) -> Level:
+        """Finest level of the registration."""
+        return self.tracked[-1]
+
+    @cached_property
+    def corners(self) -> NDArray[np.int64]:
+        """Corners (n, 2) int of the finest level, pixels u, v."""
+        return _corners(self.fine)
+
+    @cached_property
+    def corner_points(self) -> NDArray[np.float64]:
+        """Points (n, 3) at the corners, metres, camera frame."""
+        (u, v), level = self.corners.T, self.fine
+        return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
+
+
+def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
+    """Mask (H, W) at the size of a level: a pixel is set if any part of it lies in the mask."""
+    import cv2
+
+    size = level.depth.shape[::-1]
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+
+
+def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
+    """Whether more than half of the readings of a level are marked as moving (h, w) bool."""
+    return bool(2 * np.count_nonzero(moving) > level.num_readings)
+
+
+def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
+    """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
+    return 2 * round((edge - 1) / 2 * width / reference_width) + 1
+
+
+def _corners(level: Level) -> NDArray[np.int64]:
+    """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
+
+    A corner has a depth reading and lies on the nearest surface in its window: a window across a depth edge follows the
+    foreground, not the surface behind it.
+    """
+    import cv2
+
+    image = level.grey
+    strength = cv2.cornerMinEigenVal(image, 5)
+    cell = max(1, image.shape[1] // CELLS)
+    height, width = image.shape[0] // cell, image.shape[1] // cell
+    tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
+    tiles = tiles.reshape(height * width, cell * cell)
+    strongest = tiles.argmax(axis=1)
+    rows = np.arange(height * width) // width * cell + strongest // cell
+    columns = np.arange(height * width) % width * cell + strongest % cell
+    z = level.depth[rows, columns]
+    window = scaled_window(WINDOW, image.shape[1])
+    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((window, window), np.uint8))
+    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
+    return np.stack([columns, rows], axis=1)[useful]

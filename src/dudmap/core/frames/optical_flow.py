@@ -1,4 +1,4 @@
-"""Corners and their sparse optical flow between two images (Lucas and Kanade 1981)."""
+"""Sparse optical flow of pixels between two images (Lucas and Kanade 1981)."""
 
 from typing import TypeVar
 
@@ -6,60 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.threads import bands, run_bands
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import WINDOW, scaled_window
 
 Number = TypeVar("Number", np.float32, np.float64)
-CELLS = 40
-"""Corners across the image: the strongest of each cell."""
 SIMILAR = 1.5
 """A match is as good as another if the mean grey difference of its windows is at most this multiple of the other's."""
-WINDOW = 11
-"""Edge of the window that a corner is matched by, pixels of an image 320 wide."""
 RETURN_PX = 0.5
 """Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
 FEWEST = 128
 """Fewest pixels whose flow is worth another thread."""
-FLOW_WIDTH = 320
-"""Image width that these distances are given for; they grow in proportion to the width of an image."""
-
-
-def grey(level: Level) -> NDArray[np.uint8]:
-    """Intensities (h, w) in grey values from 0 to 255."""
-    return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
-
-
-def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
-    """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
-    return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 
 
 def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
     """Lengths (n,) of vectors (n, 2)."""
     squares = vectors * vectors
     return np.sqrt(squares[:, 0] + squares[:, 1])
-
-
-def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
-
-    A corner has a depth reading and lies on the nearest surface in its window: a window across a depth edge follows the
-    foreground, not the surface behind it.
-    """
-    import cv2
-
-    strength = cv2.cornerMinEigenVal(image, 5)
-    cell = max(1, image.shape[1] // CELLS)
-    height, width = image.shape[0] // cell, image.shape[1] // cell
-    tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
-    tiles = tiles.reshape(height * width, cell * cell)
-    strongest = tiles.argmax(axis=1)
-    rows = np.arange(height * width) // width * cell + strongest // cell
-    columns = np.arange(height * width) % width * cell + strongest % cell
-    z = level.depth[rows, columns]
-    window = scaled_window(WINDOW, image.shape[1])
-    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((window, window), np.uint8))
-    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
-    return np.stack([columns, rows], axis=1)[useful]
 
 
 def lucas_kanade(

@@ -1,11 +1,9 @@
-"""Rigid alignment of point sets (Kabsch 1976, Umeyama 1991; RANSAC: Fischler and Bolles 1981), comparison of poses."""
+"""Rigid alignment of point sets (Kabsch 1976, Umeyama 1991; RANSAC: Fischler and Bolles 1981)."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-
-from dudmap.core.geometry import se3
 
 SUCCESS = 0.9999
 """Probability with which at least one sample of the RANSAC consists of inliers."""
@@ -79,11 +77,3 @@ def umeyama(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.
 def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
     return umeyama(a, b)[0]
-
-
-def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
-    """Whether two poses (4, 4) are closer than a distance (m) and an angle (deg)."""
-    apart = T_a[:3, 3] - T_b[:3, 3]
-    if math.sqrt(apart @ apart) >= distance:
-        return False
-    return math.degrees(se3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])) < angle_deg

@@ -146,8 +146,8 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def pieces(mesh: Mesh) -> NDArray[np.int32]:
-    """Number (V,) of the connected piece that each vertex belongs to."""
+def component_of_vertices(mesh: Mesh) -> NDArray[np.int32]:
+    """Number (V,) of the connected component that each vertex belongs to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

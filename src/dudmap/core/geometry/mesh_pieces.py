@@ -9,7 +9,7 @@ import numpy as np
 
 from dudmap.atomic_file import atomic_file
 from dudmap.core.geometry.mesh import Mesh, joined, ply_arrays, ply_header, ply_layout
-from dudmap.core.geometry.mesh_simplification import clustered, simplified
+from dudmap.core.geometry.mesh_simplification import clustered, mean_edge, simplified
 from dudmap.errors import MapError
 
 FACES_AT_ONCE = 500_000
@@ -59,8 +59,7 @@ def load_simplified(path: str | Path, max_triangles: int) -> Mesh:
         parts.append(simplified(piece, max(int(share * len(piece.faces)), 1)))
     whole = joined(parts)
     if share < 1 and len(whole.faces):  # the pieces meet in vertices that are not shared: merge them first
-        edges = whole.vertices[whole.faces[:, 0]] - whole.vertices[whole.faces[:, 1]]
-        whole = clustered(whole, max(float(np.linalg.norm(edges, axis=1).mean()) / 2, 1e-6))
+        whole = clustered(whole, mean_edge(whole) / 2)
     return simplified(whole, max_triangles)
 
 

@@ -12,7 +12,7 @@ from dudmap.core.geometry.mesh import Mesh
 
 def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
     """The mesh itself if it has at most ``max_triangles``, else a coarser one that has."""
-    count, cell, out = len(mesh.faces), _mean_edge(mesh), mesh
+    count, cell, out = len(mesh.faces), mean_edge(mesh), mesh
     while count > max_triangles:
         # the number of triangles of a surface falls with the square of the cells' edge; 2 % in case it falls short
         cell *= 1.02 * np.sqrt(count / max_triangles)
@@ -53,7 +53,7 @@ def clustered(mesh: Mesh, cell: float) -> Mesh:
     )
 
 
-def _mean_edge(mesh: Mesh) -> float:
+def mean_edge(mesh: Mesh) -> float:
     """Mean length of the first edge of the triangles, metres."""
     if len(mesh.faces) == 0:
         return 1.0

@@ -230,3 +230,11 @@ def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Mat
         return Ts[after]
     start, end = timestamps[after - 1], timestamps[after]
     return interpolate(Ts[after - 1], Ts[after], (timestamp - start) / (end - start))
+
+
+def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
+    """Whether two poses (4, 4) are closer than a distance (m) and an angle (deg)."""
+    apart = T_a[:3, 3] - T_b[:3, 3]
+    if math.sqrt(apart @ apart) >= distance:
+        return False
+    return math.degrees(rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])) < angle_deg

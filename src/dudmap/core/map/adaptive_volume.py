@@ -9,25 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.core.backends.cpu import raycasting
-from dudmap.core.backends.parameters import (
-    BlockVisit,
-    DepthView,
-    FusionParameters,
-    RaycastParameters,
-    RaycastResult,
-    TouchedBlocks,
-)
+from dudmap.core.backends.parameters import BlockVisit, DepthView, FusionParameters, TouchedBlocks
 from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.core.map.fine_blocks import FineBlocks, two_levels
-from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
+from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.level_meshes import level_meshes
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.refinement import prolonged, refine
-from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume import TsdfVolume, fusion_parameters
 from dudmap.core.map.voxel_blocks import VoxelBlocks
 
 
@@ -95,7 +86,8 @@ class AdaptiveVolume(TsdfVolume):
             children = level.children_of(slots)
             updated_children = self._average_finer(n, view, touched, children, count)
             updated = updated[~gone]
-            depths = self._depths(parents, updated, self.voxel_size / 2**n, view.T_world_camera)
+            centres = (parents.slot_coords[updated] + 0.5) * (self.block_size / 2**n)
+            depths = (centres - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
             self._note_change(
                 n, refine(level, parents, updated, depths, number, self.config, self.sensor, self._parameters_of(n))
             )
@@ -128,13 +120,6 @@ class AdaptiveVolume(TsdfVolume):
             slots = level.parents[slots]
         self.blocks.written[slots] = self._frame_number
 
-    def _depths(
-        self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Depth (n,) of the centres of blocks in the camera frame, metres."""
-        centres = (blocks.slot_coords[slots] + 0.5) * (8 * voxel_size)
-        return (centres - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
-
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
         """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
         assert isinstance(other, AdaptiveVolume)
@@ -149,15 +134,6 @@ class AdaptiveVolume(TsdfVolume):
         finer.blocks.written[slots] = number
 
     # -- reading -----------------------------------------------------------------------------------------------------
-
-    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
-        """See ``TsdfVolume.raycast``."""
-        camera = camera or self.camera
-        self.look_at(T_world_camera)
-        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return raycasting.raycast(
-            self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, two_levels(self.levels)
-        )
 
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None

@@ -15,7 +15,7 @@ from dudmap.core.state import Remembered, Stateful
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
-"""Stand for a level that a map does not have."""
+"""Arrays in place of a level that a map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
 """Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
 
@@ -220,7 +220,9 @@ class BlockTree:
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
-    """The finer levels of a map, at most two, as views and meshes read them."""
+    """The finer levels of a map, at most two, as views read them."""
+    if not levels:
+        return FinerLevels()
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
     arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels]
     return FinerLevels(*zip(*arrays, *missing, strict=True))

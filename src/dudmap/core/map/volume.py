@@ -18,12 +18,15 @@ from dudmap.core.backends.parameters import (
     BlockVisit,
     DepthView,
     FreeSpace,
+    FusionParameters,
     LevelImage,
     MapSample,
     MeshParameters,
     RaycastParameters,
     RaycastResult,
+    SensorNoise,
     TouchedBlocks,
+    TruncationBand,
     VoxelGrid,
 )
 from dudmap.core.backends.spec import Backend
@@ -33,18 +36,43 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.block_window import BlockWindow
-from dudmap.core.map.fusion_parameters import DEPTH_MIN, fusion_parameters
+from dudmap.core.map.fine_blocks import two_levels
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import MapError
 
+DEPTH_MIN = 0.05
+"""Blocks nearer to the camera than this are not updated, metres."""
+MIN_LIMIT = 0.3
+"""Smallest limit of the distances that voxels can store, metres."""
+
+
+def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
+    """Parameters of a map whose readings end at ``depth_max`` metres."""
+    front = config.truncation_voxels * config.voxel_size
+    behind = config.truncation_behind_voxels * config.voxel_size
+    limit = max(MIN_LIMIT, front, behind)
+    noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
+    return FusionParameters(
+        band=TruncationBand(front, behind, config.truncation_noise, limit, noise),
+        voxel_size=config.voxel_size,
+        sdf_unit=limit / 32767,
+        depth_unit=depth_max / 65534,
+        max_weight=config.max_weight,
+        max_readings=config.max_readings,
+        carve_rate=config.carve_rate if config.carving else 1,
+        depth_min=DEPTH_MIN,
+        depth_max=depth_max,
+    )
+
+
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
 _MAP_IDS = itertools.count()
 NO_WEIGHTS = np.empty((0, 0), np.float32)
-"""Of an image that is only sampled."""
+"""Weights of an image that is only sampled."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -228,7 +256,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def _local_grid(self) -> VoxelGrid:
-        """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
+        """Blocks with coordinates from the window's local origin, near to which 32-bit arithmetic is precise."""
         grid, origin = self.grid, self.window.local_origin
         if not origin.any():
             return grid
@@ -274,7 +302,7 @@ class TsdfVolume(PagedMap):
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
-    def see_farther(self, depth: float) -> None:
+    def extend_range(self, depth: float) -> None:
         """Let views reach ``depth`` metres, or as far as the largest window permits; for maps only looked at."""
         spread = 2 * self._reach / self.depth_max  # the window covers depth_max
         longest = ((MAX_WINDOW - 8) * self.block_size - 2 * self.band.limit) / spread
@@ -288,7 +316,8 @@ class TsdfVolume(PagedMap):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
+        finer = two_levels(self.levels)
+        return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, finer)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.

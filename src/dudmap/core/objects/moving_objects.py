@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,7 @@ from dudmap.core.objects.object_fusion import ObjectFusion
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover, ObjectTracker
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MOST_WAITING = 30
 """Frames whose moving objects nobody has asked for yet: 0.2 MB each."""
@@ -46,13 +46,14 @@ class MovingObjects(Stateful):
         self.tracker = ObjectTracker(config.movers) if config.movers.enabled else None
         self.fusion = ObjectFusion(config) if config.movers.enabled and config.movers.meshes else None
         self._waiting = deque()
+        self._finding = Lock()
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
         """Take note of a tracked frame; the function that is returned finds its moving objects, by id.
 
-        They are found when somebody asks for them or for those of a later frame, or at once where their shapes are
-        fused. Of what nobody asks for, the last ``MOST_WAITING`` frames are kept: who asks for the first time gets
-        objects that were followed since then.
+        They are found when somebody, in any thread, asks for them or for those of a later frame, or at once where their
+        shapes are fused. Of what nobody asks for, the last ``MOST_WAITING`` frames are kept: who asks for the first
+        time gets objects that were followed since then.
         """
         if self.tracker is None or estimate.labels is None:
             return tuple
@@ -67,16 +68,18 @@ class MovingObjects(Stateful):
                 )
             frame.movers = tuple(fused)
         elif len(self._waiting) > MOST_WAITING:
-            self._waiting.popleft().movers = ()
+            with self._finding:
+                self._waiting.popleft().movers = ()
         return partial(self._movers, frame)
 
     def _movers(self, frame: "_Frame") -> tuple[Mover, ...]:
         """The moving objects of a frame, after those of the frames before it."""
         assert self.tracker is not None
-        while frame.movers is None:
-            first = self._waiting.popleft()
-            found = self.tracker.update(first.timestamp, first.dynamic, first.level, first.T_world_camera)
-            first.movers = tuple(found)
+        with self._finding:
+            while frame.movers is None:
+                first = self._waiting.popleft()
+                found = self.tracker.update(first.timestamp, first.dynamic, first.level, first.T_world_camera)
+                first.movers = tuple(found)
         return frame.movers
 
     def rigid_objects(self, Ts_world_camera: Mapping[float, NDArray[np.float64]]) -> list[RigidObject]:

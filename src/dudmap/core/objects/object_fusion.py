@@ -16,7 +16,6 @@ from dudmap.config import Config
 from dudmap.core.dynamics.masks import full_size
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level, Observation, exposed_color
-from dudmap.core.frames.pyramid import halved
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.objects.object_map import ObjectTrack, ObjectVolume, RigidObject
@@ -108,7 +107,7 @@ def crop_object(
             continue
         scaled = camera.scaled(halvings)
         cut = np.s_[y >> halvings : (y >> halvings) + scaled.height, x >> halvings : (x >> halvings) + scaled.width]
-        depth, intensity = (np.ascontiguousarray(image[cut]) for image in halved(observation, halvings))
+        depth, intensity = (np.ascontiguousarray(image[cut]) for image in observation.halved(halvings))
         inner = cv2.resize(mask.astype(np.float32), (scaled.width, scaled.height), interpolation=cv2.INTER_AREA) > 0.99
         levels.append(Level(scaled, depth, gain * intensity + offset))
         weights.append((inner & (depth > 0)).astype(np.float32))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.mesh import Mesh, pieces, with_faces
+from dudmap.core.geometry.mesh import Mesh, component_of_vertices, with_faces
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
@@ -131,6 +131,6 @@ class ObjectTrack:
 
 def _main_components(mesh: Mesh) -> Mesh:
     """Mesh without connected components much smaller than the largest, which stem from readings beside the object."""
-    piece = pieces(mesh)
-    counts = np.bincount(piece)
-    return with_faces(mesh, (counts >= MIN_COMPONENT * counts.max())[piece[mesh.faces[:, 0]]])
+    component = component_of_vertices(mesh)
+    counts = np.bincount(component)
+    return with_faces(mesh, (counts >= MIN_COMPONENT * counts.max())[component[mesh.faces[:, 0]]])

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dudmap.config import MoversConfig
 from dudmap.core.backends.median import median
 from dudmap.core.frames.observation import Level
-from dudmap.core.frames.optical_flow import grey
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.objects.regions import (
@@ -289,4 +288,4 @@ def _instance_frame(
     points.reshape(-1, 3)[pixels.flat] = pixels.points
     for indices, track in zip(objects, tracks, strict=True):
         ids.reshape(-1)[pixels.flat[indices]] = track.id
-    return InstanceFrame(timestamp, grey(level), ids, points)
+    return InstanceFrame(timestamp, level.grey, ids, points)

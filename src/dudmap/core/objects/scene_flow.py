@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.median import median
-from dudmap.core.frames.optical_flow import scaled_window, track_forward_backward
+from dudmap.core.frames.observation import scaled_window
+from dudmap.core.frames.optical_flow import track_forward_backward
 
 PAIRED_PIXELS = 60
 """Pixels of an object that are tracked into the last frame."""

@@ -19,12 +19,12 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.frame_store import FrameStore, KeptFrame
 from dudmap.core.places.map_rebuilding import MAX_ADDED, MAX_IMMEDIATE, PER_FRAME, MapRebuilding, nearest_views
-from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase
 from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
+from dudmap.core.tracking.pose_prediction import VELOCITY_LIFETIME
 
 
 @dataclass(eq=False)
@@ -99,7 +99,7 @@ class Atlas(Stateful):
         keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
         return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
-    def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
+    def continue_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
         """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera;
         ``max_blocks`` as of ``TsdfVolume``."""
         self.saved = self.current
@@ -267,7 +267,7 @@ class Atlas(Stateful):
         return [] if self.history is None else self.history.in_submap(submap)
 
     def kept_nodes(self, submap: int) -> list[int]:
-        """Those of them whose images are kept."""
+        """Numbers of the stored frames of a submap whose images are kept."""
         return [] if self.history is None else self.history.kept_of(submap)
 
     def correct(
@@ -286,31 +286,30 @@ class Atlas(Stateful):
         stored frame.
         """
         assert self.history is not None
-        stamps = np.array([self.history.timestamps[n] for n in nodes])
-        corrections = np.stack(
-            [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
-        )
+        frames = [self.history.frames[n] for n in nodes]
+        stamps = np.array([frame.timestamp for frame in frames])
+        corrections = np.stack([T @ se3.inverse(frame.T_world_camera) for frame, T in zip(frames, Ts_new, strict=True)])
         self.move(stamps, corrections, volume)
-        for n, T in zip(nodes, Ts_new, strict=True):
-            self.history.Ts_world_camera[n] = T  # without the rounding of a correction
+        for frame, T in zip(frames, Ts_new, strict=True):
+            frame.T_world_camera = T  # without the rounding of a correction
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
             self.rebuildings[self.current] = MapRebuilding.of(self.history, self.current, new, fused)
         return corrections[-1]
 
+    def _places(self, submap: int) -> list[TimedPose | Keyframe | KeptFrame]:
+        """Everything that has a pose in the world of a submap."""
+        frames = [] if self.history is None else self.history.frames
+        return [place for place in (*self.poses, *self.keyframes.keyframes, *frames) if place.submap == submap]
+
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
         """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,), and use
         a map that was built from the moved ones."""
         self.repainting = None  # the new map has the new colours
-        for place in (*self.poses, *self.keyframes.keyframes):
-            if place.submap == self.current:
-                correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
-                place.T_world_camera = correction @ place.T_world_camera
-        for n in self.nodes(self.current):
-            assert self.history is not None
-            correction = se3.interpolate_in_time(stamps, corrections, self.history.timestamps[n])
-            self.history.Ts_world_camera[n] = correction @ self.history.Ts_world_camera[n]
+        for place in self._places(self.current):
+            correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
+            place.T_world_camera = correction @ place.T_world_camera
         self.volume.take_over(volume)
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
@@ -318,13 +317,9 @@ class Atlas(Stateful):
         assert self.history is not None
         self._complete_repainting()
         moved_nodes = self.kept_nodes(source)
-        for moved in (*self.poses, *self.keyframes.keyframes):
-            if moved.submap == source:
-                moved.T_world_camera = T_target_source @ moved.T_world_camera
-                moved.submap = target
-        for n in self.nodes(source):
-            self.history.Ts_world_camera[n] = T_target_source @ self.history.Ts_world_camera[n]
-            self.history.submaps[n] = target
+        for moved in self._places(source):
+            moved.T_world_camera = T_target_source @ moved.T_world_camera
+            moved.submap = target
         del self.volumes[source]
         self.rebuildings.pop(source, None)
         if len(moved_nodes) <= MAX_IMMEDIATE or target == self.saved:  # not all frames of a saved map are stored
@@ -333,7 +328,7 @@ class Atlas(Stateful):
                 self.rebuildings[target].add_shown(moved_nodes)
         else:
             nodes = np.array(self.kept_nodes(target))
-            Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
+            Ts = np.array([self.history.frames[n].T_world_camera for n in nodes])
             near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
             provisional = self.make_volume()
             self.history.reintegrate(provisional, near)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import exposed_color
-from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.scratch_store import ScratchStore
 from dudmap.core.state import Remembered, Stateful
@@ -46,6 +46,27 @@ class StoredFrame:
     count: int
 
 
+@dataclass(eq=False)
+class KeptFrame:
+    """A stored frame without its images.
+
+    Attributes:
+        timestamp: Seconds.
+        T_world_camera: (4, 4), updated when the map is corrected.
+        submap: Number of its submap; -1 for a frame that is as if it had never been.
+        cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
+        color_timestamp: Seconds, of the colour image; None if that is not known.
+        count: Number of fused frames that it represents; 0 if its images were removed.
+    """
+
+    timestamp: float
+    T_world_camera: NDArray[np.float64]
+    submap: int
+    cells: int
+    color_timestamp: float | None = None
+    count: int = 1
+
+
 class FrameStore(Stateful):
     """A selection of the fused frames in a temporary file, which the operating system removes.
 
@@ -57,19 +78,11 @@ class FrameStore(Stateful):
 
     Attributes:
         registered: Registers the colour of a frame that was stored as it was recorded; None for registered colours.
-        timestamps, Ts_world_camera: Times (s) and poses (4, 4); these are updated when the map is corrected.
-        counts: Number of fused frames that each represents; 0 for those whose images were removed.
-        cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
-        submaps: Numbers of their submaps; -1 for frames that are as if they had never been.
+        frames: All frames, by number.
         archived: Returns a frame, by its number, that is in the database of a continued run.
     """
 
-    timestamps: Remembered[list[float]]
-    Ts_world_camera: Remembered[list[NDArray[np.float64]]]
-    counts: Remembered[list[int]]
-    cells: Remembered[list[int]]
-    submaps: Remembered[list[int]]
-    color_timestamps: Remembered[list[float | None]]
+    frames: Remembered[list[KeptFrame]]
 
     def __init__(
         self,
@@ -81,13 +94,8 @@ class FrameStore(Stateful):
     ) -> None:
         self.camera = camera
         self.registered = registered
-        self.color_timestamps = []
         self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
-        self.timestamps = []
-        self.Ts_world_camera = []
-        self.counts = []
-        self.cells = []
-        self.submaps = []
+        self.frames = []
         self.archived: Callable[[int], EncodedFrame] | None = None
         self._first_own = 0  # number; the frames before it are archived
         self._file: ScratchStore | None = None
@@ -103,7 +111,7 @@ class FrameStore(Stateful):
         return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
 
     def __len__(self) -> int:
-        return len(self.timestamps)
+        return len(self.frames)
 
     def add(
         self,
@@ -120,19 +128,16 @@ class FrameStore(Stateful):
         Raises:
             MapError: The temporary file cannot be written.
         """
-        if self.timestamps and self.submaps[-1] == submap and self.counts[-1] < self.gap:
-            if agree(self.Ts_world_camera[-1], T_world_camera, self.distance, self.angle_deg):
-                self.counts[-1] += 1
+        last = self.frames[-1] if self.frames else None
+        if last is not None and last.submap == submap and last.count < self.gap:
+            if agree(last.T_world_camera, T_world_camera, self.distance, self.angle_deg):
+                last.count += 1
                 return False
         if self._encoder is None:
             self._encoder = ThreadPoolExecutor(1, thread_name_prefix="dudmap-frames")
             weakref.finalize(self, self._encoder.shutdown, wait=False)
-        self.timestamps.append(frame.timestamp)
-        self.Ts_world_camera.append(T_world_camera.copy())
-        self.counts.append(1)
-        self.cells.append(_fused_cells(frame, static))
-        self.submaps.append(submap)
-        self.color_timestamps.append(frame.color_timestamp)
+        cells = _fused_cells(frame, static)
+        self.frames.append(KeptFrame(frame.timestamp, T_world_camera.copy(), submap, cells, frame.color_timestamp))
         self._pending.append((len(self) - 1, self._encoder.submit(_encoded, frame, static, exposure)))
         self._write(MAX_PENDING)
         return True
@@ -140,31 +145,31 @@ class FrameStore(Stateful):
     @property
     def kept(self) -> list[int]:
         """Numbers of the frames whose images were not removed."""
-        return [number for number, count in enumerate(self.counts) if count]
+        return [number for number, frame in enumerate(self.frames) if frame.count]
 
     def in_submap(self, submap: int) -> list[int]:
         """Numbers of the frames of a submap, in order of time: the nodes of its pose graph."""
-        return [number for number, other in enumerate(self.submaps) if other == submap]
+        return [number for number, frame in enumerate(self.frames) if frame.submap == submap]
 
     def kept_of(self, submap: int) -> list[int]:
-        """Those of them whose images were not removed."""
-        return [number for number in self.in_submap(submap) if self.counts[number]]
+        """Numbers of the frames of a submap whose images were not removed."""
+        return [number for number in self.in_submap(submap) if self.frames[number].count]
 
     def remove_submap(self, submap: int) -> None:
         """Remove the frames of a submap as if they had never been."""
         for number in self.in_submap(submap):
             self.remove_images(number)
-            self.submaps[number] = -1
+            self.frames[number].submap = -1
 
     def remove_images(self, number: int) -> None:
         """Remove the images of a frame; its pose stays."""
-        if self.counts[number] == 0:
+        if self.frames[number].count == 0:
             return
         if any(number == pending for pending, _ in self._pending):
             self._write(0)
         if self._file is not None and number >= self._first_own:
             self._file.remove(str(number))
-        self.counts[number] = 0
+        self.frames[number].count = 0
 
     def __getitem__(self, number: int) -> StoredFrame:
         """The stored frame of a number, 0 = oldest; its images must not have been removed."""
@@ -179,9 +184,10 @@ class FrameStore(Stateful):
         )  # fmt: skip
         depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        frame = Frame(self.timestamps[number], depth, rgb, self.color_timestamps[number])
+        kept = self.frames[number]
+        frame = Frame(kept.timestamp, depth, rgb, kept.color_timestamp)
         frame = frame if self.registered is None else self.registered(frame)
-        return StoredFrame(frame, mask > 0, self.Ts_world_camera[number], self.counts[number])
+        return StoredFrame(frame, mask > 0, kept.T_world_camera, kept.count)
 
     def encoded(self, number: int) -> EncodedFrame:
         """The files of a stored frame."""

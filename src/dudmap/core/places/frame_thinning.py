@@ -48,7 +48,7 @@ class FrameThinning(Stateful):
         if spare <= 0:
             return
         nodes = self.atlas.kept_nodes(self.atlas.current)
-        Ts = np.array([history.Ts_world_camera[n] for n in nodes])
+        Ts = np.array([history.frames[n].T_world_camera for n in nodes])
         for i in 1 + np.flatnonzero(_same_view(Ts[1:-1], Ts[-1])):  # the first one fixes the world; the oldest first
             if spare > 0 and self._is_replaced(history, nodes, Ts, int(i)):
                 history.remove_images(nodes[i])
@@ -57,15 +57,15 @@ class FrameThinning(Stateful):
     def _is_replaced(self, history: FrameStore, nodes: list[int], Ts: NDArray[np.float64], i: int) -> bool:
         """Whether newer frames show what frame ``nodes[i]`` does; ``Ts`` (n, 4, 4) are the poses of the ``nodes``."""
         newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i]))
-        cells = np.array([history.cells[nodes[j]] for j in (i, *newer)], np.int64)
+        cells = np.array([history.frames[nodes[j]].cells for j in (i, *newer)], np.int64)
         fused = (cells[:, None] >> np.arange(np.prod(CELLS))) & 1
-        readings = np.array([history.counts[nodes[j]] for j in newer], np.int64) @ fused[1:]
+        readings = np.array([history.frames[nodes[j]].count for j in newer], np.int64) @ fused[1:]
         if np.any(readings[fused[0] > 0] < self._enough):
             return False
-        first = history.timestamps[nodes[i]]
+        first = history.frames[nodes[i]].timestamp
         nearby = self.atlas.keyframes.near(Ts[i], self.atlas.current, 2 * LOCAL_DISTANCE, 2 * LOCAL_ANGLE_DEG)
         until = min((keyframe.last_seen for keyframe in nearby if keyframe.last_seen >= first), default=np.inf)
-        return sum(history.timestamps[nodes[j]] <= until for j in newer) >= LOCAL_FRAMES
+        return sum(history.frames[nodes[j]].timestamp <= until for j in newer) >= LOCAL_FRAMES
 
 
 def _same_view(Ts: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_thinning import FrameThinning
 from dudmap.core.places.loop_correction import LoopCorrector
@@ -66,6 +66,7 @@ class LoopCloser(Stateful):
     _failures: Remembered[int] = 0
     _newest_keyframe: Remembered[float | None] = None  # timestamp; their number ends at ``max_keyframes``
     _search: Remembered[LoopSearch | None] = None
+    # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
     _pending: Remembered[tuple[int, NDArray[np.float64]] | None] = None
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
@@ -75,7 +76,6 @@ class LoopCloser(Stateful):
         self.corrector = LoopCorrector(atlas)
         self.thinning = FrameThinning(config, atlas)
         self._executor: ThreadPoolExecutor | None = None
-        # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.

@@ -51,11 +51,11 @@ class LoopCorrector(Stateful):
         nodes = self.atlas.nodes(self.atlas.current)
         if len(nodes) < 2:
             return None
-        old, new = min(nodes, key=lambda n: abs(history.timestamps[n] - keyframe.timestamp)), nodes[-1]
+        old, new = min(nodes, key=lambda n: abs(history.frames[n].timestamp - keyframe.timestamp)), nodes[-1]
         if old == new:
             return None
-        T_camera_new = se3.inverse(T_tracked) @ history.Ts_world_camera[new]
-        T_old_new = se3.inverse(history.Ts_world_camera[old]) @ T_measured @ T_camera_new
+        T_camera_new = se3.inverse(T_tracked) @ history.frames[new].T_world_camera
+        T_old_new = se3.inverse(history.frames[old].T_world_camera) @ T_measured @ T_camera_new
         return Edge(old, new, T_old_new, *LOOP_NOISE)
 
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
@@ -69,7 +69,7 @@ class LoopCorrector(Stateful):
         assert history is not None
         nodes = self.atlas.nodes(self.atlas.current)
         index = {n: i for i, n in enumerate(nodes)}
-        Ts = np.stack([history.Ts_world_camera[n] for n in nodes])
+        Ts = np.stack([history.frames[n].T_world_camera for n in nodes])
         edges = _odometry_edges(Ts)
         for edge in (*self.edges, loop):
             if edge.a in index and edge.b in index:
@@ -77,7 +77,7 @@ class LoopCorrector(Stateful):
         Ts_new = optimize(Ts, edges)
         if not np.all(np.isfinite(Ts_new)):
             return None
-        kept = np.flatnonzero([history.counts[n] for n in nodes])
+        kept = np.flatnonzero([history.frames[n].count for n in nodes])
         old, new = _passes(Ts_new, kept, index[loop.a], index[loop.b])
         self.atlas.make_room()
         before = self._misfit(self._map_of(nodes, Ts, new), nodes, Ts, new)
@@ -133,8 +133,8 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
 
 
 def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) -> tuple[list[int], list[int]]:
-    """Of the ``kept`` poses (k,) of a path (n, 4, 4), the indices of those with the view of pose ``b``, where a loop
-    ends: those before and those after the farthest point of the way from ``a`` to ``b``, about as many of each."""
+    """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, where a loop from ``a``
+    closes: of the old pass, which ends where the path is farthest from there, and of the new one, about as many."""
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
     new = after[nearest_views(Ts[after], Ts[b], max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before)))]

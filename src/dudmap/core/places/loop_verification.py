@@ -13,13 +13,13 @@ from dudmap.config import Config
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import Level, Observation
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas, TimedPose
 from dudmap.core.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
 from dudmap.core.places.map_rebuilding import view_distances
 from dudmap.core.places.place_recognition import PlaceMatch
-from dudmap.core.tracking.estimate import static_weights
+from dudmap.core.tracking.frame_view import static_weights
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
@@ -76,21 +76,13 @@ class LoopVerifier:
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place (or in the
         saved map that the place belongs to); None unless features, distances and intensities agree."""
-        limits = self.config.relocalization
         local = self._local_map(place)
         if local is None:
             return None
         exposure = query.tracking.exposure
         found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
-        if (
-            found.converged
-            and len(found.unobservable) == 0
-            and not monitor.misfit_reason(found)
-            and found.inlier_share >= limits.min_on_map
-            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
-        ):
-            return found.T_world_camera
-        return None
+        confirmed = place.is_confirmed(found, self.config.relocalization) and not monitor.misfit_reason(found)
+        return found.T_world_camera if confirmed else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
         """Whether the newest frame, too, fits the map of the time of a place better where a correction puts it.
@@ -124,11 +116,11 @@ class LoopVerifier:
         nodes = [
             n
             for n in self.atlas.kept_nodes(keyframe.submap)
-            if history.timestamps[n] <= keyframe.last_seen
-            and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+            if history.frames[n].timestamp <= keyframe.last_seen
+            and agree(history.frames[n].T_world_camera, place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
         ]
         T_camera_world = se3.inverse(place.T_world_camera)
-        distances = [np.linalg.norm((T_camera_world @ history.Ts_world_camera[n])[:3, 3]) for n in nodes]
+        distances = [np.linalg.norm((T_camera_world @ history.frames[n].T_world_camera)[:3, 3]) for n in nodes]
         nearest = sorted(nodes[i] for i in np.argsort(distances, kind="stable")[:LOCAL_FRAMES])
         if not nearest:
             return None

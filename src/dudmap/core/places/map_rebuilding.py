@@ -25,10 +25,10 @@ MAX_ADDED = 8
 VIEW_DEPTH = 2.0
 """Depth of the point by which views are compared, metres: the middle of what a camera sees indoors."""
 NEAR = 3.0
-"""Stored frames whose point is farther than this from that of the view are not added to the provisional map, metres:
-what they see is out of view, or is added as the camera goes there."""
+"""Largest distance, metres, between the point that a stored frame looks at and that of the view for the frame to be
+added to the provisional map: what others see is out of view, or is added as the camera goes there."""
 SPACING = 0.3
-"""Nor are those whose point is nearer than this to that of one which was added, metres: they see the same."""
+"""Smallest distance, metres, between the points that two added frames look at: nearer ones see the same."""
 
 
 @dataclass(eq=False)
@@ -78,7 +78,7 @@ class MapRebuilding:
         many."""
         unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self.start and n not in self.shown])
         unknown = unknown.astype(int)
-        points = _looked_at(np.reshape([self.history.Ts_world_camera[n] for n in unknown], (-1, 4, 4)))
+        points = _looked_at(np.reshape([self.history.frames[n].T_world_camera for n in unknown], (-1, 4, 4)))
         here = _looked_at(T_world_camera)
         added: list[int] = []
         while len(unknown) and len(added) < count:

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.core.backends.threads import submit
 from dudmap.core.frames.observation import Observation
-from dudmap.core.geometry.alignment import agree, rigid_ransac
+from dudmap.core.geometry.alignment import rigid_ransac
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
+from dudmap.core.tracking.tracker import TrackingResult
 
 COARSE_FEATURES = 64
 """Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
@@ -50,7 +52,7 @@ class PlacedFeatures:
 
 
 NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
-"""Those of an image without texture."""
+"""Features of an image without texture."""
 
 
 @dataclass(eq=False)
@@ -85,6 +87,16 @@ class PlaceMatch:
     keyframe: Keyframe
     T_world_camera: NDArray[np.float64]
     num_inliers: int
+
+    def is_confirmed(self, found: TrackingResult, limits: RelocalizationConfig, static_share: float = 1.0) -> bool:
+        """Whether the registration of the frame, this share of whose readings is static, confirms the pose that its
+        features give."""
+        return (
+            found.converged
+            and len(found.unobservable) == 0
+            and static_share * found.inlier_share >= limits.min_on_map
+            and agree(found.T_world_camera, self.T_world_camera, limits.max_distance, limits.max_angle_deg)
+        )
 
 
 class KeyframeDatabase(Stateful):

@@ -14,12 +14,11 @@ from dudmap.config import Config, SimilarityConfig
 from dudmap.core.dynamics.detector import MIN_REGION, depth_tolerance, distance_sigma, noise_threshold
 from dudmap.core.dynamics.masks import opened_mask
 from dudmap.core.frames.observation import Level
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MIN_FEATURES = 20
 """With fewer features than this in either frame the share is meaningless and the frame counts as new."""

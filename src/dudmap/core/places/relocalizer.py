@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
 from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-from dudmap.core.frames.pyramid import is_majority_dynamic
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.dynamics.segments import Segmentation
+from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
@@ -43,7 +42,8 @@ class Relocalizer(Stateful):
 
     _lost_since: Remembered[float | None] = None
     _mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
-    _recent: Remembered[deque[FrameView]]
+    # time, images and segments of the last lost frames, those of LONGEST_BASELINE
+    _recent: Remembered[deque[tuple[float, Pyramid, Segmentation]]]
     _place_unknown: Remembered[bool] = False
     _counted: Remembered[tuple[float, int]]
 
@@ -51,7 +51,7 @@ class Relocalizer(Stateful):
         self.config = config
         self.atlas = atlas
         self.prior_map = prior_map
-        self._recent = deque()  # lost frames: the last, those of LONGEST_BASELINE
+        self._recent = deque()
         self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
 
     @property
@@ -85,9 +85,8 @@ class Relocalizer(Stateful):
         """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
 
         Candidates in the current submap are tried first, those with more matching features before others. The first
-        is taken whose registration converges, is accepted, has at least ``relocalization.min_on_map`` of the frame's
-        readings static and on the map, and stays within ``relocalization.max_distance`` and ``max_angle_deg`` of the
-        pose given by the features. The view's timer receives the time of feature matching as stage ``recognise``.
+        is taken that its registration confirms and whose registration is accepted. The view's timer receives the time
+        of feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:
@@ -107,13 +106,7 @@ class Relocalizer(Stateful):
             estimate = register(volume, T_features)
             tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
-            if (
-                tracking.converged
-                and len(tracking.unobservable) == 0
-                and accept(tracking)
-                and static_share * tracking.inlier_share >= limits.min_on_map
-                and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)
-            ):
+            if candidate.is_confirmed(tracking, limits, static_share) and accept(tracking):
                 return Relocalization(estimate, submap)
         return None
 
@@ -126,12 +119,13 @@ class Relocalizer(Stateful):
         since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
-        while len(self._recent) > 1 and observation.timestamp - self._recent[0].timestamp > LONGEST_BASELINE:
-            self._recent.popleft()
-        recent = list(self._recent)
-        self._recent.append(view)
         if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
+        while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
+            self._recent.popleft()
+        recent = [(pyramid, segmentation) for _, pyramid, segmentation in self._recent]
+        if self._compares_images:
+            self._recent.append((view.timestamp, view.pyramid, view.segmentation()))
         if observation.timestamp - self._lost_since < config.patience:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
@@ -145,7 +139,11 @@ class Relocalizer(Stateful):
             return self._shows_static_world(recent[0] if recent else None, view)
         return self._shows_static_world(recent[-1], view) and self._shows_static_world(recent[0], view)
 
-    def _shows_static_world(self, before: FrameView | None, view: FrameView) -> bool:
+    @property
+    def _compares_images(self) -> bool:
+        return self.config.dynamics.method == "em" and self.config.dynamics.start_seconds > 0
+
+    def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
         """Whether the motion from an earlier lost image to this one is certainly that of the camera.
 
         Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
@@ -154,11 +152,11 @@ class Relocalizer(Stateful):
         without texture, it is begun unless most of the view moved when the camera was lost. Nothing is examined where
         images are not compared (``dynamics.start_seconds`` = 0).
         """
-        if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
+        if not self._compares_images:
             return True
         motion = None
         if before is not None:
-            motion = dominant_motion(before.pyramid, view.pyramid, (before.segmentation(), view.segmentation()))
+            motion = dominant_motion(before[0], view.pyramid, (before[1], view.segmentation()))
         if motion is None:
             return not self._mostly_dynamic
         return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

@@ -46,7 +46,7 @@ USUAL_OVERLAP = 0.6
 
 @dataclass(frozen=True)
 class Limits:
-    """What the limits of the checks follow from.
+    """Quantities from which the limits of the checks follow.
 
     Attributes:
         config: Configured limits.

@@ -10,13 +10,12 @@ from dudmap.core.backends.median import median
 from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level, Observation
-from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.frames.observation import Level, Observation, Pyramid
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
+from dudmap.core.tracking.pose_prediction import VELOCITY_LIFETIME, MotionModel
 
 
 class RegisteredLevel(Level):
@@ -71,7 +70,7 @@ class ColorMotion(Stateful):
 
     given: Remembered[Calibration | None]
     calibration: Remembered[Calibration | None]
-    _first: Remembered[FrameView | None] = None
+    _is_first: Remembered[bool] = False  # whether the last frame began a map, with colours that are not registered yet
 
     def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
         self.motion = motion
@@ -79,16 +78,19 @@ class ColorMotion(Stateful):
         self.calibration = given
 
     def start(self, view: FrameView) -> None:
-        """Remember the frame that a map was made of, until its velocity is known."""
-        self._first = None if self.is_prepared(view.observation) else view
+        """A map was made of this frame, whose velocity is not known yet."""
+        self._is_first = not self.is_prepared(view.observation)
 
-    def first_frame(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> FrameView | None:
+    def first_frame(
+        self, first: FrameView | None, timestamp: float, T_world_camera: NDArray[np.float64]
+    ) -> FrameView | None:
         """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
 
-        None where the map is right as it is, or where too much time has passed for the velocity to be known.
+        None where the map is right as it is, where its first frame is forgotten, or where too much time has passed for
+        the velocity to be known.
         """
-        first, self._first = self._first, None
-        if first is None or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
+        is_first, self._is_first = self._is_first, False
+        if first is None or not is_first or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
             return None
         return self._with_colors(first, self.motion.velocity_to(timestamp, T_world_camera))
 
@@ -98,7 +100,7 @@ class ColorMotion(Stateful):
 
     def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
         """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
-        if self._first is not None:
+        if self._is_first:
             return view
         return self._with_levels(view, self._velocity(view, T_world_camera))
 
@@ -139,7 +141,7 @@ class ColorMotion(Stateful):
         if self.calibration is None:
             return view.color_velocity
         assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
-        if self._first is not None:
+        if self._is_first:
             return found
         ratio = (self.calibration.delay + view.observation.color_offset) / self.motion.elapsed(view.timestamp)
         return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)

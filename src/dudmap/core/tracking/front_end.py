@@ -9,15 +9,13 @@ from dudmap.config import Config
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
-from dudmap.core.frames.pyramid import reduced
-from dudmap.core.geometry.alignment import agree
+from dudmap.core.frames.observation import reduced
+from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, MotionModel, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
 
@@ -120,7 +118,9 @@ class FrontEnd(Stateful):
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], unverified)
             pose, exposure = found.T_world_camera, found.exposure
-            color_weight = tracker.config.color_weight * self._motion_discount(volume, view, pose)
+            velocity, time_sigma = self.motion.velocity_to(view.timestamp, pose), self.config.sensor.color_time_sigma
+            discount = motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
+            color_weight = tracker.config.color_weight * discount
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.blind:
             tracking = replace(tracking, color_residual=np.nan)
@@ -133,8 +133,6 @@ class FrontEnd(Stateful):
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
-        with view.timer("check"):
-            self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
         with view.timer("label"):
@@ -146,12 +144,6 @@ class FrontEnd(Stateful):
         if self.motion.lost(timestamp):
             self.detector.reset()
             self.last_dynamic = None
-
-    def _motion_discount(self, volume: TsdfVolume, view: FrameView, T_world_camera: NDArray[np.float64]) -> float:
-        """Factor of the weight of the intensities at the velocity that leads to a pose (4, 4)."""
-        velocity = self.motion.velocity_to(view.timestamp, T_world_camera)
-        time_sigma = self.config.sensor.color_time_sigma
-        return motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
 
     def _labels_unchanged(self, labels: Labels) -> bool:
         """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not

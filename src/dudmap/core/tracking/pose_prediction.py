@@ -1,24 +1,138 @@
 """Prediction of the camera pose, by constant velocity or by the ego-motion between two images."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import Config
+from dudmap.config import Config, TrackerConfig
 from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.pyramid import is_majority_dynamic
+from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
+from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.quality_monitor import ImagePose
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.tracker import Tracker
+
+VELOCITY_LIFETIME = 0.15
+"""Time after the last accepted pose during which the velocity is still used, seconds."""
+PAUSE = 1.0
+"""Time without a pose after which the last velocity says nothing, seconds: a hand accelerates by about 1 m/s^2."""
+ACCELERATION = 1.0
+"""Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
+
+
+class MotionModel(Stateful):
+    """Predicts the next pose from the last two.
+
+    Args:
+        config: Whether velocity is constant.
+        timed: Whether the stamps are the times of the frames; else they only tell their order.
+
+    Attributes:
+        T_world_camera: (4, 4), the last accepted pose.
+    """
+
+    T_world_camera: Remembered[NDArray[np.float64]]
+    _timestamp: Remembered[float] = 0.0
+    _velocity: Remembered[NDArray[np.float64]]
+    _initialized: Remembered[bool] = False
+    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
+
+    def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
+        self.config = config
+        self.timed = timed
+        self.T_world_camera = np.eye(4)
+        self._velocity = np.zeros(6)  # twist per second, camera axes
+
+    @property
+    def timestamp(self) -> float:
+        """Time of the last accepted pose, seconds."""
+        return self._timestamp
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
+        return self._velocity
+
+    def predict(self, timestamp: float) -> NDArray[np.float64]:
+        """Predicted pose (4, 4) at a time in seconds."""
+        if not self.config.constant_velocity:
+            return self.T_world_camera
+        return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
+
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
+        """Accept the pose of a tracked frame, whose motion was ``observed`` in all directions or partly predicted."""
+        if observed:
+            self._observed = timestamp
+        if self._initialized:
+            self._velocity = self.velocity_to(timestamp, T_world_camera)
+        self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
+
+    def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
+        if not self._initialized:
+            return np.zeros(6)
+        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
+
+    def lost(self, timestamp: float) -> bool:
+        """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
+
+        Returns:
+            Whether the velocity's lifetime is over.
+        """
+        if timestamp - self._timestamp <= VELOCITY_LIFETIME:
+            return False
+        self._velocity = np.zeros(6)
+        return True
+
+    def has_paused(self, timestamp: float) -> bool:
+        """Whether no pose has been accepted for longer than PAUSE."""
+        return self._initialized and timestamp - self._timestamp > PAUSE
+
+    def drift(self, timestamp: float) -> float:
+        """Standard deviation of a pose that is partly predicted, metres.
+
+        An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
+        """
+        return ACCELERATION * (timestamp - self._observed) ** 2 / 2
+
+    def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
+        """Continue from the pose of a relocalised frame with unknown velocity."""
+        self._initialized, self._velocity = False, np.zeros(6)
+        self.update(timestamp, T_world_camera)
+
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Follow a correction of the world frame; the velocity is in camera axes and stays."""
+        self.T_world_camera = T_new_old @ self.T_world_camera
+
+    def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
+        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``, or, where the times of the frames are
+        not known, ``step``, by which it moves the median reading, as a share of the width of the image.
+
+        Args:
+            timestamp: Seconds.
+            T_world_camera: (4, 4) pose at that time.
+            image: The image there, of any size.
+        """
+        motion = se3.inverse(self.T_world_camera) @ T_world_camera
+        shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)
+        distance = math.sqrt(shift @ shift)
+        if self.timed:
+            elapsed = self.elapsed(timestamp)
+            return {"speed_m_s": distance / elapsed, "turn_deg_s": math.degrees(angle) / elapsed, "step": np.nan}
+        readings = image.depth[image.depth > 0]
+        depth = float(np.median(readings)) if len(readings) else np.inf
+        step = (distance / depth + angle) * image.camera.fx / image.camera.width
+        return {"speed_m_s": np.nan, "turn_deg_s": np.nan, "step": step}
+
+    def elapsed(self, timestamp: float) -> float:
+        """Seconds since the last accepted pose, at most 1."""
+        return min(max(timestamp - self._timestamp, 1e-3), 1.0)
+
 
 CLEARLY_BETTER = 0.95
 """A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
@@ -152,13 +266,11 @@ class PosePredictor(Stateful):
         """Set the image that the next one is compared with: a frame whose pose is accepted."""
         if self.ego_motion.seconds == 0:
             return
-        if view.blind:
-            self.ego_motion.reset()
-            return
         with view.timer("parallax"):
             dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-            T = estimate.T_world_camera
-            self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+            gain, _ = estimate.exposure
+            image = view.tracked_at(estimate.T_world_camera, moving=dynamic, blind=view.blind, gain=gain)
+            self.ego_motion.update(image)
 
     def _slow_motion(
         self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
@@ -175,7 +287,7 @@ class PosePredictor(Stateful):
         """
         if is_majority_dynamic(moving, view.labelled):
             return None
-        slow = self.ego_motion.slow_motion(view.timestamp, T_world_camera, view.pyramid, view.segmentation())
+        slow = self.ego_motion.slow_motion(view.tracked_at(T_world_camera))
         return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
@@ -183,8 +295,9 @@ class PosePredictor(Stateful):
         if self.ego_motion.seconds == 0:
             return None
         with view.timer("parallax"):
-            T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
-            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
+            T_world_camera = self.motion.predict(view.timestamp)
+            T_expected = se3.inverse(T_world_camera) @ self.motion.T_world_camera
+            return self.ego_motion.compare(view.tracked_at(T_world_camera), T_expected)
 
     def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
         return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)

@@ -6,7 +6,6 @@ something else. Shape alone does not tell: walls and desks resemble each other, 
 
 import statistics
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -15,11 +14,10 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
-from dudmap.core.backends.cpu.image_comparison import compare_images
-from dudmap.core.backends.cpu.reprojection import reproject
+from dudmap.core.backends.cpu.reprojection import compare_images, reproject
 from dudmap.core.dynamics.detector import noise_parameters
-from dudmap.core.frames.observation import Level
-from dudmap.core.frames.pyramid import reduced
+from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
+from dudmap.core.frames.observation import Level, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import (
@@ -31,13 +29,10 @@ from dudmap.core.tracking.checks import (
     Limits,
     first_failure,
 )
-from dudmap.core.tracking.estimate import PoseEstimate
-from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
+from dudmap.core.tracking.pose_prediction import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
 
-ImagePose = Callable[[], NDArray[np.float64] | None]
-"""Pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
 CLEARLY_LESS = 0.5
 """Another motion explains two images clearly better if its misregistration is below this share of the other: both are
 known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
@@ -73,34 +68,26 @@ class ImageComparison:
         return self.confirms and self.shift <= MAX_IMAGE_SHIFT
 
 
-class ImageConsistency(Stateful):
+class ImageConsistency:
     """Measures how well the motion since the last tracked frame explains both frames.
 
     Args:
-        config: Noise of the sensor. Without ``dynamics.start_seconds`` images are never compared, nor are they here.
+        config: Noise of the sensor.
         motion: Knows the pose of the last tracked frame.
     """
 
-    _last: Remembered[tuple[Level, NDArray[np.uint8], bool] | None] = None  # coarsest level, dynamic pixels, blind
-    _gain: Remembered[float] = 1.0  # of the exposure of the last frame
-
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
-        self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
 
-    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Compare the next frame with this one, whose pose is accepted."""
-        level = view.pyramid.coarse
-        if self._enabled:
-            self._last = level, _dynamic(estimate, level).astype(np.uint8), view.blind
-        self._gain = estimate.exposure[0]
-
-    def reset(self) -> None:
-        """Forget the last frame: a new map begins."""
-        self._last = None
-
-    def supported(self, view: FrameView, estimate: PoseEstimate, seen: ImageComparison, image_pose: ImagePose) -> bool:
+    def supported(
+        self,
+        last: TrackedImage | None,
+        view: FrameView,
+        estimate: PoseEstimate,
+        seen: ImageComparison,
+        image_pose: ImagePose,
+    ) -> bool:
         """Whether the images are compatible with the pose of a frame.
 
         They are not if the last one lies more than MAX_IMAGE_SHIFT beside this one, and the corners of the two follow
@@ -109,22 +96,27 @@ class ImageConsistency(Stateful):
         corners and images alike. That corners are not found again where the exposure has changed suddenly says nothing.
 
         Args:
+            last: The last tracked frame; None where it is not known.
             view: The frame.
             estimate: Its pose and labels.
             seen: Its comparison with the last frame.
             image_pose: Computes the pose (4, 4) that the corners predict; None if they follow no common motion.
         """
-        if not seen.shift > MAX_IMAGE_SHIFT:
+        if last is None or not seen.shift > MAX_IMAGE_SHIFT:
             return True
         T_image = image_pose()
         if T_image is None:
-            change = estimate.exposure[0] / self._gain
+            change = estimate.exposure[0] / last.gain
             return len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN
-        other = self.compare(view, estimate, T_image)
+        other = self.compare(last, view, estimate, T_image)
         return not other.shift < CLEARLY_LESS * seen.shift or (seen.confirms and not other.confirms)
 
     def compare(
-        self, view: FrameView, estimate: PoseEstimate, T_world_camera: NDArray[np.float64] | None = None
+        self,
+        last: TrackedImage | None,
+        view: FrameView,
+        estimate: PoseEstimate,
+        T_world_camera: NDArray[np.float64] | None = None,
     ) -> ImageComparison:
         """Comparison of a frame with the last tracked one.
 
@@ -137,6 +129,7 @@ class ImageConsistency(Stateful):
         of their difference.
 
         Args:
+            last: The last tracked frame; None where it is not known.
             view: This frame.
             estimate: Its pose and labels.
             T_world_camera: (4, 4) another pose of this frame; None for that of the estimate.
@@ -144,26 +137,28 @@ class ImageConsistency(Stateful):
         Returns:
             Of NaN where the last frame is not known.
         """
-        if self._last is None:
+        if last is None:
             return ImageComparison()
-        level, (last, moved, blind) = view.pyramid.coarse, self._last
+        level, older = view.pyramid.coarse, last.pyramid.coarse
+        moved = _reduced(last.moving, older).astype(np.uint8)
+        dynamic = _reduced(None if estimate.labels is None else estimate.labels.dynamic, level)
         T_world_camera = estimate.T_world_camera if T_world_camera is None else T_world_camera
         T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
-        older = np.array([(last.depth, last.intensity)])
+        images = np.array([(older.depth, older.intensity)])
         gaps, differences, marks = reproject(
-            level.depth, level.intensity, level.camera.intrinsics, T_last_camera[None], older, moved[None]
+            level.depth, level.intensity, level.camera.intrinsics, T_last_camera[None], images, moved[None]
         )  # fmt: skip
         shift, agreeing, readings, seen = compare_images(
-            level.depth, level.intensity, _dynamic(estimate, level), gaps[0], differences[0], marks[0],
+            level.depth, level.intensity, dynamic, gaps[0], differences[0], marks[0],
             noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
         )  # fmt: skip
-        shift = np.nan if view.blind or blind else shift
+        shift = np.nan if view.blind or last.blind else shift
         return ImageComparison(shift, agreeing / max(readings, 1), agreeing / max(seen, 1))
 
 
-def _dynamic(estimate: PoseEstimate, level: Level) -> NDArray[np.bool_]:
-    """Dynamic pixels (h, w) of a frame at the size of a level."""
-    return np.zeros(level.depth.shape, bool) if estimate.labels is None else reduced(estimate.labels.dynamic, level)
+def _reduced(mask: NDArray[np.bool_] | None, level: Level) -> NDArray[np.bool_]:
+    """A mask, None for an empty one, at the size of a level (h, w)."""
+    return np.zeros(level.depth.shape, bool) if mask is None else reduced(mask, level)
 
 
 HISTORY = 30
@@ -212,7 +207,6 @@ class QualityMonitor(Stateful):
         motion: Velocity of the camera.
     """
 
-    images: Remembered[ImageConsistency]
     recovering: Remembered[bool]
     _residuals: Remembered[deque[float]]
     _shares: Remembered[deque[float]]
@@ -232,24 +226,26 @@ class QualityMonitor(Stateful):
         self._colors = deque(maxlen=HISTORY)
         self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN where they are not known yet
         self.recovering = False
-        self.images.reset()
 
     @property
     def history(self) -> RegistrationHistory:
         """The registrations that new ones are compared with."""
         return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
 
-    def go_on_from(self, history: RegistrationHistory) -> None:
+    def continue_from(self, history: RegistrationHistory) -> None:
         """Compare new registrations with those of an earlier run in the same map."""
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
         self._colors.extend(history.colors)
         self._update_usual()
 
-    def judge(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> Verdict:
+    def judge(
+        self, last: TrackedImage | None, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose
+    ) -> Verdict:
         """Figures of a registered frame, and the reason of the first check of ``CHECKS`` that it fails.
 
         Args:
+            last: The last tracked frame; None where it is not known.
             view: The frame.
             estimate: Its pose and labels.
             image_pose: Computes the pose (4, 4) that the last image and this one alone give; None if their corners
@@ -260,7 +256,7 @@ class QualityMonitor(Stateful):
             level = view.labelled
             count = 0 if labels is None else np.count_nonzero(labels.dynamic & (level.depth > 0))
             share = count / max(level.num_readings, 1)
-            seen = self.images.compare(view, estimate)
+            seen = self.images.compare(last, view, estimate)
             figures = {
                 **tracking.figures,
                 **self.motion.figures(view.timestamp, tracking.T_world_camera, level),
@@ -273,7 +269,7 @@ class QualityMonitor(Stateful):
             mostly_dynamic = bool(share > 0.5)
             evidence = {
                 "last frame": lambda: not mostly_dynamic and seen.is_same_view,
-                "corners": partial(self.images.supported, view, estimate, seen, image_pose),
+                "corners": partial(self.images.supported, last, view, estimate, seen, image_pose),
             }
             mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
             return Verdict(
@@ -285,7 +281,7 @@ class QualityMonitor(Stateful):
         return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
     def limits(self, mode: str, *, mostly_dynamic: bool = False) -> Limits:
-        """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
+        """Configuration and medians of earlier registrations, from which limits follow; NaN before there are enough."""
         config, (residual, overlap, color) = self.config, self._usual
         share = config.dynamics.max_share
         return Limits(config.tracker, config.sensor, share, mode, mostly_dynamic, 1000 * residual, overlap, color)

@@ -23,13 +23,12 @@ from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
-from dudmap.core.tracking.gradient_agreement import MIN_AGREEMENT, GradientAgreement
-from dudmap.core.tracking.observability import COMPLETE, Observability, gradient_noise
+from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, GradientAgreement, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
 """Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
 directions, along which more damping shortens the steps until they are taken for convergence."""
-NO_STEP = DescentRules(np.eye(6), damping=0.0, limit=0, stop=0.0, stop_gain=0.0, taken=0.0)
+NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0, accept_below=0.0)
 """Rules of a registration that ends where it begins, with the normal equations there."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
@@ -279,9 +278,9 @@ class Tracker:
         """
         config, basis = self.config, COMPLETE.observable
         if finest:
-            damping = min(config.damping, FINEST_DAMPING)
-            return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
-        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain, taken=0.0)
+            damping, short = min(config.damping, FINEST_DAMPING), SHORT_STEP * config.stop
+            return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, accept_below=short)
+        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain, accept_below=0.0)
 
     def linearize(
         self,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.geometry.mesh import Mesh, pieces, with_faces
+from dudmap.core.geometry.mesh import Mesh, component_of_vertices, with_faces
 from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
 from dudmap.io.exporting.run_content import SPECK, Box, ExportOptions
@@ -39,7 +39,7 @@ def cropped(mesh: Mesh, box: Box) -> Mesh:
 
 def without_small_pieces(mesh: Mesh, area: float = SPECK) -> Mesh:
     """Mesh without the connected pieces whose surface is smaller than ``area``, square metres."""
-    piece = pieces(mesh)[mesh.faces[:, 0]]
+    piece = component_of_vertices(mesh)[mesh.faces[:, 0]]
     kept = np.bincount(piece, face_areas(mesh))[piece] >= area
     return mesh if kept.all() else with_faces(mesh, kept)
 

@@ -1,4 +1,4 @@
-"""Intrinsics in files: where they lie, and JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS and Kalibr.
+"""Intrinsics in files: where they lie; JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr, ORB-SLAM.
 
 A file that cannot be read or understood, or that tells of too many cameras, is a ``DatasetError``.
 """
@@ -27,6 +27,10 @@ FILES = (
 TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intrinsic.json", "intrinsic.json")
 """Files of one or two cameras; in the folder itself any JSON or YAML file that is named like one (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
+SETTINGS = "Camera.", "Camera1."
+"""What keys of cameras begin with in settings files of ORB-SLAM, which have any name: they hold "Camera.fx: "."""
+LARGEST_SETTINGS = 1 << 16
+"""Characters in which they are looked for."""
 LARGEST_LIST = 10
 """Kinds of files that a message lists."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
@@ -36,7 +40,7 @@ NAMES = {
     "height": ("height", "h", "image_height"), **{key: (key,) for key in DISTORTION_KEYS},
 }  # fmt: skip
 """Our key and the names it has in JSON and YAML files."""
-SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor")
+SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor", "DepthMapFactor", "RGBD.DepthMapFactor")
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "D", "d")
 """Names of the intrinsic matrix and of the coefficients of the lens: a list, or a ``data`` list as OpenCV writes it."""
@@ -57,6 +61,7 @@ def find(folder: Path) -> Intrinsics | None:
         files = [place / name for name in TREES if (place / name).is_file()]
         if place is folder:
             files = [file for file in sorted(place.iterdir()) if re.fullmatch(NAMED, file.name.lower())]
+            files = files or [file for file in sorted(place.glob("*.yaml")) if _are_settings(file)]
         if files:
             return load(files)
     return None
@@ -116,6 +121,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
     """
     values = {}
+    tree = tree | {str(key).partition(".")[2]: tree[key] for key in tree if str(key).startswith(SETTINGS)}
     for key, names in NAMES.items():
         found = next((tree[name] for name in names if _is_finite(tree.get(name))), None)
         if found is not None:
@@ -161,6 +167,13 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
         return read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
+
+
+def _are_settings(file: Path) -> bool:
+    """Whether a file holds settings of ORB-SLAM."""
+    with file.open(encoding="utf-8", errors="replace") as text:
+        head = text.read(LARGEST_SETTINGS)
+    return any(f"\n{start}fx" in head for start in SETTINGS)
 
 
 def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  # noqa: ANN401

@@ -1,18 +1,23 @@
-"""What a frame costs besides arithmetic: kernel launches, barriers, Python calls, files, and time around kernels."""
+"""What a frame costs besides arithmetic: launches, barriers, Python calls, files, time around kernels, and bytes."""
 
 import gc
 import sys
 import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from types import FrameType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from dudmap.config import Config
 from dudmap.core import slam as slam_module
 from dudmap.core.backends import threads
+from dudmap.core.backends.parameters import BLOCK
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.lab.benchmark.measure import grid
@@ -24,6 +29,12 @@ CORE = str(Path(slam_module.__file__).parent)
 """Folder of the algorithm."""
 COUNTED_FROM = 40
 """Frames before those that are counted: the first second has a map that knows little."""
+BYTES_PER_PIXEL = 12 + 8 * 4 + 8
+"""Of one linearisation: depth, intensity, weight; eight voxels; two residuals."""
+BYTES_PER_VOXEL, BYTES_PER_READING = 2 * 8, 13
+"""Of a fusion: distance, weight, intensity and colour, read and written; depth, colour, mask and packed pixel."""
+COPIED = 1 << 24
+"""Numbers of four bytes that are copied to measure the memory: more than caches hold."""
 
 
 class FrameCost(NamedTuple):
@@ -33,12 +44,13 @@ class FrameCost(NamedTuple):
         counts: Of the first, in the thread that calls ``Slam.process``. ``launches``: calls of compiled kernels;
             ``barriers``: calls whose work other threads share, and which wait for it; ``calls``: calls of Python and C
             functions outside of kernels; ``files``: files of ``core`` that the frame enters.
-        kernels: Milliseconds in kernels by stage, of the first.
+        inside: By stage, of the first: ``kernel_us``, microseconds in them; ``launches``; ``barriers``; and ``bytes``
+            that registration and fusion read and write.
         stages: Milliseconds by stage, of the second, which is not slowed down by the counting.
     """
 
     counts: dict[str, int]
-    kernels: dict[str, float]
+    inside: dict[str, Counter[str]]
     stages: dict[str, float]
 
 
@@ -64,46 +76,90 @@ def summary(costs: list[FrameCost]) -> dict[str, float]:
     return {name: float(median(one.counts[name] for one in costs)) for name in (costs[0].counts if costs else ())}
 
 
-def stage_table(costs: list[FrameCost]) -> str:
-    """Median time of each stage, in kernels and around them, as a Markdown table."""
+def stage_table(costs: list[FrameCost], rate: float) -> str:
+    """Medians of each stage as a Markdown table: time in kernels and around them, launches, barriers, bytes, and the
+    time that the memory takes for these at ``rate`` bytes per second."""
     rows = []
     for name in dict.fromkeys(name for one in costs for name in one.stages):
         whole = median(one.stages.get(name, 0.0) for one in costs)
-        inside = median(one.kernels.get(name, 0.0) for one in costs)
-        rows.append([name, f"{whole:.2f}", f"{inside:.2f}", f"{whole - inside:.2f}"])
-    return grid(["stage", "ms", "in kernels", "around"], rows, words=1)
+        kernel_us, launches, barriers, moved = (
+            median(one.inside.get(name, Counter[str]())[key] for one in costs)
+            for key in ("kernel_us", "launches", "barriers", "bytes")
+        )
+        times = (f"{ms:.2f}" for ms in (whole, kernel_us / 1000, whole - kernel_us / 1000))
+        bound = (f"{moved / 1e6:.1f}", f"{1000 * moved / rate:.2f}") if moved else ("", "")
+        rows.append([name, *times, f"{launches:.0f}", f"{barriers:.0f}", *bound])
+    head = ["stage", "ms", "in kernels", "around", "launches", "barriers", "MB", "least ms"]
+    return grid(head, rows, words=1)
 
 
-def _counted(slam: Slam, view: FrameView) -> tuple[dict[str, int], dict[str, float]]:
-    """Counts of a frame, and its milliseconds in kernels by stage."""
+def memory_rate() -> float:
+    """Bytes per second that all threads together read and write in a copy, the best of five."""
+    source, target, seconds = np.ones(COPIED, np.float32), np.empty(COPIED, np.float32), []
+    parts = threads.bands(COPIED, -(-COPIED // threads.num_threads()))
+    for _ in range(5):
+        start = time.perf_counter()
+        threads.run_bands(lambda first, last: np.copyto(target[first:last], source[first:last]), parts)
+        seconds.append(time.perf_counter() - start)
+    return 2 * 4 * COPIED / min(seconds)
+
+
+@contextmanager
+def _weighed(slam: Slam, view: FrameView, inside: dict[str, Counter[str]]) -> Iterator[None]:
+    """Count the bytes that registration and fusion of a frame move."""
+    backend: Any = slam.reference.backend
+    register, fuse = backend.register, backend.fuse
+
+    def registered(grid: Any, image: Any, *rest: Any) -> Any:  # noqa: ANN401
+        found = register(grid, image, *rest)
+        inside[view.timer.stage]["bytes"] += found.iterations * image.depth.size * BYTES_PER_PIXEL
+        return found
+
+    def fused(grid: Any, image: Any, *rest: Any) -> Any:  # noqa: ANN401
+        found = fuse(grid, image, *rest)
+        moved = BYTES_PER_VOXEL * BLOCK**3 * len(found.slots) + BYTES_PER_READING * image.depth.size
+        inside[view.timer.stage]["bytes"] += moved
+        return found
+
+    backend.register, backend.fuse = registered, fused
+    try:
+        yield
+    finally:
+        del backend.register, backend.fuse
+
+
+def _counted(slam: Slam, view: FrameView) -> tuple[dict[str, int], dict[str, Counter[str]]]:
+    """Counts of a frame, in all and by stage."""
     # an isinstance would ask dead proxies
     compiled = [found for found in gc.get_objects() if issubclass(type(found), Dispatcher)]
     # formulas are inlined where kernels call them, and Python calls them uncompiled
     kernels = {found.py_func.__code__ for found in compiled if not found.targetoptions.get("forceinline")}
     sharing = threads.also_in_other_threads.__code__
-    launches = barriers = calls = 0
+    calls = 0
     files: set[str] = set()
-    spent: dict[str, float] = {}
+    inside: defaultdict[str, Counter[str]] = defaultdict(Counter)
     began = 0.0
 
     def count(frame: FrameType, event: str, argument: object) -> None:
-        nonlocal launches, barriers, calls, began
-        code = frame.f_code
+        nonlocal calls, began
+        code, stage = frame.f_code, inside[view.timer.stage]
         if code in kernels:
             if event == "call":
-                launches, began = launches + 1, time.perf_counter()
+                began = time.perf_counter()
+                stage["launches"] += 1
             elif event == "return":
-                stage = view.timer.stage
-                spent[stage] = spent.get(stage, 0.0) + 1000 * (time.perf_counter() - began)
+                stage["kernel_us"] += round(1e6 * (time.perf_counter() - began))
         elif event in ("call", "c_call"):
             calls += 1
-            barriers += event == "call" and code is sharing
+            stage["barriers"] += event == "call" and code is sharing
             if code.co_filename.startswith(CORE):
                 files.add(code.co_filename)
 
-    sys.setprofile(count)
-    try:
-        slam.process(view)
-    finally:
-        sys.setprofile(None)
-    return {"launches": launches, "barriers": barriers, "calls": calls, "files": len(files)}, spent
+    with _weighed(slam, view, inside):
+        sys.setprofile(count)
+        try:
+            slam.process(view)
+        finally:
+            sys.setprofile(None)
+    launches, barriers = (sum(stage[key] for stage in inside.values()) for key in ("launches", "barriers"))
+    return {"launches": launches, "barriers": barriers, "calls": calls, "files": len(files)}, inside

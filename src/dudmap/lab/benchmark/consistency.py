@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import fit_exposure
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, Pyramid, reduced
 from dudmap.core.frames.preprocess import Preprocessor
-from dudmap.core.frames.pyramid import Pyramid, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import LARGEST_GAP
 from dudmap.core.geometry.trajectory import Trajectory

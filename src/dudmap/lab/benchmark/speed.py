@@ -18,6 +18,7 @@ import numpy as np
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError
+from dudmap.lab.benchmark.calls import COUNTED_FROM, count_calls, memory_rate, stage_table
 from dudmap.lab.benchmark.measure import Row, grid, in_own_process
 from dudmap.lab.benchmark.suites import Entry
 
@@ -104,6 +105,15 @@ def markdown(figures: list[SpeedFigure]) -> str:
         goal = ("", "") if target is None else (f"<= {target:.3g} {unit}", "yes" if reached else "NO")
         body.append([what, goal[0], "none" if measured is None else f"{measured:.3g} {unit}", goal[1], remark])
     return grid(["what", "target", "measured", "reached", "remark"], body, words=1)
+
+
+def stages() -> str:
+    """Table of what the stages of an ordinary frame of the same room cost, see ``calls.stage_table``."""
+    return _measured(_stages, COUNTED_FROM + 20)["table"]
+
+
+def _stages(frames: int) -> Row:
+    return {"table": stage_table(count_calls(_room(frames), Config(), frames), memory_rate())}
 
 
 def _measured(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
@@ -238,7 +248,6 @@ def time_iteration(frames: int) -> Row:
     """
     os.environ["DUDMAP_THREADS"] = "1"
     from dudmap.core.frames.observation import Level
-    from dudmap.core.frames.pyramid import halved
 
     sequence = _room(frames)
     slam = None
@@ -246,7 +255,7 @@ def time_iteration(frames: int) -> Row:
         pass
     assert slam is not None
     halvings = round(np.log2(slam.camera.width / 320))
-    depth, intensity = halved(slam.preprocess(sequence[frames - 1]), halvings)
+    depth, intensity = slam.preprocess(sequence[frames - 1]).halved(halvings)
     level = Level(slam.camera.scaled(halvings), depth, intensity)
     pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
     slam.volume.look_at(pose)

@@ -133,7 +133,7 @@ class CpuBackend:
         """See ``Backend.register``."""
         height, width = image.depth.shape
         rows = -(-PIXELS_PER_BAND // width)
-        num_bands, limit = -(-height // rows), rules.limit
+        num_bands, limit = -(-height // rows), rules.max_steps
         if (num_bands, limit) not in self._descents:
             poses, buffers = np.empty((limit + 1, 3, 4), dtype=np.float32), np.empty(limit + 1, dtype=np.int64)
             sums = np.empty(registration.NUM_SUMS), np.empty((2, num_bands, registration.NUM_SUMS))

@@ -68,7 +68,7 @@ def rebuild(table, coords, num_entries):
 
 @kernel
 def in_use(slots, entry_of):
-    """Those of the slots (n,) that an entry has."""
+    """Slots among these (n,) that belong to an entry."""
     kept, count = np.empty_like(slots), 0
     for slot in slots:
         kept[count] = slot

@@ -25,10 +25,6 @@ class FinerLevels(NamedTuple):
     colors: tuple[NDArray[np.int32], ...] = ()
 
 
-NO_FINER_LEVELS = FinerLevels()
-"""Those of a map with voxels of one size."""
-
-
 @kernel
 def block_at(window, shape, children, level, i, j, k):
     """Slot of the block of a level that holds voxel (i, j, k) of that level's lattice; negative = none."""

@@ -7,7 +7,7 @@ Blocks are first splatted into an image of tiles with the nearest and farthest d
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.octree_field import NO_FINER_LEVELS, FinerLevels, blend, corner_gradient, load, sample
+from dudmap.core.backends.cpu.octree_field import FinerLevels, blend, corner_gradient, load, sample
 from dudmap.core.backends.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.pixel import project, ray
@@ -263,7 +263,7 @@ def raycast(
     intrinsics: NDArray[np.float32],
     size: tuple[int, int],
     parameters: RaycastParameters,
-    finer: FinerLevels = NO_FINER_LEVELS,
+    finer: FinerLevels,
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
 

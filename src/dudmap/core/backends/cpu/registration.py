@@ -237,7 +237,7 @@ def descend(
     while True:
         if leads:
             if count > 0 or is_known:
-                if count - (0 if is_known else 1) >= rules.limit:
+                if count - (0 if is_known else 1) >= rules.max_steps:
                     break
                 H, largest = np.empty((6, 6)), np.float64(0)
                 for i in range(6):

@@ -1,17 +1,22 @@
-"""Reprojection of an image into older ones of the same camera: what they have at its points."""
+"""Reprojection of an image into older ones of the same camera: what they have at its points, and how both agree."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.evidence import edge_tolerance, exact_sigma
+from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, run_team, take, wait_for_all
-from dudmap.core.backends.threads import kernel, scalar
+from dudmap.core.backends.median import nth
+from dudmap.core.backends.threads import exact, kernel, scalar
 
 NEAREST = np.float32(0.05)
 """Points nearer to the camera plane than this, or behind it, are not projected, metres."""
 LEAST_WEIGHT = np.float32(0.25)
 """Least sum of the bilinear weights of the pixels with a reading: a quarter, the weight of each at equal distance."""
+PARTS = 2
+"""Bands of rows of each older frame."""
 
 
 class Reprojection(NamedTuple):
@@ -49,19 +54,20 @@ def reproject(
     shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
     gap, difference = np.empty((2, *shape), np.float32)
     out = Reprojection(gap, difference, np.empty(shape, np.uint8))
-    run_team(reproject_all, shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
+    run_team(reproject_all, PARTS * shape[0], depth, intensity, intrinsics, Ts, older, marks, *out)
     return out
 
 
 @kernel
 def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_marks, gap, difference, marks):
-    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes one older frame at a time."""
-    num_bands = len(older)
+    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes some rows at a time."""
+    num_bands = PARTS * len(older)
     band, _ = first_band(leads, team, 0, num_bands)
     while band != NO_BAND:
-        reproject_difference(
-            depth, intensity, intrinsics, Ts[band], older[band, 0], older[band, 1], old_marks[band], gap[band],
-            difference[band], marks[band],
+        n, part, h = band // PARTS, band % PARTS, len(depth)
+        reproject_rows(
+            part * h // PARTS, (part + 1) * h // PARTS, depth, intensity, intrinsics, Ts[n], older[n, 0], older[n, 1],
+            old_marks[n], gap[n], difference[n], marks[n],
         )  # fmt: skip
         done(team)
         band, _ = take(team, num_bands)
@@ -71,10 +77,10 @@ def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_mark
 
 
 @scalar
-def reproject_difference(
-    depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
+def reproject_rows(
+    start, stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):  # fmt: skip
-    """Differences to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
+    """Differences of some rows to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
@@ -84,7 +90,7 @@ def reproject_difference(
     stored = np.empty((4, w), np.float32)
     last_u, last_v = np.float32(w - 1), np.float32(h - 1)
     flat_depth, flat_intensity, flat_marks = old_depth.reshape(-1), old_intensity.reshape(-1), old_marks.reshape(-1)
-    for v in range(h):
+    for v in range(start, stop):
         row_y = (np.float32(v) - intrinsics[3]) * by_fy
         row = depth[v]
         for u in range(w):
@@ -128,3 +134,55 @@ def reproject_difference(
             gap[v, u] = best if known else nan
             difference[v, u] = grey / max(total, LEAST_WEIGHT) - intensity[v, u] if known else nan
             marks[v, u] = np.int32(mark if inside > zero else zero)
+
+
+AGREEING_SIGMAS = 3 * np.sqrt(2)
+"""Difference of two readings of one surface that noise explains, in standard deviations of one of them."""
+ZERO, HALF = np.float32(0), np.float32(0.5)
+
+
+@exact
+def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewest):
+    """Distance by which two images lie beside each other, and how many of their readings agree.
+
+    Args:
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        moving: (h, w) bool, pixels that move.
+        gap, difference, marks: Of the older image, whose moving pixels are marked, see ``Reprojection``.
+        noise: NoiseParameters, all float32.
+        fewest: Pixels that must show the same static surface in both.
+
+    Returns:
+        The distance, see ``ImageConsistency.compare``; pixels, NaN where it is not known. Readings whose depth agrees
+        within AGREEING_SIGMAS, all readings, and those at whose place the older image has one.
+    """
+    h, w = depth.shape
+    agreeing, readings, seen, count = 0, 0, 0, 0
+    common, contrasts, errors = np.empty((h, w), np.bool_), np.empty(h * w, np.float32), np.empty(h * w, np.float32)
+    for v in range(h):
+        for u in range(w):
+            z, step = depth[v, u], abs(gap[v, u])
+            sigma = exact_sigma(z, noise.base, noise.scale)
+            agreeing += step < AGREEING_SIGMAS * sigma
+            readings += z != ZERO
+            seen += np.isfinite(step)
+            tolerance = edge_tolerance(sigma, z, noise.edge_sigmas, noise.edge_slope)
+            common[v, u] = marks[v, u] == 0 and not moving[v, u] and step < tolerance
+            count += common[v, u]
+    if count < fewest:
+        return np.nan, agreeing, readings, seen
+    gain, offset = fit_exposure(intensity, difference, common)
+    slope, shift, count = np.float32(1 - gain), np.float32(offset), 0
+    for v in range(h):
+        for u in range(w):
+            if common[v, u]:
+                down = intensity[min(v + 1, h - 1), u] - intensity[max(v - 1, 0), u]
+                across = intensity[v, min(u + 1, w - 1)] - intensity[v, max(u - 1, 0)]
+                down = HALF * down if 0 < v < h - 1 else down
+                across = HALF * across if 0 < u < w - 1 else across
+                contrasts[count] = np.sqrt(down * down + across * across)
+                errors[count] = abs(difference[v, u] + slope * intensity[v, u] - shift)
+                count += 1
+    contrast = np.float64(nth(contrasts[:count], count // 2))
+    error = np.float64(nth(errors[:count], count // 2))
+    return (np.sqrt(2.0) * error / contrast if contrast > 0 else np.nan), agreeing, readings, seen

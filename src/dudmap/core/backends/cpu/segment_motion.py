@@ -278,8 +278,8 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
 
 
 @exact
-def stand_still(segments, dynamic, gaps, differences, settled):
-    """Keep of the settled segments those whose dynamic part stands where it stood in each of n older frames.
+def stand_still(segments, dynamic, gap, difference, settled):
+    """Keep of the settled segments those whose dynamic part stands where it stood in an older frame.
 
     That is where more than 0.7 of its pixels are visible, less than 0.1 of them lie off by more than SETTLED_SIGMAS,
     the mean distance is below one sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or
@@ -288,7 +288,7 @@ def stand_still(segments, dynamic, gaps, differences, settled):
     Args:
         segments: SegmentImage.
         dynamic: (h, w) bool.
-        gaps, differences: (n, h, w) float32 to the older frames, see ``Reprojection``.
+        gap, difference: (h, w) float32 to the older frame, see ``Reprojection``.
         settled: (count + 1,) bool in and out.
     """
     count, (h, w) = segments.count, dynamic.shape
@@ -298,25 +298,17 @@ def stand_still(segments, dynamic, gaps, differences, settled):
     for v in range(h):
         for u in range(w):
             parts[v, u] = segments.labels[v, u] + (count if dynamic[v, u] else 0)
-    for k in range(len(gaps)):
-        gap, difference = gaps[k], differences[k]
-        for v in range(h):
-            for u in range(w):
-                compared[v, u] = not np.isnan(gap[v, u])
-                sigma = max(segments.least_sigma, segments.sigma[v, u])
-                displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
-        evidence = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, difference)
-        found, left = 0, False
-        for n in range(2 * count + 1):
-            visible[n] = evidence[n, COMPARED] > 0.7 and evidence[n, SIZE] >= segments.min_pixels
-            if visible[n]:
-                mismatches[found] = evidence[n, MISMATCH]
-                found += 1
-        limit = 1.2 * max(COMMON_MISMATCH, upper_quartile(mismatches[:found]))
-        for n in range(1, count + 1):
-            e = evidence[n + count]
-            still = visible[n + count] and e[DYNAMIC] < 0.1 and abs(e[DISTANCE]) < 1 and e[MISMATCH] < limit
-            settled[n] = settled[n] and still
-            left = left or settled[n]
-        if not left:
-            break
+            compared[v, u] = not np.isnan(gap[v, u])
+            sigma = max(segments.least_sigma, segments.sigma[v, u])
+            displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
+    evidence, found = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, difference), 0
+    for n in range(2 * count + 1):
+        visible[n] = evidence[n, COMPARED] > 0.7 and evidence[n, SIZE] >= segments.min_pixels
+        if visible[n]:
+            mismatches[found] = evidence[n, MISMATCH]
+            found += 1
+    limit = 1.2 * max(COMMON_MISMATCH, upper_quartile(mismatches[:found]))
+    for n in range(1, count + 1):
+        e = evidence[n + count]
+        still = visible[n + count] and e[DYNAMIC] < 0.1 and abs(e[DISTANCE]) < 1 and e[MISMATCH] < limit
+        settled[n] = settled[n] and still
