@@ -148,6 +148,7 @@ class DynamicDetector(Stateful):
         segmentation: Callable[[], Segmentation],
         moving: NDArray[np.bool_] | None = None,
         exposure: tuple[float, float] = (1.0, 0.0),
+        slow: NDArray[np.bool_] | None = None,
     ) -> Labels:
         """Labels of a frame that has been registered to a map.
 
@@ -159,6 +160,7 @@ class DynamicDetector(Stateful):
             segmentation: Waits for the segments of the image, as ``segment`` returns it.
             moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
             exposure: Gain and offset that make the image's intensities those of the map.
+            slow: (h, w) bool, those of them that an older image shows to move; None for none.
         """
         config, depth = self.config, level.depth
         noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
@@ -188,7 +190,8 @@ class DynamicDetector(Stateful):
             if config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None and moving.any():
-                dynamic = dynamic | (moving & ~self._stands_on_map(frame, moving, segmentation()))
+                fast = moving if slow is None else moving & ~slow
+                dynamic = dynamic | (moving & ~self._stands_on_map(frame, fast, segmentation()))
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -262,7 +265,8 @@ class DynamicDetector(Stateful):
         """Pixels (h, w) that images show to move, but whose segment stands where the map has it (``stand_still``).
 
         Corners go astray on silhouettes, in blur and on patterns that repeat. What of the moving part of a segment lies
-        on the map decides for all of it: the rest has come into view.
+        on the map decides for all of it: the rest has come into view. Not to be asked about slow motion: the map may be
+        as young as that.
         """
         sample, (gain, offset) = frame.sample, frame.exposure
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))

@@ -192,6 +192,7 @@ class FrontEnd(Stateful):
                 view.segmentation,
                 prediction.moving,
                 tracking.exposure,
+                prediction.slow,
             )
             if view.blind:
                 labels = replace(labels, hidden=None)

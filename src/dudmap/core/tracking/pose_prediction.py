@@ -146,13 +146,16 @@ class PosePrediction:
         T_world_camera: (4, 4).
         image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
         moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
-        moving_before: (h, w) bool, the same for the first image of the map where it is compared with that; else None.
+        slow: (h, w) bool, those of them that an older image shows to move; None where none was compared.
+        moving_before: (h, w) bool, as ``moving``, of the first image of the map where it is compared with that; else
+            None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
     """
 
     T_world_camera: NDArray[np.float64]
     image_pose: ImagePose
     moving: NDArray[np.bool_] | None = None
+    slow: NDArray[np.bool_] | None = None
     moving_before: NDArray[np.bool_] | None = None
     unverified_mask: NDArray[np.bool_] | None = None
 
@@ -256,7 +259,8 @@ class PosePredictor(Stateful):
                 unverified = ~slow.static
             if not young:  # where the map is known, it labels better than two images
                 moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
-        return PosePrediction(T_image, by_velocity.image_pose, moving, moving_before, unverified)
+        slowly = None if slow is None else slow.moving
+        return PosePrediction(T_image, by_velocity.image_pose, moving, slowly, moving_before, unverified)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image that the next one is compared with: a frame whose pose is accepted."""
