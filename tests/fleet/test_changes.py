@@ -264,7 +264,7 @@ def test_given_changes_take_the_place_of_drawn_ones(tmp_path, monkeypatch):
     told = []
     row = {"scene": "desk", "seed": 1, "people": False, "things": [], "false": []}
     monkeypatch.setattr(change_benchmark, "measure_pair", lambda pair, *_: told.append(pair) or dict(row))
-    words = ["benchmark", "changes", "--count", "2", "--changes", "box:moved", "--size", "0.1", "--out", str(tmp_path)]
+    words = ["benchmark", "changes", "--count", "2", "--changes", "box:moved", "--edge", "0.1", "--out", str(tmp_path)]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     assert [(pair["changes"], pair["size"]) for pair in told] == [([("box", "moved")], 0.1)] * 2

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dudmap.core.backends.cpu.octree_field import FinerLevels
 from dudmap.core.backends.cpu.raycasting import raycast
 from dudmap.core.backends.parameters import RaycastParameters, VoxelGrid
 from dudmap.core.geometry import se3
@@ -47,7 +48,9 @@ def view(field, T=None, camera=CAMERA, depth_min=0.05, depth_max=3.0, min_weight
     window, origin, geometry, colors = field
     unused = np.empty((0, 3), np.int16), np.empty(0, np.uint8)
     grid = VoxelGrid(window.reshape(-1), np.array(window.shape), origin, geometry, colors, *unused, VOXEL, UNIT)
-    return raycast(grid, T, camera.intrinsics, camera.shape, RaycastParameters(depth_min, depth_max, min_weight))
+    return raycast(
+        grid, T, camera.intrinsics, camera.shape, RaycastParameters(depth_min, depth_max, min_weight), FinerLevels()
+    )
 
 
 def pose(*twist):

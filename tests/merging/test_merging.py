@@ -200,9 +200,9 @@ def test_maps_are_recognised_in_the_order_in_which_they_can_be(room, monkeypatch
     ("change", "reason"),
     [
         (looking_elsewhere, "too few places"),
-        (retextured, "too few places|the colours disagree"),
+        (retextured, "too few places|features and surfaces|the colours disagree"),
         (lambda scene: retextured(scene, walls=False), "too few places|the colours disagree"),
-        (rearranged, "too few places|free space|the colours disagree"),
+        (rearranged, "too few places|features and surfaces|free space|the colours disagree"),
     ],
     ids=["elsewhere", "other textures", "other things", "rearranged"],
 )

@@ -24,7 +24,7 @@ def changes(
         str | None,
         Option(help="These in each pair, as for `synth`; none: nothing changed.", metavar="THING:KIND,..."),
     ] = None,
-    size: Annotated[float | None, Option(help="Longest edge of boxes, balls and bins.", metavar="M")] = None,
+    edge: Annotated[float | None, Option(help="Longest edge of boxes, balls and bins.", metavar="M")] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -43,7 +43,7 @@ def changes(
 
     recording = None if into is None else open_sequence(into)
     given: dict[str, Any] = {} if changes is None else {"changes": parsed_changes(changes)}
-    given |= {} if size is None else {"size": size}
+    given |= {} if edge is None else {"size": edge}
     config = o.read_config(None, None, assignments)
     rows, text = measure_changes(seed, count, config, out, min_size, told, recording, given)
     tree = {"rows": rows, "figures": figures(rows), "out": out}
