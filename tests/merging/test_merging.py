@@ -200,7 +200,7 @@ def test_maps_are_recognised_in_the_order_in_which_they_can_be(room, monkeypatch
     ("change", "reason"),
     [
         (looking_elsewhere, "too few places"),
-        (retextured, "too few places|features and surfaces|the colours disagree"),
+        (retextured, "too few places|cannot be aligned|the colours disagree"),
         (lambda scene: retextured(scene, walls=False), "too few places|the colours disagree"),
         (rearranged, "too few places|features and surfaces|free space|the colours disagree"),
     ],

@@ -28,7 +28,7 @@ GROUPS = {
     "--resolution --heights --world",
     "Calibration": "--calibration",
     "Live and viewing": "--live --view --host --port --token --orbit --sweep",
-    "Experiment": "--seed --count --min-size --only --quick --systems --score --keep --max-runs",
+    "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
     "Advanced": "--config --preset --set --device --jobs --resume --checkpoint-every --help",
 }
 """Options by the group of the help pages that they stand in; those of a single command stand before them."""
