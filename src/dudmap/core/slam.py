@@ -174,8 +174,7 @@ class Slam(SlamResults, Stateful):
         """
         if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
             raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
-        frame = Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
-        view = self.prepare(frame, dynamic_mask)
+        view = self.prepare(frame or Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale), dynamic_mask)
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
         if rejection:
@@ -202,8 +201,7 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        unobserved, ambiguous = estimate.unobserved_motion, self.predictor.ambiguity(view, prediction, estimate)
-        uncertain = unobserved or ambiguous
+        uncertain = estimate.unobserved_motion or self.predictor.ambiguity(view, prediction, estimate)
         fuse = self._adds_information(view, estimate, uncertain)
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
