@@ -64,6 +64,7 @@ def slam(monkeypatch):
     fake = type("Slam", (FakeSlam,), {"script": {}})
     module = types.ModuleType("dudmap.core.slam")
     module.Slam = fake
+    monkeypatch.setattr("dudmap.lab.warmup.steps", lambda: [("colour camera", lambda: None)])  # needs the real one
     monkeypatch.setitem(sys.modules, "dudmap.core.slam", module)
     monkeypatch.setattr("dudmap.app.pipeline.storing.RunStore.take", lambda *args, **options: None)
     return fake

@@ -47,7 +47,7 @@ def live(
     config, saved_map = run_parameters(parameters, mapped, out)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
-    with observers(watching) as watchers, run_compiled_beside():
+    with observers(watching) as watchers, run_compiled_beside(live=True):
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),
             max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,

@@ -98,7 +98,7 @@ def run(
     storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, watching.report)
     if watch and mapped.saved is None:
         raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
-    with observers(watching) as watchers, run_compiled_beside():
+    with observers(watching) as watchers, run_compiled_beside(live=live):
         if watch and mapped.saved is not None:
             from dudmap.core.places.saved_map import SavedMap
             from dudmap.fleet.change_watch import ChangeWatch

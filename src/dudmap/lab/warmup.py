@@ -139,9 +139,13 @@ def compiled_beside(parts: tuple[str, ...]) -> Iterator[Callable[[], object]]:
         process.wait()
 
 
-def run_compiled_beside() -> AbstractContextManager[object]:
-    """``compiled_beside`` for the first run, which no kernel is compiled for."""
-    return compiled_beside(() if compiled_kernels() else BESIDE_RUN)
+def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
+    """``compiled_beside`` for the first run, which no kernel is compiled for; before a later ``live`` one those of a
+    calibration are loaded, which would hold up the frames."""
+    compiled = compiled_kernels()
+    if live and compiled:
+        dict(steps())["colour camera"]()
+    return compiled_beside(() if compiled else BESIDE_RUN)
 
 
 if __name__ == "__main__":
