@@ -45,8 +45,9 @@ def test_an_error_of_the_caller_is_not_replaced():
             background.do(lambda: 1 / 0)
             raise KeyError("first")
 
-    with pytest.raises(KeyError, match="first"):
+    with pytest.raises(KeyError, match="first") as raised:
         fail(Background())
+    assert "ZeroDivisionError" in raised.value.__notes__[0]
 
 
 def test_postponed_jobs_are_done_when_the_caller_has_time_and_at_the_end():

@@ -29,12 +29,15 @@ class Background:
     def __enter__(self) -> "Background":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: object, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         try:
             self.wait()
-        except Exception:
-            if kind is None:  # else the error of the caller is the one to tell
+        except Exception as of_job:
+            if error is None:
                 raise
+            error.add_note(f"work beside the frames failed, too: {of_job!r}")
         finally:
             self._thread.shutdown()
 

@@ -1,24 +1,23 @@
 """Processing of a recording or of a camera: reads frames, runs the system, records metrics, writes the run folder."""
 
-import time
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.app.pipeline.background import Background
+from dudmap.app.pipeline.frame_processing import process_source
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
+from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
 from dudmap.app.terminal import counted
 from dudmap.config import Config
-from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError
 from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream of a camera begins."""
-MAKE_ROOM = "make room on the disk of the run folder"
 
 
 def run(
@@ -351,77 +349,3 @@ def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
 
 def _resolved(path: str | Path | None) -> Path | None:
     return None if path is None else Path(path).resolve()
-
-
-def process_source(
-    source: SourceFrame,
-    slam: "Slam",
-    record: RunRecord,
-    display: RunProgress,
-    mask_folder: Path | None,
-    background: Background,
-    observers: "tuple[RunObserver, ...]" = (),
-) -> None:
-    """Process one frame, count it, save its mask, and report it; what no later frame waits for is done in the
-    background."""
-    index, read = source.number, source.read
-    if record.dropped is not None:
-        record.dropped += source.dropped
-    if isinstance(read.frame, FrameError):
-        record.skip(read.frame)
-        display.note(f"skipped: {read.frame}")
-        for observer in observers:
-            observer.event("unreadable", frame=index, reason=str(read.frame))
-        return
-    true_mask, given_mask = read.true_mask, read.given_mask
-    if isinstance(true_mask, FrameError):
-        display.note(f"frame {index}: the true mask is not scored, {true_mask}")
-        true_mask = None
-    if isinstance(given_mask, FrameError):
-        display.note(f"frame {index}: the given mask is ignored, {given_mask}")
-        given_mask = None
-    start = time.perf_counter()
-    frame = read.prepared or read.frame
-    try:
-        result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
-    except FrameError as error:
-        record.skip(error)
-        display.note(f"skipped: {error}")
-        return
-    end = time.perf_counter()
-    if record.masked is not None:
-        record.masked += given_mask is not None
-    delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
-    record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
-    row = record.rows[-1]
-    read = read._replace(prepared=None)  # what waits in the background holds no pyramids
-
-    def tell(*, beside: bool) -> None:
-        for observer in observers:
-            if observer.beside == beside:
-                try:
-                    observer.frame(index, read, result, row["total"])
-                except OSError as error:
-                    display.once(f"images for the report cannot be written: {error}; {MAKE_ROOM}")
-
-    def keep_images() -> None:
-        if mask_folder is not None and not result.rejected:
-            try:
-                save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
-            except OSError as error:
-                display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
-        tell(beside=True)
-
-    def complete() -> None:
-        record.add_movers(row, result)
-        keep_images()
-
-    if record.dropped is None:
-        background.do(complete)
-    else:  # what is postponed holds no images
-        keep_images()
-        background.do(partial(record.add_movers, row, result))
-    tell(beside=False)
-    if result.calibrated:
-        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
-    display.frame(index, result, record.dropped)
