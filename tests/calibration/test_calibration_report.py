@@ -6,7 +6,7 @@ import numpy as np
 
 from dudmap import Config
 from dudmap.app.pipeline.calibration import calibrate_start, findings
-from dudmap.core.calibration.estimator import GROUPS, Estimate
+from dudmap.core.calibration.estimator import GROUPS, SHUTTER, Estimate
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 
@@ -16,7 +16,7 @@ CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
 def estimate(sigma: float, evidence: float, estimated: tuple[str, ...] = ()) -> Estimate:
     found = Calibration.registered(CAMERA)
     found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated)
-    return Estimate(found, dict.fromkeys(GROUPS, evidence), 0.0, 80)
+    return Estimate(found, dict.fromkeys((*GROUPS, SHUTTER), evidence), 0.0, 80)
 
 
 def test_what_was_not_tested_is_called_assumed():
@@ -24,7 +24,8 @@ def test_what_was_not_tested_is_called_assumed():
 
 
 def test_what_was_tested_and_kept_has_its_uncertainty():
-    timing, _, geometry = findings(estimate(0.025, -0.5))
+    shutter, timing, _, geometry = findings(estimate(0.025, -0.5))
+    assert "not proven (-0.5 standard errors, 3 are needed); rows are taken to be read out within 0.0 ms" in shutter
     for text in ("assumed as given; tested", "-0.5 standard errors", "delay 25 ms"):
         assert text in timing
     for text in ("translation 25 mm", "rotation 1.4 deg", "focal length 2.5 %"):
@@ -32,11 +33,16 @@ def test_what_was_tested_and_kept_has_its_uncertainty():
 
 
 def test_a_significant_but_small_difference_is_not_called_none():
-    assert all("too small a share to be used" in finding for finding in findings(estimate(0.025, 3.0)))
+    assert all("too small a share to be used" in finding for finding in findings(estimate(0.025, 3.0))[1:])
 
 
 def test_what_was_estimated_has_its_uncertainty():
-    timing = findings(estimate(0.002, 4.0, GROUPS["timing"]))[0]
+    found = estimate(0.002, 4.0, (*GROUPS["timing"], "depth_readout"))
+    shutter, timing, *_ = findings(replace(found, calibration=replace(found.calibration, depth_readout=0.027)))
+    assert shutter == (
+        "depth camera, shutter: estimated; other images fit 4.0 standard errors better; "
+        "rows are taken to be read out within 27.0 ms"
+    )
     assert timing.startswith("colour camera, timing: estimated")
     assert "delay 2 ms" in timing
 

@@ -51,3 +51,15 @@ def test_bad_text_is_refused_with_a_sentence(tmp_path, text, says):
 def test_missing_file_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="cannot read"):
         Trajectory.load(tmp_path / "none.txt")
+
+
+def test_poses_after_those_of_the_stamps_lie_on_the_way_of_a_steady_camera():
+    stamps = np.array([0.0, 0.03, 0.07, 0.10, 0.60, 0.63])
+    twist = np.array([0.5, -0.2, 0.1, 0.3, 0.8, -0.4])
+    trajectory = Trajectory(stamps, se3.exp_all(stamps[:, None] * twist))
+    for seconds in (0.018, -0.018):
+        wanted = se3.exp_all((stamps + seconds)[:, None] * twist)
+        np.testing.assert_allclose(trajectory.after(seconds).Ts_world_camera, wanted, atol=1e-12)
+    np.testing.assert_array_equal(trajectory.after(0.0).Ts_world_camera, trajectory.Ts_world_camera)
+    alone = Trajectory(np.array([0.0, 1.0]), trajectory.Ts_world_camera[:2])
+    np.testing.assert_array_equal(alone.after(0.02).Ts_world_camera, alone.Ts_world_camera)

@@ -207,12 +207,15 @@ def consistency(
     """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DatasetError
+    from dudmap.io.exporting.run_content import RunContent
     from dudmap.lab.benchmark.consistency import measure_consistency
 
     source = reading.open(recording)
     truth = {} if source.ground_truth is None else {"published": source.ground_truth}
-    files = [path / "trajectory.txt" if path.is_dir() else path for path in trajectories or []]
-    found = truth | {str(path): Trajectory.load(path) for path in files}
+    found = truth | {
+        str(path): RunContent.load(path).trajectory if path.is_dir() else Trajectory.load(path)
+        for path in trajectories or []
+    }
     if not found:
         raise DatasetError(f"{recording} comes without poses; name the trajectories to compare, such as a run's folder")
     result = measure_consistency(source, found, max_frames=max_frames)

@@ -191,10 +191,10 @@ def write_run_folder(
         DudmapError: A file could not be written, other than after a defect.
     """
     foreseen = Exception if defect else (OSError, MapError)
-    (trajectory, volume), *others = slam.maps
+    calibration, maps = slam.calibration, slam.maps
+    (trajectory, volume), *others = [(poses.after(calibration.depth_late), volume) for poses, volume in maps]
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
-    calibration = slam.calibration
     metrics |= record.metrics() | {
         "map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes, "mesh_vertices": 0, "mesh_triangles": 0,
         "maps": len(others) + 1, "calibration": calibration.tree(),

@@ -34,43 +34,59 @@ def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe
 class ReadoutSearch:
     """Mean robust cost of the pairs of frames of one half of the time, as a function of the readout of their depth.
 
-    The cost is nearly quadratic: its minimum is that of the parabola through three readouts, and then once more of that
-    through the nearest three. The poses of the frames are fitted to each.
+    The colour camera's own delay and readout, which look much alike, and the poses of the frames are fitted to each
+    readout. The cost is nearly quadratic: its minimum is that of the parabola through three readouts, and then once
+    more of that through the nearest three.
 
     Args:
         pairs: Of keyframes.
         given: Calibration of the colour camera.
-        adjustment: Fits the poses.
+        adjustment: Fits poses and parameters.
+        free: (13,) bool, the parameters of the timing.
         stride: Every so many points of a keyframe.
 
     Attributes:
-        costs: (2, P) of intensities and depths of every pair, by readout.
-        best: Readout with the smallest cost, seconds.
+        best: Calibration with the readout of the smallest cost.
     """
 
-    def __init__(self, pairs: Sequence[Pair], given: Calibration, adjustment: Adjustment, stride: int) -> None:
-        self._pairs, self._given, self._adjustment, self._stride = pairs, given, adjustment, stride
-        self.costs: dict[float, NDArray[np.float64]] = {}
-        for readout in (-STEP, 0.0, STEP):
-            self.cost(readout)
-        self.cost(self._vertex())
-        self.best = self._vertex()
+    best: Calibration
 
-    def cost(self, readout: float) -> NDArray[np.float64]:
-        """Costs (2, P) of a readout in seconds."""
-        if readout not in self.costs:
-            known = {id(frame): frame for pair in self._pairs for frame in (pair.first, pair.second)}
-            moved = {key: rectified_keyframe(frame, readout) for key, frame in known.items()}
-            pairs = PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)
-            start = Fit.tracked(pairs, self._given.with_depth_readout(readout))
-            fit, _ = self._adjustment.with_poses(pairs, start, self._adjustment.levels)
-            self.costs[readout] = self._adjustment.costs(pairs, fit)
-        return self.costs[readout]
+    def __init__(
+        self, pairs: Sequence[Pair], given: Calibration, adjustment: Adjustment, free: NDArray[np.bool_], stride: int
+    ) -> None:
+        self._pairs, self._given, self._adjustment, self._stride = pairs, given, adjustment, stride
+        self._free = free
+        self._found: dict[float, tuple[float, Calibration]] = {}  # mean cost and calibration by readout
+        for readout in (-STEP, 0.0, STEP):
+            self.fitted(readout)
+        self.fitted(self._vertex())
+        self.best = self.fitted(self._vertex())
+
+    def fitted(self, readout: float) -> Calibration:
+        """Calibration with a readout in seconds and the timing of the colours that goes with it."""
+        if readout not in self._found:
+            pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
+            levels = self._adjustment.levels[-2:]
+            fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, levels)
+            self._found[readout] = float(self._adjustment.costs(pairs, fit).mean()), fit.calibration
+        return self._found[readout][1]
+
+    def costs(self, calibration: Calibration) -> NDArray[np.float64]:
+        """Costs (2, P) of intensities and depths of every pair with a calibration, such as that of other pairs."""
+        pairs = self._rectified(calibration.depth_readout)
+        fit, _ = self._adjustment.with_poses(pairs, Fit.tracked(pairs, calibration))
+        return self._adjustment.costs(pairs, fit)
+
+    def _rectified(self, readout: float) -> PairSet:
+        """The pairs of keyframes at the times of their middle rows."""
+        frames = {id(frame): frame for pair in self._pairs for frame in (pair.first, pair.second)}
+        moved = {key: rectified_keyframe(frame, readout) for key, frame in frames.items()}
+        return PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)
 
     def _vertex(self) -> float:
         """Minimum of the parabola through the three readouts around the best one."""
-        readouts = np.array(sorted(self.costs))
-        values = np.array([self.costs[readout].mean() for readout in readouts.tolist()])
+        readouts = np.array(sorted(self._found))
+        values = np.array([self._found[readout][0] for readout in readouts.tolist()])
         middle = min(max(int(values.argmin()), 1), len(values) - 2)
         a, b, _ = np.polyfit(readouts[middle - 1 : middle + 2], values[middle - 1 : middle + 2], 2)
         lowest = -b / (2 * a) if a > 0 else readouts[values.argmin()]

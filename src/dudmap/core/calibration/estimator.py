@@ -24,6 +24,8 @@ MIN_PAIRS = 14
 """Pairs of either half of the time without which nothing is estimated: one more than parameters."""
 PAIRS = 80
 """Pairs that decide what is estimated; half as many more, across the halves, enter the result."""
+SHUTTER_PAIRS = 160
+"""Pairs that decide on the readout of the depth, which only turning cameras show clearly."""
 STRIDE = 2
 """Every so many points of a frame decide what is estimated; all of them enter the result."""
 SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
@@ -33,8 +35,6 @@ MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.1, SHUTTER: 0.01}
 bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
 recording with such a depth (TUM fr1_xyz) the geometry gained up to 7 % and its use made the poses worse; a colour
 camera 25 mm beside gains 19 to 30 %."""
-SAME_READOUT = 0.002
-"""Change of the readout of the depth, seconds, after which the colour camera is not estimated anew."""
 EVIDENCE = 3.0
 """Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
 pairs of the other half, in the sum of both. Chance does so once in 700 times."""
@@ -101,10 +101,10 @@ class _Trial:
         return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
 
 
-def _halves(keyframes: Sequence[ColorKeyframe]) -> list[list[Pair]]:
-    """Pairs of either half of the time."""
+def _halves(keyframes: Sequence[ColorKeyframe], count: int) -> list[list[Pair]]:
+    """Up to ``count`` pairs, from within either half of the time."""
     middle = len(keyframes) // 2
-    return [select_pairs(part, PAIRS // 2) for part in (keyframes[:middle], keyframes[middle:])]
+    return [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
 
 
 def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
@@ -145,39 +145,40 @@ class CalibrationEstimator:
         What merely absorbs errors of another kind, such as a bent depth image, does so differently from place to place
         and fails.
         """
-        halves = _halves(keyframes)
+        halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
             unknown = dict.fromkeys((*GROUPS, SHUTTER), float("nan"))
             return Estimate(self.given, unknown, 0.0, sum(map(len, halves)))
-        given = self.given
-        readout, evidence, gain = self._depth_readout(halves, given)
+        known = self.given.depth_readout
+        readout, evidence, gain = self._depth_readout(halves)
         estimate = self._estimate_color(keyframes, readout)
-        # while the colours are late, no readout explains what both do together
-        again, evidence, gain = self._depth_readout(halves, estimate.calibration)
-        if abs(again - readout) > SAME_READOUT:
-            readout, estimate = again, self._estimate_color(keyframes, again)
-        found, moved = estimate.calibration, (SHUTTER_PARAMETER,) if readout != given.depth_readout else ()
+        found, moved = estimate.calibration, (SHUTTER_PARAMETER,) if readout != known else ()
+        late = max(found.delay, 0.0) if any(frame.color_offset for frame in keyframes) else 0.0
         return Estimate(
-            replace(found, estimated=(*found.estimated, *moved)),
+            replace(found, estimated=(*found.estimated, *moved), depth_late=late),
             estimate.evidence | {SHUTTER: evidence},
             1 - (1 - gain) * (1 - estimate.gain),
             estimate.pairs,
         )
 
-    def _depth_readout(self, halves: list[list[Pair]], color: Calibration) -> tuple[float, float, float]:
+    def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float]:
         """Readout of the depth in seconds, as given where another one is not proven, the evidence for another one, and
-        the share by which the cost decreased with it; ``color`` is a calibration of the colour camera."""
-        given, adjustment = self.given, self.adjustment
+        the share by which the cost decreased with it."""
+        given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
-            searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, color, adjustment, STRIDE), halves))
-        sets, nothing = [PairSet(pairs, STRIDE) for pairs in halves], np.zeros(NUM_PARAMETERS, dtype=bool)
+            searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
         one, other = searches
-        before = _Trial(nothing, [], [other.cost(given.depth_readout), one.cost(given.depth_readout)], sets)
-        after = _Trial(nothing, [], [other.cost(one.best), one.cost(other.best)], sets)
+        sets = [PairSet(pairs, STRIDE) for pairs in halves]
+        before, after = (
+            _Trial(timing, [], [other.costs(of_one), one.costs(of_other)], sets)
+            for of_one, of_other in (
+                (one.fitted(given.depth_readout), other.fitted(given.depth_readout)), (one.best, other.best)
+            )
+        )  # fmt: skip
         evidence, gain = after.improvement(before)
         if not after.proves(before, SHUTTER):
             return given.depth_readout, evidence, 0.0
-        return (one.best + other.best) / 2, evidence, gain
+        return (one.best.depth_readout + other.best.depth_readout) / 2, evidence, gain
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
         """Calibration of the colour camera beside a depth camera with a known readout."""
@@ -187,7 +188,7 @@ class CalibrationEstimator:
     def _beside_rectified(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
         """Calibration of the colour camera beside a depth camera whose images are rectified."""
         middle = len(keyframes) // 2
-        within = _halves(keyframes)
+        within = _halves(keyframes, PAIRS)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
         fits = [

@@ -43,6 +43,9 @@ class Calibration:
         sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
         estimated: Names of the parameters that were estimated; the others are as given.
         depth_readout: Time from the first to the last row of the depth image (rolling shutter), s.
+        depth_late: Time by which the stamps of the depth images are later than the images, s: no image is stamped
+            before it is taken, so that where both have stamps of their own and the colours were found to be taken later
+            by a ``delay``, it is the depth that is stamped too late.
     """
 
     camera: Camera
@@ -52,6 +55,7 @@ class Calibration:
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(NUM_PARAMETERS, np.nan))
     estimated: tuple[str, ...] = ()
     depth_readout: float = 0.0
+    depth_late: float = 0.0
 
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
@@ -63,6 +67,7 @@ class Calibration:
         ):
             raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
         times = {"delay": self.delay, "readout": self.readout, "depth_readout": self.depth_readout}
+        times["depth_late"] = self.depth_late
         if not np.all(np.isfinite([*times.values()])):
             found = ", ".join(f"{name} {value} s" for name, value in times.items())
             raise DatasetError(f"the calibration has {found}; expected finite numbers")
@@ -153,6 +158,7 @@ class Calibration:
             "delay": self.delay,
             "readout": self.readout,
             "depth_readout": self.depth_readout,
+            "depth_late": self.depth_late,
             "estimated": list(self.estimated),
             "camera": camera,
             "sigma": sigma,
@@ -187,6 +193,7 @@ class Calibration:
                 np.array([float(known.get(name, np.nan)) for name in PARAMETERS]),
                 tuple(tree.get("estimated", ())),
                 float(tree.get("depth_readout", 0.0)),
+                float(tree.get("depth_late", 0.0)),
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error

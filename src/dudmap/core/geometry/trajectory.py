@@ -12,6 +12,9 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import read_rows
 from dudmap.errors import DatasetError
 
+LARGEST_STEP = 0.15
+"""Largest time between two poses, seconds, between which a camera is taken to move steadily."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -61,6 +64,23 @@ class Trajectory:
         if len(self) == 0 or not self.timestamps[0] <= timestamp <= self.timestamps[-1]:
             raise DatasetError(f"no pose at time {timestamp:.6f}: it lies outside the trajectory")
         return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
+
+    def after(self, seconds: float) -> "Trajectory":
+        """Poses so many seconds after those of the same time stamps, or before them where negative.
+
+        They lie on the screw to the next pose, or the one before; beside a gap longer than ``LARGEST_STEP`` and at the
+        ends on that through the two on the other side, if these are near enough.
+        """
+        if seconds == 0 or len(self) < 2:
+            return self
+        gaps, forwards = np.diff(self.timestamps), seconds > 0
+        near = np.append(gaps <= LARGEST_STEP, False)
+        motions = se3.log_all(se3.inverse(self.Ts_world_camera[:-1]) @ self.Ts_world_camera[1:]) / gaps[:, None]
+        to_next = np.where(near[:, None], np.vstack([motions, np.zeros(6)]), 0.0)
+        from_last, has_last = np.roll(to_next, 1, axis=0), np.roll(near, 1)
+        first, other = (to_next, from_last) if forwards else (from_last, to_next)
+        twists = np.where((near if forwards else has_last)[:, None], first, other)
+        return Trajectory(self.timestamps, self.Ts_world_camera @ se3.exp_all(seconds * twists))
 
     def save(self, path: str | Path) -> None:
         """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""

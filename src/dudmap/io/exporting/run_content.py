@@ -74,8 +74,9 @@ class RunContent:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the tracked frames."""
-        return Trajectory.load(self.folder / "trajectory.txt")
+        """Poses at which the depth images of the tracked frames were taken."""
+        late = 0.0 if self.calibration is None else self.calibration.depth_late
+        return Trajectory.load(self.folder / "trajectory.txt").after(-late)
 
     @cached_property
     def mesh(self) -> Mesh | None:
