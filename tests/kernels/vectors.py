@@ -18,7 +18,6 @@ PATTERNS = {
     "fma": rf"\bvfn?m(?:add|sub)\d+ps{WIDE}",
     "packed": rf"\bv(?:add|sub|mul|div|min|max|fn?m(?:add|sub)\d+)ps{WIDE}",
     "converted": rf"\bvcvt(?:dq2ps|tps2dq){WIDE}",
-    "gathers": r"\bvp?gather[dq]\w+",
     "scalar": r"\bv(?:add|sub|mul|div|min|max|fn?m(?:add|sub)\d+)ss\b",
 }
 

@@ -64,3 +64,4 @@ def test_it_happens_once_and_never_to_a_map_that_began_anew(room, monkeypatch):
 def test_a_live_camera_does_not_wait_for_it(room, monkeypatch):
     slam, returned = run(room, monkeypatch, WINDOW, live=True)
     assert np.array_equal(slam.trajectory.Ts_world_camera, returned)
+    assert slam.bootstrap.complete_window() == []  # nor are frames kept for it

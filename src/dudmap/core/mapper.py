@@ -80,6 +80,9 @@ class Bootstrap(Stateful):
 
     The first frames were registered to a map that had seen little: they are remembered to be registered once more.
 
+    Args:
+        refines: Whether they are; else they are not remembered for it.
+
     Attributes:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
     """
@@ -89,7 +92,8 @@ class Bootstrap(Stateful):
     _window: Remembered[list[FusedFrame]]
     _num_fused: Remembered[int] = 0
 
-    def __init__(self) -> None:
+    def __init__(self, *, refines: bool) -> None:
+        self._refines = refines
         self._frames = []
         self._window = []
 
@@ -104,7 +108,7 @@ class Bootstrap(Stateful):
         """Remember the frame that a map was made of."""
         estimate = PoseEstimate.at_origin()
         self._frames, self._num_fused = [StartFrame(view, estimate, dynamic_mask, fused=True)], 1
-        self._window = [FusedFrame.of(view, estimate, dynamic_mask)]
+        self._window = [FusedFrame.of(view, estimate, dynamic_mask)] if self._refines else []
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember what was fused after the first frame, or that the map began anew with it."""

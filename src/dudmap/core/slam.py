@@ -111,7 +111,7 @@ class Slam(SlamResults, Stateful):
         self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._make_volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
-        self.bootstrap = Bootstrap()
+        self.bootstrap = Bootstrap(refines=prior is None and not live)  # a second pass has the map of the first
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
@@ -263,9 +263,8 @@ class Slam(SlamResults, Stateful):
         return view
 
     def _refine_first_poses(self) -> None:
-        """Estimate the poses of the first moments of a map once more; a second pass has the map of the first."""
-        wanted = self.prior_map is None and not self.live
-        if wanted and (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
+        """Estimate the poses of the first moments of a map once more."""
+        if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
             self.motion.apply_correction(correction)
 
     def _is_blind(self, view: FrameView) -> bool:

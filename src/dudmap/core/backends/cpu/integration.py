@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.cpu.gathers import load_pairs
-from dudmap.core.backends.cpu.memory import prefetch
+from dudmap.core.backends.cpu.memory import load_pair, prefetch_quarter
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import scalar
 from dudmap.core.formulas.pixel import band_behind, free_depth, project, ray, reading_weight
@@ -120,7 +119,7 @@ def integrate_blocks(
     for block in range(start, stop):
         slot = slots[block]
         following = np.uintp(slots[min(block + 1, stop - 1)]) * np.uintp(512)
-        prefetch(map_geometry, following)
+        prefetch_quarter(map_geometry, following)
         ox = np.float32(coords[slot, 0] * 8) * voxel_size
         oy = np.float32(coords[slot, 1] * 8) * voxel_size
         oz = np.float32(coords[slot, 2] * 8) * voxel_size
@@ -135,9 +134,14 @@ def integrate_blocks(
             ok = (z > np.float32(0.05)) & (u >= zero) & (v >= zero) & (u < max_u) & (v < max_v)
             pixel[n] = np.int32(v * max_u + u if ok else blank)
             known[0, n] = z
-        prefetch(map_geometry, following + np.uintp(256))
-        farthest = np.float32(load_pairs(pixels, pixel, seen)) * parameters.depth_unit
-        prefetch(map_colors, following)
+        prefetch_quarter(map_geometry, following + np.uintp(256))
+        for n in range(512):
+            seen[n] = load_pair(pixels, np.uintp(2 * pixel[n]))
+        largest = np.int32(0)
+        for n in range(512):
+            largest = max(largest, (words[2 * n] >> 16) & 0xFFFF)
+        farthest = np.float32(largest) * parameters.depth_unit
+        prefetch_quarter(map_colors, following)
         first = np.int64(slot) * 512
         geometry = map_geometry[first : first + 512]
         count = repeats[block]
@@ -151,7 +155,7 @@ def integrate_blocks(
                     occupied[block] = 1
                     break
             continue
-        prefetch(map_colors, following + np.uintp(256))
+        prefetch_quarter(map_colors, following + np.uintp(256))
         for n in range(512):
             word, share = fuse_voxel(
                 geometry[n], words[2 * n], words[2 * n + 1], known[0, n], count, by_unit, parameters

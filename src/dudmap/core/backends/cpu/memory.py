@@ -1,32 +1,55 @@
 """Memory operations that NumPy does not have."""
 
+import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from dudmap.core.backends.threads import scalar
+
 LINES = 16
-"""Cache lines of one call of ``prefetch``: as many as a core of most processors can wait for; more of them at once hold
-up the loads that follow."""
+"""Cache lines of one call of ``prefetch_quarter``: as many as a core of most processors can wait for; more of them at
+once hold up the loads that follow. They are a quarter of the words of a block, of 512."""
 LINE = 64
 """Bytes of a cache line of most processors."""
 
 
 @intrinsic
-def prefetch(typing_context, array, index):
-    """Prefetch ``LINES`` cache lines of a flat array from element ``index`` on: a hint, which changes no result."""
+def load_pair(typing_context, words, index):
+    """Two consecutive elements of a flat int32 array, from ``index`` on, as one int64; the first is its lower half."""
 
     def generate(context, builder, signature, arguments):
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        byte_pointer = ir.IntType(8).as_pointer()
-        number = ir.IntType(32)
+        pair = ir.IntType(64)
+        return builder.load(builder.bitcast(_place(context, builder, signature, arguments), pair.as_pointer()), align=4)
+
+    return types.int64(words, types.uintp), generate
+
+
+@intrinsic
+def prefetch(typing_context, array, index):
+    """Prefetch the cache line of an element of a flat array: a hint, which changes no result."""
+
+    def generate(context, builder, signature, arguments):
+        byte_pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
         hint = builder.module.declare_intrinsic(
             "llvm.prefetch", [byte_pointer], ir.FunctionType(ir.VoidType(), [byte_pointer, number, number, number])
         )
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), byte_pointer)
         read, all_caches, data_cache = number(0), number(3), number(1)
-        for line in range(LINES):
-            place = builder.gep(pointer, [number(LINE * line)])
-            builder.call(hint, [place, read, all_caches, data_cache])
+        place = builder.bitcast(_place(context, builder, signature, arguments), byte_pointer)
+        builder.call(hint, [place, read, all_caches, data_cache])
         return context.get_dummy_value()
 
-    return types.void(array, index), generate
+    return types.void(array, types.uintp), generate
+
+
+def _place(context, builder, signature, arguments):
+    """Address of an element of a flat array."""
+    data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+    return builder.gep(data, [arguments[1]])
+
+
+@scalar
+def prefetch_quarter(words, index):
+    """Prefetch a quarter of a block of a flat array of 32-bit words, from an index on."""
+    for line in range(LINES):
+        prefetch(words, index + np.uintp(line * LINE // 4))

@@ -1,46 +1,32 @@
 """The eight voxels around points of the map: what a trilinear interpolation loads.
 
-For two thirds of all points one block holds all eight. A branch on that is mispredicted for every third point. A single
-point therefore always takes eight look-ups; of a row of points, those of the other third are listed first, without a
-branch, and both kinds are loaded by vector instructions.
+For two thirds of all points one block holds all eight, and four loads of two words fetch them. A branch on that is
+mispredicted for every third point: of a row of points, those of the other third are listed first, without a branch, and
+looked up once more on their own. The voxels of points that come later in the row are prefetched.
 """
 
 import numpy as np
 
-from dudmap.core.backends.cpu.gathers import LANES, load_voxels, load_voxels_of_blocks
+from dudmap.core.backends.cpu.memory import load_pair, prefetch
 from dudmap.core.backends.threads import kernel, scalar
+
+AHEAD = 16
+"""Points between that whose voxels are loaded and that whose voxels are prefetched."""
 
 
 @kernel
-def load_corners(window, geometry, ix, iy, iz, corners, u, size_y, size_z):
-    """Words of the eight voxels around lattice point (ix, iy, iz) into ``corners[:, u]``, int32; 0 = unknown.
+def load_corners(window, geometry, cell, voxel, size_y, size_z, corners, u):
+    """Words of the eight voxels around a point into ``corners[:, u]``, int32, corner 4 dx + 2 dy + dz; 0 = unknown.
 
-    ``corners`` has two axes: eight words in a row would be read back by one vector load, which waits for all stores.
+    ``cell`` and ``voxel`` say which one lies at its lower corner. ``corners`` has two axes: eight words in a row would
+    be read back by one vector load, which waits for all stores.
     """
-    x0, y0, z0 = ix & 7, iy & 7, iz & 7
-    x1, y1, z1 = (ix + 1) & 7, (iy + 1) & 7, (iz + 1) & 7
-    bx0, by0, bz0 = (ix >> 3) * size_y, iy >> 3, iz >> 3
-    bx1, by1, bz1 = ((ix + 1) >> 3) * size_y, (iy + 1) >> 3, (iz + 1) >> 3
-    row = (bx0 + by0) * size_z
-    slot0, slot1 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx0 + by1) * size_z
-    slot2, slot3 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx1 + by0) * size_z
-    slot4, slot5 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx1 + by1) * size_z
-    slot6, slot7 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    voxel = (x0 * 8 + y0) * 8
-    corners[0, u] = _voxel(geometry, slot0, voxel + z0)
-    corners[1, u] = _voxel(geometry, slot1, voxel + z1)
-    voxel = (x0 * 8 + y1) * 8
-    corners[2, u] = _voxel(geometry, slot2, voxel + z0)
-    corners[3, u] = _voxel(geometry, slot3, voxel + z1)
-    voxel = (x1 * 8 + y0) * 8
-    corners[4, u] = _voxel(geometry, slot4, voxel + z0)
-    corners[5, u] = _voxel(geometry, slot5, voxel + z1)
-    voxel = (x1 * 8 + y1) * 8
-    corners[6, u] = _voxel(geometry, slot6, voxel + z0)
-    corners[7, u] = _voxel(geometry, slot7, voxel + z1)
+    # 1 along the axes where the next voxel lies in the next block
+    x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3
+    for corner in range(8):
+        dx, dy, dz = corner >> 2, (corner >> 1) & 1, corner & 1
+        slot = window[np.uintp(cell + dx * x * size_y * size_z + dy * y * size_z + dz * z)]
+        corners[corner, u] = _voxel(geometry, slot, voxel + dx * (64 - 512 * x) + dy * (8 - 64 * y) + dz * (1 - 8 * z))
 
 
 @kernel
@@ -82,7 +68,7 @@ def locate(x, y, z, last, size_y, size_z):
 
 
 @scalar
-def load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words):
+def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
     Those of the points, a third, whose eight voxels lie in several blocks are looked up on their own.
@@ -91,21 +77,38 @@ def load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, wo
         window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
         shape: (3,) int64 blocks of the window.
         geometry: (slots * 512,) int32 packed voxels.
-        cells: (w,) int32, cell of the window that holds the point; w is a multiple of ``LANES``.
-        voxels: (w,) int32, number within the block of the voxel at its lower corner.
-        crossing: (w,) int32, 1 where the eight voxels of a wanted point lie in more than one block, else 0.
-        wanted: (w,) uint8, 0 where nothing need be loaded; points are left out by ``LANES``.
-        outer: (w + LANES,) int32, work space.
-        words: (8, w) int32 out, corner 4 dx + 2 dy + dz.
+        cells: (w + AHEAD,) int32, cell of the window that holds the point; any cell behind the last one.
+        voxels: (w + AHEAD,) int32, number within the block of the voxel at its lower corner.
+        crossing: (w,) int32, 1 where the eight voxels of a point lie in more than one block, else 0, and 0 for points
+            whose words are not used.
+        outer: (w,) int32, work space.
+        words: (8, >= w) int32 out, corner 4 dx + 2 dy + dz.
     """
-    flat, groups, num_outer = words.reshape(-1), wanted.view(np.uint64), np.uintp(0)
-    for u in range(len(cells)):
+    num_outer = np.uintp(0)
+    for u in range(len(crossing)):
         outer[num_outer] = u
         num_outer += np.uintp(crossing[u])
-    for start in range(0, len(cells), LANES):
-        if groups[start // LANES] != 0:
-            load_voxels(window, geometry, cells, voxels, crossing, start, flat, len(cells))
-    if num_outer > 0:
-        outer[num_outer : num_outer + np.uintp(LANES)] = outer[num_outer - np.uintp(1)]
-    for start in range(0, num_outer, LANES):
-        load_voxels_of_blocks(window, shape[1], shape[2], geometry, cells, voxels, outer, start, flat, len(cells))
+    for u in range(len(crossing)):
+        coming, used = _first_word(window, cells[u + AHEAD], voxels[u + AHEAD])
+        prefetch(geometry, np.uintp(coming & used))
+        prefetch(geometry, np.uintp(coming & used) + np.uintp(64))
+        first, used = _first_word(window, cells[u], voxels[u])
+        used &= np.int64(crossing[u]) - 1
+        place = np.uintp(first & used)
+        near, beside = load_pair(geometry, place) & used, load_pair(geometry, place + np.uintp(8)) & used
+        words[0, u], words[1, u] = np.int32(near), np.int32(near >> 32)
+        words[2, u], words[3, u] = np.int32(beside), np.int32(beside >> 32)
+        near = load_pair(geometry, place + np.uintp(64)) & used
+        beside = load_pair(geometry, place + np.uintp(72)) & used
+        words[4, u], words[5, u] = np.int32(near), np.int32(near >> 32)
+        words[6, u], words[7, u] = np.int32(beside), np.int32(beside >> 32)
+    for n in range(num_outer):
+        u = np.uintp(outer[n])
+        load_corners(window, geometry, np.int64(cells[u]), np.int64(voxels[u]), shape[1], shape[2], words, u)
+
+
+@scalar
+def _first_word(window, cell, voxel):
+    """Place of a voxel's word, and all bits where there is one, else none."""
+    slot = np.int64(window[np.uintp(cell)])
+    return slot * 512 + voxel, ~(slot >> 63)

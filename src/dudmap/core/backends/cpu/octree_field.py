@@ -48,7 +48,9 @@ def load(window, shape, children, voxels, level, x, y, z, corners):
     x, y, z = x * scale, y * scale, z * scale
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
     if level == 0:
-        load_corners(window, voxels[0], np.int64(lx), np.int64(ly), np.int64(lz), corners, 0, shape[1], shape[2])
+        i, j, k = np.int64(lx), np.int64(ly), np.int64(lz)
+        cell, voxel = ((i >> 3) * shape[1] + (j >> 3)) * shape[2] + (k >> 3), ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
+        load_corners(window, voxels[0], cell, voxel, shape[1], shape[2], corners, 0)
         return x - lx, y - ly, z - lz
     for m in range(8):
         i, j, k = np.int64(lx) + (m >> 2), np.int64(ly) + ((m >> 1) & 1), np.int64(lz) + (m & 1)

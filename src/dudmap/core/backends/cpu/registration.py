@@ -8,8 +8,7 @@ on every CPU.
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu.gathers import LANES
-from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.neighbors import AHEAD, last_corner, load_row, locate
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import BLOCK, ImageStack, NormalEquations
@@ -65,16 +64,15 @@ def linearize_rows(
     """
     wide_vectors()
     w = depth.shape[1]
-    padded = -(-w // LANES) * LANES
-    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
-    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    cells, voxels, crossing = np.zeros(w + AHEAD, np.int32), np.zeros(w + AHEAD, np.int32), np.empty(w, np.int32)
+    outer, words = np.empty(w, np.int32), np.empty((8, -(-w // 8) * 8), np.int32)
     fx = np.empty(w, np.float32)
     fy = np.empty(w, np.float32)
     fz = np.empty(w, np.float32)
     px = np.empty(w, np.float32)
     py = np.empty(w, np.float32)
     pz = np.empty(w, np.float32)
-    wanted = np.zeros(padded, np.uint8)
+    wanted = np.empty(w, np.uint8)
 
     zero, one = np.float32(0), np.float32(1)
     by_unit = sdf_unit / voxel_size
@@ -99,7 +97,7 @@ def linearize_rows(
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
             wanted[u] = ok
 
-        load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.cpu.gathers import LANES
-from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.neighbors import AHEAD, last_corner, load_row, locate
 from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
@@ -51,11 +50,10 @@ def sample_rows(
     wide_vectors()
     w = depth.shape[1]
     nan, half, zero = f32(np.nan), f64(0.5), f64(0)
-    padded = -(-w // LANES) * LANES
-    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
-    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    cells, voxels, crossing = np.zeros(w + AHEAD, np.int32), np.zeros(w + AHEAD, np.int32), np.empty(w, np.int32)
+    outer, words = np.empty(w, np.int32), np.empty((8, -(-w // 8) * 8), np.int32)
     slots = np.empty(w, np.int32)
-    fractions, inside = np.empty((3, w), np.float32), np.zeros(padded, np.uint8)
+    fractions, inside = np.empty((3, w), np.float32), np.empty(w, np.uint8)
     last, size_y, size_z = last_corner(shape), shape[1], shape[2]
     t = elements(T)
     for v in range(row_start, row_stop):
@@ -68,7 +66,7 @@ def sample_rows(
             crossing[u] = crosses if ok else np.int32(0)
             fractions[0, u], fractions[1, u], fractions[2, u] = ax, ay, az
             inside[u] = ok
-        load_row(window, shape, geometry, cells, voxels, crossing, inside, outer, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
         for u in range(w):
             slots[u] = window[np.uintp(cells[u])] if inside[u] > 0 else np.int32(-1)
         for u in range(w):

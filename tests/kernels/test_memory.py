@@ -1,28 +1,24 @@
-"""Loads of scattered pairs of words, and the blocks that the fusion leaves as they are."""
+"""Loads of pairs of words, and the blocks that the fusion leaves as they are."""
 
 import numpy as np
 from numba import njit
 
 from dudmap.config import VolumeConfig
-from dudmap.core.backends.cpu.gathers import LANES, load_pairs
+from dudmap.core.backends.cpu.memory import load_pair
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 
 
 @njit
-def loaded(pairs, places, out):
-    return load_pairs(pairs, places, out)  # pyright: ignore[reportCallIssue]
+def loaded(words, index):
+    return load_pair(words, np.uintp(index))  # pyright: ignore[reportCallIssue]
 
 
-def test_pairs_are_those_that_indexing_finds():
-    rng = np.random.default_rng(0)
-    pairs = rng.integers(-(2**31), 2**31, (1000, 2)).astype(np.int32)
-    places = rng.integers(0, 1000, 4 * LANES).astype(np.int32)
-    out = np.zeros(len(places), np.int64)
-    largest = loaded(pairs.reshape(-1), places, out)
-    assert np.array_equal(out.view(np.int32).reshape(-1, 2), pairs[places])
-    assert largest == (pairs[places, 0].view(np.uint32) >> 16).max() > 32767
+def test_a_pair_is_two_consecutive_words():
+    words = np.random.default_rng(0).integers(-(2**31), 2**31, 100).astype(np.int32)
+    for index in range(99):  # odd ones too, where the pair does not lie as a 64-bit number would
+        assert np.array_equal(np.array([loaded(words, index)]).view(np.int32), words[index : index + 2])
 
 
 def test_what_lies_behind_the_band_of_all_readings_stays_as_it_is():
