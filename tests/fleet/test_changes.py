@@ -331,3 +331,7 @@ def test_what_is_new_is_reported_within_a_second_and_what_passes_is_not(unchange
     middle = CAMERA.points(np.array([120]), np.array([120]), np.array([1.0]))[0]
     rows = watched(saved, [replace(frames[0], timestamp=k / 30) for k in range(30)], poses, recording.camera, tmp_path)
     assert np.linalg.norm(np.array(rows[0]["centre"]) - middle) < 0.05
+    left = [replace(recording[0], timestamp=(30 + k) / 30) for k in range(60)]  # who stayed goes on after a second
+    stayed = [replace(frames[0], timestamp=k / 30) for k in range(30)]
+    rows = watched(saved, stayed + left, [np.eye(4)] * 90, recording.camera, tmp_path)
+    assert [(row["id"], row["kind"]) for row in rows] == [(1, "appeared"), (1, "withdrawn")]
