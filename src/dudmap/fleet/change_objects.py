@@ -14,7 +14,7 @@ LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 BRIDGE = 0.15
 """The same where no free space was seen between them, metres."""
-REACH = 0.25
+REACH = 0.5
 """The same beside a larger piece, in its lengths."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
