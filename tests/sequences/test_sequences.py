@@ -84,6 +84,19 @@ def test_known_cameras_by_folder_name(tmp_path):
         assert open_sequence(folder).camera.fx == fx
 
 
+def test_a_renamed_folder_keeps_its_camera_by_the_header_of_its_list(tmp_path):
+    folder = write_recording(tmp_path / "data", 1, intrinsics=None)
+    for images, value in (("rgb", np.full((480, 640, 3), 90, np.uint8)), ("depth", np.full((480, 640), 1, np.uint16))):
+        cv2.imwrite(str(folder / images / "0.png"), value)
+    header = "# color images\n# file: 'rgbd_dataset_freiburg3_sitting_xyz.bag'\n# timestamp filename\n"
+    lines = (folder / "rgb.txt").read_text()
+    (folder / "rgb.txt").write_text(header + lines)
+    assert open_sequence(folder).camera.fx == 535.4
+    (folder / "rgb.txt").write_text(lines + header)
+    with pytest.raises(DatasetError, match="is not known"):
+        open_sequence(folder)
+
+
 def test_a_known_camera_does_not_fit_images_of_another_size(tmp_path):
     folder = write_recording(tmp_path / "fr1_small", 1, intrinsics=None)
     with pytest.raises(DatasetError, match=r"TUM freiburg1 camera.* is for images of 640x480 pixels.*64x48.*--camera"):

@@ -25,7 +25,8 @@ class TumSequence(ImageFolder):
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
-    Intrinsics come from ``camera``, else from a file, else from the folder's name (freiburg1-3). The published
+    Intrinsics come from ``camera``, else from a file, else from the name (freiburg1-3) of the folder, or of the bag in
+    the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``), which a renamed folder keeps. The published
     distortion of freiburg1 and 2 is deliberately left out: it describes the colour lens, but the driver reprojected the
     depth as if that lens had no distortion, and undistorting both images would distort correct depth. On 240 frames of
     freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are
@@ -39,7 +40,7 @@ class TumSequence(ImageFolder):
         (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", camera_values(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
         (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", camera_values(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
     )
-    """Pattern of the folder's name, name and published intrinsics of each camera."""
+    """Pattern of the folder's or bag's name, name and published intrinsics of each camera."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path, camera)
@@ -72,11 +73,12 @@ class TumSequence(ImageFolder):
         return self._pair_timed(read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt"))
 
     def _published(self) -> intrinsics.Intrinsics | None:
-        folder = self.path.resolve().name
+        names = self.path.resolve().name, _bag_name(self.path / "rgb.txt")
         named = (
             intrinsics.by_name(name, values)
+            for recording in names
             for pattern, name, values in self.cameras
-            if re.search(pattern, folder, re.IGNORECASE)
+            if re.search(pattern, recording, re.IGNORECASE)
         )
         return super()._published() or next(named, None)
 
@@ -93,6 +95,18 @@ class TumSequence(ImageFolder):
         order = np.argsort(colors, kind="stable")
         pairs = associate(np.array([mask.timestamp for mask in masks]), colors[order])
         return {int(order[j]): masks[i].path for i, j in pairs}
+
+
+def _bag_name(path: Path) -> str:
+    """Name of the bag that the header of a list of images tells; empty if it tells none."""
+    if not path.is_file():
+        return ""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            found = re.match(r"#\s*file:\s*'(.*)'", line)
+            if found or not line.startswith("#"):
+                return found.group(1) if found else ""
+    return ""
 
 
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
