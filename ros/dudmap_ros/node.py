@@ -54,7 +54,7 @@ class DudmapNode(LifecycleNode):
         for name, value in (SETTINGS | self.keys).items():
             self.declare_parameter(name, value)
         self.session: Session | None = None
-        self.shown = 0
+        self.shown: list[dict] = []
         self.inputs: list[Subscriber] = []
 
     def setting(self, name: str) -> Any:  # noqa: ANN401
@@ -73,7 +73,7 @@ class DudmapNode(LifecycleNode):
         except DudmapError as error:
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
-        self.shown = 0
+        self.shown = []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.outputs = {
             "odometry": self.create_lifecycle_publisher(Odometry, "~/odometry", 10),
@@ -145,8 +145,8 @@ class DudmapNode(LifecycleNode):
         movers = [{"id": mover.id, "box": mover.box} for mover in result.movers]
         self.outputs["movers"].publish(ros.mover_markers(TYPES, stamp, movers, map_frame))
         changes = self.session.watch.reported if self.session.watch is not None else []
-        if len(changes) > self.shown:
-            self.shown = len(changes)
+        if changes != self.shown:
+            self.shown = list(changes)
             self.outputs["changes"].publish(ros.mover_markers(TYPES, stamp, changes, map_frame))
 
     def publish_surface(self) -> None:
@@ -172,7 +172,7 @@ class DudmapNode(LifecycleNode):
 
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Begin a new map with the next images."""
-        self.shown = 0
+        self.shown = []
         return self.answer(response, lambda: self.session.reset() or "the map is empty")
 
     def localize(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

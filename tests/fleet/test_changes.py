@@ -17,6 +17,7 @@ from dudmap.fleet import change_benchmark
 from dudmap.fleet.change_benchmark import draw_pair, figures, score_pair
 from dudmap.fleet.change_colors import recolored_pieces
 from dudmap.fleet.change_evidence import BEHIND, CONFIRMED, DENIED, Visit
+from dudmap.fleet.change_motion import Body, _gains
 from dudmap.fleet.change_objects import Piece, is_hidden_between
 from dudmap.fleet.change_watch import WATCH_FILE, ChangeWatch
 from dudmap.fleet.changes import find_changes, vertical
@@ -84,6 +85,29 @@ def test_the_motion_is_that_of_the_thing(changed):
     thing = changed.score["things"][0]
     assert thing["motion_cm"] < 1.0
     assert thing["motion_deg"] < 3.0  # a cube of 35 cm with voxels of 2 cm
+
+
+def test_light_from_another_side_is_a_gain_that_depends_on_the_normals():
+    rng = np.random.default_rng(4)
+    normals, mine = np.repeat(np.eye(3), 200, axis=0), rng.uniform(40, 200, 600)
+    true = np.repeat([0.7, 1.0, 1.3], 200)
+    theirs = true * mine + rng.normal(0, 2, 600)
+    theirs[::10] = rng.uniform(0, 255, 60)  # what is not of the thing
+    assert np.abs(_gains(mine, theirs, normals) / true - 1).max() < 0.08  # they are damped
+
+
+def test_slopes_are_those_of_the_intensities_along_the_surface():
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(0, 0.3, (800, 2)), np.zeros(800)])
+    grey = 50 + 300 * points[:, 0] - 100 * points[:, 1]
+    body = Body(points, np.tile([0.0, 0, 1], (800, 1)), np.tile(grey[:, None], 3), np.ones(800, bool), 0.01)
+    assert np.allclose(body.slopes, [300, -100, 0], atol=3)
+
+
+def test_a_motion_that_is_not_the_only_likely_one_says_so(changed):
+    moved = next(change for change in changed.changes if change.kind == "moved")
+    assert "ambiguous" not in moved.tree()
+    assert replace(moved, ambiguous="two turns").tree()["ambiguous"] == "two turns"
 
 
 def test_nothing_changed_is_found_in_an_unchanged_place(unchanged):
@@ -331,3 +355,7 @@ def test_what_is_new_is_reported_within_a_second_and_what_passes_is_not(unchange
     middle = CAMERA.points(np.array([120]), np.array([120]), np.array([1.0]))[0]
     rows = watched(saved, [replace(frames[0], timestamp=k / 30) for k in range(30)], poses, recording.camera, tmp_path)
     assert np.linalg.norm(np.array(rows[0]["centre"]) - middle) < 0.05
+    left = [replace(recording[0], timestamp=(30 + k) / 30) for k in range(60)]  # who stayed goes on after a second
+    stayed = [replace(frames[0], timestamp=k / 30) for k in range(30)]
+    rows = watched(saved, stayed + left, [np.eye(4)] * 90, recording.camera, tmp_path)
+    assert [(row["id"], row["kind"]) for row in rows] == [(1, "appeared"), (1, "withdrawn")]

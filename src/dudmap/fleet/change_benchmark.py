@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.app.pipeline.run import run
+from dudmap.atomic_file import write_text
 from dudmap.config import Config
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
@@ -85,11 +86,14 @@ def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[T
             pair = pair | {"changes": pair["changes"][:-1]}
 
 
-def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path) -> list[Path]:
-    """Run folders of both visits."""
-    folders = [out / "before", out / "after"]
+def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path, told: str = "") -> list[Path]:
+    """Run folders of both visits; those of an earlier call that was told the same are kept."""
+    folders, note = [out / "before", out / "after"], out / "pair.json"
+    if note.is_file() and note.read_text(encoding="utf-8") == told:
+        return folders
     for recording, folder in zip(recordings, folders, strict=True):
         run(recording, config, folder, progress=False)
+    write_text(note, told)
     return folders
 
 
@@ -123,16 +127,17 @@ def score_pair(
         if true.kind == "unknown":
             continue
         row: dict[str, Any] = {"thing": true.thing, "kind": true.kind, "size": true.size, "found": None}
-        if not true.common and {c.kind for c in mine[:2]} == {"disappeared", "appeared"}:
+        if not true.common and mine and {c.kind for c in mine[:2]} <= {"disappeared", "appeared"}:
             row["kind"] = mine[0].kind  # it showed other sides: nobody can know that it is one thing
-            del mine[1]
+            mine = mine[:1] + [c for c in mine[1:2] if c.kind == mine[0].kind] + mine[2:]
         false += [c.kind for c in mine[1:]]
         if mine:
             row |= {"found": mine[0].kind, "iou": _iou(surface(mine[0]), surface(true))}
             if mine[0].T_after_before is not None and not np.array_equal(true.T_after_before, np.eye(4)):
-                row |= _motion_error(true, T_scene_before @ mine[0].T_after_before @ se3.inverse(T_scene_before))
-                if row["motion_cm"] < SAME_MOTION_CM:  # seen by both visits, though one saw little
+                error = _motion_error(true, T_scene_before @ mine[0].T_after_before @ se3.inverse(T_scene_before))
+                if error["motion_cm"] < SAME_MOTION_CM:  # seen by both visits, though one saw little
                     row["kind"] = "moved"
+                row |= {"ambiguous": True} if mine[0].ambiguous else error
         things.append(row)
     false += [c.kind for c, owner in zip(found, owners, strict=True) if owner is None]
     return {"things": things, "false": false}
@@ -152,12 +157,13 @@ def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
     return {"motion_cm": moved, "motion_deg": 0.0 if true.symmetric else float(np.degrees(se3.rotation_angle(off)))}
 
 
-def measure_pair(pair: dict[str, Any], config: Config, min_size: float) -> dict[str, Any]:
-    """Render, run and compare one pair; returns a row."""
+def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Path | None = None) -> dict[str, Any]:
+    """Render, run and compare one pair, whose run folders may be kept in a folder; returns a row."""
     recordings, truth = rendered_pair(pair)
     row: dict[str, Any] = {"scene": pair["scene"], "seed": pair["seed"], "people": pair["people"]}
     with tempfile.TemporaryDirectory() as folder:
-        folders = run_pair(recordings, config, Path(folder))
+        told = json.dumps(pair | {"config": config.to_toml()}, sort_keys=True)
+        folders = run_pair(recordings, config, keep or Path(folder), told)
         start = time.perf_counter()
         try:
             changes = compared(folders[0], folders[1], min_size).changes
@@ -228,15 +234,18 @@ def measure_changes(
     done: Callable[[dict[str, Any]], None],
     recording: Recording | None = None,
     given: dict[str, Any] | None = None,
+    keep: Path | None = None,
 ) -> tuple[list[dict[str, Any]], str]:
     """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``.
 
     The pairs are rendered ones, with arguments of ``visits`` that are ``given`` instead of drawn, or with a recording
-    its halves, see ``measure_insertions``.
+    its halves, see ``measure_insertions``. Run folders of rendered ones are kept in ``keep`` and used again.
     """
     rows = [] if recording is None else measure_insertions(recording, seed, count, config, min_size, done)
     for number in range(count) if recording is None else ():
-        row = {"pair": number} | measure_pair(draw_pair(seed, number) | (given or {}), config, min_size)
+        row = {"pair": number} | measure_pair(
+            draw_pair(seed, number) | (given or {}), config, min_size, keep and keep / f"{seed}-{number}"
+        )
         rows.append(row)
         done(row)
     text = table(rows)
@@ -268,6 +277,11 @@ def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
         "recall_15cm": recall(large), "recall_small": recall(small), "precision": share(len(hits), len(hits) + false),
         "kind_right": share(sum(thing["found"] == thing["kind"] for thing in hits), len(hits)),
         "voxel_iou": median("iou"), "motion_cm": median("motion_cm"), "motion_deg": median("motion_deg"),
+        "motion_within_1cm_1deg": share(
+            sum(thing["motion_cm"] <= 1 and thing["motion_deg"] <= 1 for thing in hits if "motion_cm" in thing),
+            sum("motion_cm" in thing for thing in hits),
+        ),
+        "motion_ambiguous": sum("ambiguous" in thing for thing in hits),
         "unchanged_pairs": sum(not row["things"] for row in rows),
         "false_in_unchanged": sum(len(row["false"]) for row in rows if not row["things"]),
         "seconds": round(float(np.median([row["seconds"] for row in rows if "seconds" in row] or [0])), 2),

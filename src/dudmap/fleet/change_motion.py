@@ -1,11 +1,12 @@
 """Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
 
 Motions that bring a point onto one of like colour and slope, turned about the vertical, are refined by the iterative
-closest point method in both directions (to planes, Chen and Medioni 1992; by colours, Johnson and Kang 1997). The best
-is the motion if each surface lies on the other, has its colours, and nothing of it would hang in seen free space.
+closest point method in both directions (to planes, Chen and Medioni 1992; by colours, Johnson and Kang 1997; at last on
+the intensities along the surface, Park et al. 2017). The best is the motion if each surface lies on the other, has its
+colours, and nothing of it would hang in seen free space. If others are as good, the smallest turn is taken, and said.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,20 +33,31 @@ Kang 1997), in sizes of the thing."""
 COLOR_GATE = 50.0
 """Difference of colours at which points do not meet in the first step, grey levels."""
 COLOR_SCALE = 15.0
-"""Difference of colours at which the Geman-McClure weight of two points that meet falls to a quarter, grey levels."""
+"""Difference of colours at which the Cauchy weight of two points that meet falls to a half, grey levels."""
 PULL = 0.05
 """Weight of the distance to a point against that to its plane: holds flat surfaces from sliding."""
+NEIGHBOURS = 12
+"""Points from which the gradient of the intensities along a surface is taken."""
+DEVIATIONS, LEAST_NOISE = (2.0, 3.0), (1e-3, 4.0)
+"""Standard deviations at which the Geman-McClure weights of distances and intensities fall to a quarter, and the least
+that is assumed of each (m, grey levels)."""
+LIGHT, DAMPING = 0.2, 0.02
+"""Difference of the logarithms of intensities at which the weight falls to a quarter when the light is fitted, and the
+weight of its direction per point."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
 LEAST_FIT, LEAST_SHAPE, LEAST_SEEN = 0.8, 0.6, 0.25
 """Shares of the surface that must lie on the other's: of what would else hang in free space, of what would else hang
-there or lie under the other's surface (the back of a thin thing does), and of the smaller of both surfaces."""
-MAX_COLOR, MAX_CHROMA = (4.0, 0.2), 0.04
-"""Largest median difference of the colours after one gain for other light: grey levels and share of the brightness; and
-of the shares of red, green and blue."""
+there or lie under the other's surface (the back of a thin thing does), and of the larger of both surfaces."""
+PLAIN, MAX_COLOR, MAX_CHROMA = 5.0, 0.25, 0.04
+"""Largest median difference of the colours in one light: grey levels of a thing without texture, share of the
+brightness of one with texture; and of the shares of red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
 """Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
 two that are one: things of one make have the same texture, any others have about none."""
+AS_GOOD, FLAT = 0.9, 0.05
+"""Share of the best mean agreement from which on another motion is as good, and the mean square of the normals of what
+meets across its two main directions, or of a flat face, from which on it is not known to be the same face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +98,21 @@ class Body:
         """Of the points."""
         return KDTree(self.points)
 
+    @cached_property
+    def shades(self) -> Array:
+        """Intensities (n,), grey levels."""
+        return self.colors.mean(axis=1)
+
+    @cached_property
+    def slopes(self) -> Array:
+        """Gradients (n, 3) of the intensities along the surface, grey levels per metre, from the nearest points."""
+        n, near = self.normals, self.tree.query(self.points, k=min(NEIGHBOURS, len(self.points)))[1]
+        apart = self.points[near] - self.points[:, None]
+        apart -= np.einsum("nkj,nj,ni->nki", apart, n, n)
+        H = np.einsum("nki,nkj->nij", apart, apart) + 1e-6 * np.einsum("ni,nj->nij", n, n) + 1e-7 * np.eye(3)
+        g = np.einsum("nki,nk->ni", apart, self.shades[near] - self.shades[:, None])
+        return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], np.float64)
+
     def chosen(self, rows: NDArray) -> "Body":
         """Some of the points."""
         return Body(self.points[rows], self.normals[rows], self.colors[rows], self.denied[rows], self.tolerance)
@@ -105,11 +132,15 @@ class Motion:
         T_after_before: (4, 4), common frame.
         fit: Share of the surface that fits, of what must.
         explained: Vertices of both surfaces that the motion explains, less those that it leaves in free space.
+        agreement: The same per vertex.
+        ambiguous: Why another motion is as likely, None if there is none.
     """
 
     T_after_before: Array
     fit: float
     explained: float
+    agreement: float
+    ambiguous: str | None = None
 
 
 def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
@@ -117,7 +148,7 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
 
     ``up`` (3,) is the direction about which things turn most.
     """
-    coarse, fine = (_Meeting(missing, new, count) for count in (COARSE, FINE))
+    coarse, fine = _Meeting(missing, new, COARSE), _Meeting(missing, new, FINE, colored=False)
     starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
     centre = np.eye(4)
     centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
@@ -126,8 +157,20 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     ]
     first = [T for T in first if coarse.share(T, coarse.gate) > LEAST_SEEN / 2]
     first = _different(sorted(first, key=lambda T: -coarse.share(T, coarse.gate)), centre, 0.05, 10.0)
-    motions = [_judged(before, after, missing, new, fine.registered(T, 3 * fine.gate)) for T in first[:REFINED]]
-    return max((one for one in motions if one is not None), key=lambda one: one.explained, default=None)
+    judged = [
+        _judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first[:REFINED]
+    ]
+    motions = sorted((one for one in judged if one is not None), key=lambda one: -one.explained)
+    alike = [
+        one
+        for one in motions
+        if one.explained > 0.5 * motions[0].explained and one.agreement > AS_GOOD * motions[0].agreement
+    ]
+    others = len(_different([one.T_after_before for one in alike], centre, 0.3 * coarse.size, 20.0))
+    if others > 1:
+        smallest = min(alike, key=lambda one: se3.rotation_angle(one.T_after_before))
+        return replace(smallest, ambiguous=f"it looks the same after {others} motions; this is the smallest turn")
+    return motions[0] if motions else None
 
 
 class _Meeting:
@@ -136,18 +179,19 @@ class _Meeting:
     Args:
         a, b: The bodies.
         count: Points of the denied surface of each that are looked for on the other, at most.
+        colored: Whether like colours are near each other.
     """
 
-    def __init__(self, a: Body, b: Body, count: int) -> None:
+    def __init__(self, a: Body, b: Body, count: int, colored: bool = True) -> None:
         self.sources = [body.chosen(body.denied).sample(count) for body in (a, b)]
         self.size = max(float(np.linalg.norm(np.ptp(source.points, axis=0))) for source in self.sources)
-        self.gate, self.shade = max(a.tolerance, b.tolerance), COLOR_LENGTH * self.size / 255
+        self.gate, self.shade = max(a.tolerance, b.tolerance), colored * COLOR_LENGTH * self.size / 255
         self.others = b, a
         self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
 
-    def pairs(self, T: Array, gate: float) -> tuple[Array, Array, Array, Array]:
-        """Points (n, 3) of a after a motion (4, 4), those of b that they meet within a gate (m) and the normals there;
-        and the shares of both sources whose points meet any of a like colour."""
+    def pairs(self, T: Array, gate: float) -> tuple["_Pairs", Array]:
+        """What meets within a gate (m) after a motion (4, 4), and the shares of both sources whose points meet any of a
+        like colour."""
         rows, shares = [], []
         for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
@@ -158,13 +202,10 @@ class _Meeting:
             use = known & (np.linalg.norm(points - other.points[near], axis=1) < gate)
             use &= (normals * other.normals[near]).sum(axis=1) > 0.5
             shares.append((use & (np.abs(own.colors - other.colors[near]).max(axis=1) < COLOR_GATE)).mean())
-            met = other.points[near[use]]
-            ends = (transformed(T, met), own.points[use], own.normals[use]) if rows else (
-                points[use], met, other.normals[near[use]],
-            )  # fmt: skip
-            rows.append(ends)
-        p, q, n = (np.concatenate(part) for part in zip(*rows, strict=True))
-        return p, q, n, np.array(shares)
+            ends = (own, np.flatnonzero(use)), (other, near[use])
+            (a, i), (b, j) = ends[::-1] if rows else ends
+            rows.append((transformed(T, a.points[i]), a.shades[i], b.points[j], b.normals[j], b.shades[j], b.slopes[j]))
+        return _Pairs(*(np.concatenate(part) for part in zip(*rows, strict=True))), np.array(shares)
 
     def ranked(self, starts: list[Array]) -> list[Array]:
         """Motions (4, 4), those first that bring most of some points of both surfaces near the other's."""
@@ -180,19 +221,55 @@ class _Meeting:
 
     def share(self, T: Array, gate: float) -> float:
         """Mean share of both surfaces that meet the other."""
-        return float(self.pairs(T, gate)[3].mean())
+        return float(self.pairs(T, gate)[1].mean())
 
-    def registered(self, T: Array, gate: float) -> Array:
-        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks."""
+    def registered(self, T: Array, gate: float, *, lit: bool = False) -> Array:
+        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks; at last by the intensities
+        as well."""
         for _ in range(ICP_ROUNDS):
-            p, q, n, _ = self.pairs(T, max(gate, self.gate))
-            if len(p) < 10:
+            pairs = self.pairs(T, max(gate, self.gate))[0]
+            if len(pairs.moved) < 10:
                 break
-            step = _icp_step(p, q, n)
+            step = pairs.lit_step() if lit else pairs.step()
             T, gate = se3.exp(step) @ T, 0.7 * gate
             if np.linalg.norm(step) < STOP:
                 break
         return T
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Moved points (n, 3) of one surface and their intensities (n,), and the points that they meet on the other with
+    its normals, intensities and the gradients of these."""
+
+    moved: Array
+    mine: Array
+    points: Array
+    normals: Array
+    shades: Array
+    slopes: Array
+
+    def step(self) -> Array:
+        """Twist (6,) that brings the points to the planes through the others, and a little to them."""
+        p, off = self.moved, self.moved - self.points
+        J, r = np.hstack([self.normals, np.cross(p, self.normals)]), (off * self.normals).sum(axis=1)
+        turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
+        pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
+        H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
+        return -np.linalg.solve(H + 1e-9 * np.eye(6), J.T @ r + np.einsum("nij,ni->j", pull, PULL * off))
+
+    def lit_step(self) -> Array:
+        """Twist (6,) that brings the points to the planes through the others and to their intensities, both with
+        Geman-McClure weights and by their noise."""
+        off, H, g = self.moved - self.points, 1e-9 * np.eye(6), np.zeros(6)
+        shade = self.shades + (off * self.slopes).sum(axis=1) - _gains(self.mine, self.shades, self.normals) * self.mine
+        rows = (self.normals, (off * self.normals).sum(axis=1)), (self.slopes, shade)
+        for (slope, r), deviations, least in zip(rows, DEVIATIONS, LEAST_NOISE, strict=True):
+            sigma = max(1.4826 * float(np.median(np.abs(r))), least)
+            J = np.hstack([slope, np.cross(self.moved, slope)])
+            weighted = J * np.square(1 / sigma / (1 + np.square(r / (deviations * sigma))))[:, None]
+            H, g = H + weighted.T @ J, g + weighted.T @ r
+        return np.asarray(-np.linalg.solve(H, g), np.float64)
 
 
 def _starts(a: Body, b: Body, up: Array) -> list[Array]:
@@ -225,41 +302,46 @@ def _different(poses: list[Array], centre: Array, distance: float, angle_deg: fl
     return kept
 
 
-def _icp_step(p: Array, q: Array, n: Array) -> Array:
-    """Twist (6,) that brings points (k, 3) to planes through others with normals n, and a little to them."""
-    J = np.hstack([n, np.cross(p, n)])
-    r = ((p - q) * n).sum(axis=1)
-    turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
-    pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
-    H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
-    g = J.T @ r + np.einsum("nij,ni->j", pull, PULL * (p - q))
-    return -np.linalg.solve(H + 1e-9 * np.eye(6), g)
-
-
 def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
     """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
     sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
     meets, hangs, sunk = np.sum([side.count for side in sides], axis=0)
-    fewest = min(missing.denied.sum(), new.denied.sum())
-    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SHAPE * (meets + hangs + sunk), LEAST_SEEN * fewest, MIN_POINTS):
+    most = max(missing.denied.sum(), new.denied.sum())
+    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SHAPE * (meets + hangs + sunk), LEAST_SEEN * most, MIN_POINTS):
         return None
     mine = np.concatenate([sides[0].own, sides[1].other])
     theirs = np.concatenate([sides[0].other, sides[1].own])
-    gain = np.clip(np.median(theirs) / max(np.median(mine), 1.0), 0.6, 1.7)
-    if not _alike(mine, theirs, gain):
+    normals = np.concatenate([sides[0].normals, sides[1].normals @ T[:3, :3].T])
+    lit = _gains(mine.mean(axis=1), theirs.mean(axis=1), normals)[:, None] * mine
+    if not _alike(lit, theirs):
         return None
-    agree = np.mean(1 / np.square(1 + np.square(np.abs(gain * mine - theirs).max(axis=1) / COLOR_SCALE)))
-    return Motion(T, float(meets / (meets + hangs)), float(agree * meets - hangs))
+    agree = np.mean(1 / (1 + np.square(np.abs(lit - theirs).max(axis=1) / COLOR_SCALE)))
+    explained = float(agree * meets - hangs)
+    flat = np.linalg.eigvalsh(normals.T @ normals / len(normals))[1] < FLAT
+    ambiguous = "one flat face of it was seen; another may look the same" if flat else None
+    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs + sunk), ambiguous)
+
+
+def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
+    """Gains (n,) from the intensities (n,) of a surface in one light to those in another: their logarithm is linear in
+    the normals (n, 3), as light from afar is about (Basri and Jacobs 2003)."""
+    A, y = np.hstack([np.ones((len(mine), 1)), normals]), np.log((theirs + 8) / (mine + 8))
+    x, damping = np.array([np.median(y), 0, 0, 0]), DAMPING * len(y) * np.diag([0, 1.0, 1, 1])
+    for _ in range(3):
+        weights = 1 / np.square(1 + np.square((y - A @ x) / LIGHT))
+        x = np.linalg.solve((A * weights[:, None]).T @ A + damping, A.T @ (weights * y))
+    return np.exp(np.clip(A @ x, -0.7, 0.7))
 
 
 @dataclass(frozen=True, eq=False)
 class _Landed:
     """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, hang in free space or
-    lie under the other's surface; colours (n, 3) of some that lie on it, and of the other's points there."""
+    lie under the other's surface; colours (n, 3) of some that lie on it and of the other's points, and its normals."""
 
     count: Array
     own: Array
     other: Array
+    normals: Array
 
 
 def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
@@ -274,15 +356,15 @@ def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
     sunk = known & (samples.sdf < -limit)
     each = own.denied.sum() / len(points)
     count = each * np.array([meets.sum(), hangs.sum(), sunk.sum()])
-    return _Landed(count, moved.colors[meets], other.colors[near[meets]])
+    return _Landed(count, moved.colors[meets], other.colors[near[meets]], normals[meets])
 
 
-def _alike(mine: Array, theirs: Array, gain: float) -> bool:
-    """Whether colours (n, 3) of two surfaces are those of one thing, but for a gain."""
+def _alike(mine: Array, theirs: Array) -> bool:
+    """Whether colours (n, 3) of two surfaces in one light are those of one thing."""
     shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
     if np.abs(shares[0] - shares[1]).max() > MAX_CHROMA:
         return False
-    if np.median(np.abs(gain * mine - theirs)) > MAX_COLOR[0] + MAX_COLOR[1] * theirs.mean():
-        return False
-    grey = mine.mean(axis=1), theirs.mean(axis=1)
-    return bool(min(grey[0].std(), grey[1].std()) < TEXTURE or np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)
+    grey, off = (mine.mean(axis=1), theirs.mean(axis=1)), np.median(np.abs(mine - theirs))
+    if min(grey[0].std(), grey[1].std()) < TEXTURE:
+        return bool(off < PLAIN)
+    return bool(off < MAX_COLOR * theirs.mean() and np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)

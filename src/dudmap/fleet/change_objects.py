@@ -14,7 +14,7 @@ LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 BRIDGE = 0.15
 """The same where no free space was seen between them, metres."""
-REACH = 0.25
+REACH = 0.5
 """The same beside a larger piece, in its lengths."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
@@ -22,6 +22,8 @@ LEAST_WIDTH = 0.5
 """Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 LEAST_FACING = 0.1
 """Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
+LEAST_COVER = 0.125
+"""Share of the larger face of its box that the surface of a change fills: fragments at depth edges are scattered."""
 CLEAR = 2.0
 """Median gap between a change and any surface of the other map, in what noise explains: a map that is bent shifts
 surface by more than the noise, not by a multiple of it."""
@@ -95,6 +97,8 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
     if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
         return False
     if np.median(facing(found, piece)[1]) < LEAST_FACING:
+        return False
+    if piece.area < LEAST_COVER * np.prod(np.sort(piece.box[1] - piece.box[0])[1:]):
         return False
     blur = float(np.median(found.blur[piece.vertices]))
     return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))

@@ -14,6 +14,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.fleet.change_evidence import DEVIATIONS
+from dudmap.fleet.change_objects import LEAST_FACING
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, transformed
 
 if TYPE_CHECKING:
@@ -26,9 +27,9 @@ CELL = 0.05
 """Edge of the cells in which evidence is counted, metres."""
 COLUMNS = 80
 """Readings of a row of the image that are looked at."""
-FRAMES, SECONDS = 6, 0.5
-"""Frames that must show a change in a cell, more than show the opposite, and the time that they must span: who walks
-through does not stay that long in one cell."""
+FRAMES, SECONDS = 6, 0.75
+"""Frames that must show a change in a cell, more than show the opposite, and the time that they
+must span: who walks through does not stay that long in one cell."""
 LEAST_CELLS = 3.0
 """Cells of a change that is reported, in multiples of the cells of a face of the smallest size."""
 KINDS = ("appeared", "disappeared")
@@ -72,10 +73,11 @@ class _Cells:
 
 
 class ChangeWatch(RunObserver):
-    """Writes changes.jsonl into the run folder: an object per change with kind, box, centre, timestamp and frame.
+    """Writes changes.jsonl into the run folder: an object per change with id, kind, box, centre, timestamp and frame.
 
     One half of the frames asks for new surface in space that the earlier map saw free, the other for its surface that
-    a frame looks through. ``event`` of the other observers is told each change as "change".
+    a frame looks through. A change that later frames deny is written once more,
+    with the kind "withdrawn". ``event`` of the other observers is told each as "change".
 
     Args:
         before: The map of the earlier visit, which must not be the one that the run changes.
@@ -86,16 +88,18 @@ class ChangeWatch(RunObserver):
     def __init__(self, before: SavedMap, others: "tuple[RunObserver, ...]" = (), min_size: float = 0.1) -> None:
         self.volume, self.others, self.min_size = before.volume, others, min_size
         self.reported: list[dict[str, Any]] = []
-        vertices = before.volume.extract_mesh().vertices.astype(np.float64)
+        self._members: dict[int, NDArray[np.int64]] = {}
+        mesh = before.volume.extract_mesh()
+        vertices = mesh.vertices.astype(np.float64)
         codes, first = np.unique(morton.encode(np.floor(vertices / CELL).astype(np.int64)), return_index=True)
-        self._codes, self._surface = codes, vertices[first]
+        self._codes, self._surface, self._normals = codes, vertices[first], mesh.normals[first].astype(np.float64)
         self._cells = self._fresh()
         self._file: TextIO | None = None
         self._slam: Slam | None = None
 
     def start(self, slam: "Slam", out: Path | None, count: int | None) -> None:
         """A pass begins; without a folder no file is written."""
-        self._slam, self.reported = slam, []
+        self._slam, self.reported, self._members = slam, [], {}
         self._cells = self._fresh()
         self._close()
         if out is not None:
@@ -117,6 +121,7 @@ class ChangeWatch(RunObserver):
         kind = KINDS[index % 2]
         self._count(kind, frame, T)
         if index % 8 < 2:
+            self._withdraw(kind, index, frame.timestamp)
             self._report(kind, index, frame.timestamp)
 
     def finish(self, out: Path) -> None:
@@ -131,29 +136,42 @@ class ChangeWatch(RunObserver):
     def _count(self, kind: str, frame: Frame, T: NDArray[np.float64]) -> None:
         assert self._slam is not None
         camera, cells, sensor = self._slam.camera, self._cells[kind], self.volume.sensor
-        if kind == "appeared":
-            step = max(1, frame.depth.shape[1] // COLUMNS)
-            depth = frame.depth[step // 2 :: step, step // 2 :: step]
-            v, u = np.nonzero((depth > 0) & (depth < self.volume.depth_max))
-            z = depth[v, u].astype(np.float64)
-            points = transformed(T, camera.points(u * step + step // 2, v * step + step // 2, z))
-            samples = sample_map(self.volume, points)
-            margin = self._margin(z, sensor)
-            free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > margin))
-            cells.count(cells.rows_of(points[free]), 1, frame.timestamp)
+        if kind == "disappeared":
+            through, on = self._looked_at(self._surface, frame.depth, T)
+            rays = T[:3, 3] - self._surface[through]
+            faces = (rays * self._normals[through]).sum(axis=1) > LEAST_FACING * np.linalg.norm(rays, axis=1)
+            through = through[faces]
+            cells.count(through, 1, frame.timestamp)
+            cells.count(on, -1, frame.timestamp)
             return
-        local = transformed(se3.inverse(T), self._surface)
+        step = max(1, frame.depth.shape[1] // COLUMNS)
+        depth = frame.depth[step // 2 :: step, step // 2 :: step]
+        v, u = np.nonzero((depth > 0) & (depth < self.volume.depth_max))
+        z = depth[v, u].astype(np.float64)
+        points = transformed(T, camera.points(u * step + step // 2, v * step + step // 2, z))
+        samples = sample_map(self.volume, points)
+        free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > self._margin(z, sensor)))
+        cells.count(cells.rows_of(points[free]), 1, frame.timestamp)
+        rows = np.flatnonzero(cells.score > 0)
+        cells.count(rows[self._looked_at(_centres(cells.codes[rows]), frame.depth, T)[0]], -1, frame.timestamp)
+
+    def _looked_at(
+        self, points: NDArray[np.float64], depth: NDArray[np.float32], T: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of the points (n, 3) behind which a depth image from a pose (4, 4) sees a surface, also beside the
+        pixel, and of those on which it sees one."""
+        assert self._slam is not None
+        camera, local = self._slam.camera, transformed(se3.inverse(T), points)
         ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
         ahead &= np.abs(local[:, 0]) < local[:, 2] * camera.width / camera.fx
         near = np.flatnonzero(ahead)
         u, v = np.rint(camera.project(local[near])).astype(np.int64).T
         inside = (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
         near, u, v = near[inside], u[inside], v[inside]
-        z, reading = local[near, 2], frame.depth[v, u]
-        beside = np.minimum.reduce([reading, frame.depth[v, u - 1], frame.depth[v, u + 1], frame.depth[v - 1, u]])
-        margin = self._margin(z, sensor)
-        cells.count(near[beside > z + 2 * margin], 1, frame.timestamp)
-        cells.count(near[np.abs(reading - z) < margin], -1, frame.timestamp)
+        z, reading = local[near, 2], depth[v, u]
+        beside = np.minimum.reduce([reading, depth[v, u - 1], depth[v, u + 1], depth[v - 1, u]])
+        margin = self._margin(z, self.volume.sensor)
+        return near[beside > z + 2 * margin], near[np.abs(reading - z) < margin]
 
     def _margin(self, z: NDArray[np.float64], sensor: Any) -> NDArray[np.float64]:  # noqa: ANN401 - its configuration
         """Distance (n,) that noise explains at depths (n,), metres."""
@@ -166,7 +184,7 @@ class ChangeWatch(RunObserver):
         wanted = LEAST_CELLS * (self.min_size / CELL) ** 2
         if len(rows) < wanted:
             return
-        centres = (morton.decode(cells.codes[rows]).astype(np.float64) + 0.5) * CELL
+        centres = _centres(cells.codes[rows])
         tree, left = KDTree(centres), set(range(len(rows)))
         while left:
             group, edge = set[int](), {left.pop()}
@@ -183,16 +201,35 @@ class ChangeWatch(RunObserver):
             if self._is_known(kind, box):
                 continue
             row = {
-                "timestamp": now, "frame": index, "id": len(self.reported) + 1, "kind": kind,
+                "timestamp": now, "frame": index, "id": len(self._members) + 1, "kind": kind,
                 "centre": box.mean(axis=0).round(3).tolist(), "box": box.round(3).tolist(),
             }  # fmt: skip
             self.reported.append(row)
-            if self._file is not None:
-                self._file.write(json.dumps(row) + "\n")
-            for observer in self.others:
-                observer.event("change", **row)
+            self._members[row["id"]] = cells.codes[rows[members]]
+            self._tell(row)
+
+    def _withdraw(self, kind: str, index: int, now: float) -> None:
+        """Withdraw reported changes, most of whose cells later frames deny."""
+        cells = self._cells[kind]
+        for row in [row for row in self.reported if row["kind"] == kind]:
+            rows = np.searchsorted(cells.codes, self._members[row["id"]])
+            if np.median(cells.score[rows]) == 0:
+                cells.reported[rows] = False
+                self.reported.remove(row)
+                self._tell(row | {"timestamp": now, "frame": index, "kind": "withdrawn"})
+
+    def _tell(self, row: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(row) + "\n")
+        for observer in self.others:
+            observer.event("change", **row)
 
     def _is_known(self, kind: str, box: NDArray[np.float64]) -> bool:
         """Whether a box touches a change of the same kind that was reported: more of the same thing came into view."""
         boxes = [np.array(row["box"]) for row in self.reported if row["kind"] == kind]
         return any(np.all((box[0] < b[1] + 2 * CELL) & (b[0] - 2 * CELL < box[1])) for b in boxes)
+
+
+def _centres(codes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Centres (n, 3) of cells, metres."""
+    return (morton.decode(codes).astype(np.float64) + 0.5) * CELL

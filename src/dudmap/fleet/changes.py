@@ -42,6 +42,7 @@ class Change:
         before, after: Its surface in either visit, None if it is not there.
         confidence: 0..1, share of its surface that agrees with its kind.
         T_after_before: (4, 4), of what moved.
+        ambiguous: Why another motion is as likely, None if there is none.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class Change:
     after: Piece | None
     confidence: float
     T_after_before: Array | None = None
+    ambiguous: str | None = None
 
     @property
     def points(self) -> Array:
@@ -78,6 +80,7 @@ class Change:
             distance = float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
             turn = float(np.degrees(se3.rotation_angle(T)))
             out |= {"T_after_before": T.tolist(), "distance": round(distance, 4), "turn_deg": round(turn, 2)}
+            out |= {} if self.ambiguous is None else {"ambiguous": self.ambiguous}
         return out
 
 
@@ -133,14 +136,22 @@ def _moved(
             zip(firsts, found, visits, visits[::-1], surfaces, strict=True)
         ):
             left = [p for p in pieces[side] if not np.isin(p.vertices[0], first.vertices)]
-            T_there = T if side == 0 else se3.inverse(T)
-            parts = [p for p in left if gap_between(p, first) < length and _goes_along(p, one, there, T_there, tree)]
+            shares = [_after_motion(p, one, there, T if side == 0 else se3.inverse(T), tree) for p in left]
+            parts = [
+                p
+                for p, (on, hangs) in zip(left, shares, strict=True)
+                if gap_between(p, first) < length and on > 0.5 and hangs < 1 - LEAST_FIT
+            ]
             thing = joined([first, *parts])
-            parts += [p for p in left if p not in parts and p.area < thing.area and is_part(p, thing, own)]
+            parts += [
+                p
+                for p, (_, hangs) in zip(left, shares, strict=True)
+                if p not in parts and (p.area < thing.area or hangs < 1 - LEAST_FIT) and is_part(p, thing, own)
+            ]
             things.append(joined([first, *parts]))
             taken[side][things[-1].vertices] = True
             pieces[side][:] = [p for p in left if p not in parts]
-        out.append(Change("moved", things[0], things[1], motion.fit, T))
+        out.append(Change("moved", things[0], things[1], motion.fit, T, motion.ambiguous))
     return out
 
 
@@ -157,12 +168,12 @@ def vertical(visit: Visit) -> Array:
     return mean / np.linalg.norm(mean)
 
 
-def _goes_along(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> bool:
-    """Whether a motion (4, 4) brings most of a piece onto surface of the other visit, and little into free space."""
+def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
+    """Shares of a piece that a motion (4, 4) brings onto surface of the other visit, and into its free space."""
     points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
     on, samples = tree.query(points)[0] < limit, there.sample(points)
     hangs = ~on & ((samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > limit)))
-    return bool(on.mean() > 0.5 and hangs.mean() < 1 - LEAST_FIT)
+    return float(on.mean()), float(hangs.mean())
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:

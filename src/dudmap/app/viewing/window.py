@@ -128,6 +128,10 @@ class Window:
         with self._lock:
             low, high = np.array(change["box"])
             name, middle = f"/changes/{change['id']}", (low + high) / 2
+            if change["kind"] == "withdrawn":
+                self._remove(f"{name}/box")
+                self._remove(f"{name}/label")
+                return
             color = CHANGE_COLORS[change["kind"]]
             self._add(f"{name}/box", "add_box", color=color, dimensions=high - low, position=middle, wireframe=True)
             self._add(f"{name}/label", "add_label", text=f"{change['id']}: {change['kind']}", position=middle)

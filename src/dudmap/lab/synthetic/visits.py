@@ -35,6 +35,8 @@ CLEAR = 0.03
 """A ray that goes on so far behind a point sees it empty, metres: twice the noise of a Kinect at 2.5 m."""
 LEAST_SEEN = 0.35
 """Share of the face of a thing (its longest edge times its middle one) that must have been seen to change."""
+NORMAL_LENGTH = 0.05
+"""Length of the normals beside the points that both visits must have seen of one side: 3 cm are 35 degrees."""
 GAP = 0.12
 """Distance between things, and to the solids beside them, metres."""
 TRIES = 400
@@ -306,7 +308,8 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
         vertices, seen = surface.vertices.astype(float), _views(surface, own) >= VIEWS
         through = (_views(surface, other) if recoloured else _looks_through(surface, other)) >= VIEWS
         changed.append(vertices[seen & through])
-        shown.append(vertices[seen])
+        oriented = np.hstack([vertices, NORMAL_LENGTH * surface.normals])
+        shown.append((oriented[seen & through], oriented[seen]))
         areas.append(surface.area() / max(len(vertices), 1))
     edges = np.sort(np.ptp(_samples(thing.before or thing.after), axis=0))
     kind = "moved" if thing.kind == "opened" else thing.kind
@@ -315,8 +318,12 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
     if kind == "moved" and not all(enough):
         kind = "disappeared" if enough[0] else "appeared" if enough[1] else "unknown"
     elif kind == "moved":
-        moved = shown[0] @ thing.T_after_before[:3, :3].T + thing.T_after_before[:3, 3]
-        common = areas[0] * (KDTree(shown[1]).query(moved)[0] < CLEAR).sum() > least
+        common = any(
+            area * (KDTree(others).query(_moved(T, own))[0] < CLEAR).sum() > least
+            for area, (own, _), (_, others), T in zip(
+                areas, shown, shown[::-1], (thing.T_after_before, se3.inverse(thing.T_after_before)), strict=True
+            )
+        )
     elif not any(enough):
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
@@ -331,6 +338,11 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
         at,
         bool(common),
     )
+
+
+def _moved(T: Array, oriented: Array) -> Array:
+    """Points beside their normals (n, 6) after a rigid motion (4, 4)."""
+    return np.hstack([oriented[:, :3] @ T[:3, :3].T + T[:3, 3], oriented[:, 3:] @ T[:3, :3].T])
 
 
 def _shots(recording: SyntheticSequence) -> list[tuple[Array, NDArray[np.float32]]]:
