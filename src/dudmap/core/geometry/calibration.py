@@ -22,6 +22,8 @@ PARAMETERS = (
 """Parameters that can be estimated, in the order of a step (13,): metres, radians, logarithm of the focal lengths,
 pixels of the colour image, the first two coefficients of radial lens distortion (thesis eq. 3.88), seconds."""
 NUM_PARAMETERS = len(PARAMETERS)
+MAX_VIGNETTING = 2.0
+"""Largest vignetting: no camera whose colours are of use loses seven eighths of the light in its corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,9 @@ class Calibration:
         readout: Time from the first to the last row of the colour image (rolling shutter), s.
         sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
         estimated: Names of the parameters that were estimated; the others are as given.
+        vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
+            with the squared distance to the middle.
+        vignetting_sigma: Its standard deviation, NaN where unknown.
     """
 
     camera: Camera
@@ -47,6 +52,8 @@ class Calibration:
     readout: float = 0.0
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(NUM_PARAMETERS, np.nan))
     estimated: tuple[str, ...] = ()
+    vignetting: float = 0.0
+    vignetting_sigma: float = float("nan")
 
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
@@ -59,6 +66,9 @@ class Calibration:
             raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
         if not np.all(np.isfinite([self.delay, self.readout])):
             raise DatasetError(f"the delay is {self.delay} s and the readout {self.readout} s; expected finite numbers")
+        if not abs(self.vignetting) <= MAX_VIGNETTING:
+            limit = f"a number from -{MAX_VIGNETTING:g} to {MAX_VIGNETTING:g}"
+            raise DatasetError(f"the vignetting is {self.vignetting}; expected {limit}")
 
     @classmethod
     def registered(cls, camera: Camera) -> "Calibration":
@@ -66,11 +76,11 @@ class Calibration:
         return cls(replace(camera, distortion=()))
 
     def is_registered(self, depth_camera: Camera) -> bool:
-        """Whether the pixels of both images correspond as they are, time stamps aside."""
+        """Whether the pixels of both images correspond, as bright as they are, time stamps aside."""
         one, other = self.camera, depth_camera
         same = (one.fx, one.fy, one.cx, one.cy, one.shape) == (other.fx, other.fy, other.cx, other.cy, other.shape)
-        still = self.delay == 0 and self.readout == 0
-        return same and still and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
+        plain = self.delay == 0 and self.readout == 0 and self.vignetting == 0
+        return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
     def is_instant(self, offset: float) -> bool:
         """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
@@ -118,15 +128,21 @@ class Calibration:
             ]
         )
 
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations of ``PARAMETERS`` and of the vignetting by name, NaN where unknown."""
+        return dict(zip((*PARAMETERS, "vignetting"), (*self.sigma.tolist(), self.vignetting_sigma), strict=True))
+
     def tree(self) -> dict[str, Any]:
         """Nested dictionary of numbers, lists and words, as in the file and in metrics.json; NaN is left out."""
-        sigma = {name: float(value) for name, value in zip(PARAMETERS, self.sigma, strict=True) if np.isfinite(value)}
+        sigma = {name: value for name, value in self.sigmas.items() if np.isfinite(value)}
         camera = asdict(self.camera) | {"distortion": list(self.camera.distortion)}
         del camera["depth_scale"]
         return {
             "T_color_depth": self.T_color_depth.tolist(),
             "delay": self.delay,
             "readout": self.readout,
+            "vignetting": self.vignetting,
             "estimated": list(self.estimated),
             "camera": camera,
             "sigma": sigma,
@@ -160,6 +176,8 @@ class Calibration:
                 float(tree["readout"]),
                 np.array([float(known.get(name, np.nan)) for name in PARAMETERS]),
                 tuple(tree.get("estimated", ())),
+                float(tree.get("vignetting", 0.0)),
+                float(known.get("vignetting", np.nan)),
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
