@@ -6,7 +6,7 @@ import numpy as np
 
 from dudmap import Config
 from dudmap.app.pipeline.calibration import calibrate_start, findings
-from dudmap.core.calibration.estimator import GROUPS, TESTED, Estimate
+from dudmap.core.calibration.estimator import GROUPS, SHUTTER, TESTED, Estimate
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 
@@ -16,7 +16,7 @@ CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
 def estimate(sigma: float, evidence: float, estimated: tuple[str, ...] = ()) -> Estimate:
     found = Calibration.registered(CAMERA)
     found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated, vignetting_sigma=sigma)
-    return Estimate(found, dict.fromkeys(TESTED, evidence), 0.0, 80)
+    return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), evidence), 0.0, 80)
 
 
 def test_what_was_not_tested_is_called_assumed():
@@ -24,7 +24,7 @@ def test_what_was_not_tested_is_called_assumed():
 
 
 def test_what_was_tested_and_kept_has_its_uncertainty():
-    timing, _, geometry, vignetting = findings(estimate(0.025, -0.5))
+    _, timing, _, geometry, vignetting = findings(estimate(0.025, -0.5))
     for text in ("assumed as given; tested", "-0.5 standard errors", "delay 25 ms"):
         assert text in timing
     assert "vignetting 2.5 %" in vignetting
@@ -33,11 +33,11 @@ def test_what_was_tested_and_kept_has_its_uncertainty():
 
 
 def test_a_significant_but_small_difference_is_not_called_none():
-    assert all("too small a share to be used" in finding for finding in findings(estimate(0.025, 3.0)))
+    assert all("too small a share to be used" in finding for finding in findings(estimate(0.025, 3.0))[1:])
 
 
 def test_what_was_estimated_has_its_uncertainty():
-    timing = findings(estimate(0.002, 4.0, GROUPS["timing"]))[0]
+    timing = findings(estimate(0.002, 4.0, GROUPS["timing"]))[1]
     assert timing.startswith("colour camera, timing: estimated")
     assert "delay 2 ms" in timing
 

@@ -261,7 +261,8 @@ class Mapper:
         window, atlas = self._bootstrap.complete_window(), self._atlas
         if not window or self._localize or atlas.current == atlas.saved or atlas.current in atlas.rebuildings:
             return None
-        volume, Ts, time_sigma = atlas.volume, [], self._config.sensor.color_time_sigma
+        volume, Ts = atlas.volume, []
+        time_sigma = self._color_motion.time_sigma(self._config.sensor.color_time_sigma)
         finest = len(self._config.tracker.widths) - 1
         for fused in window:
             level, velocity = fused.level, atlas.velocity_at(fused.frame.timestamp)

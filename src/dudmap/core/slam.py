@@ -12,8 +12,9 @@ from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame, FrameArrays
-from dudmap.core.frames.observation import Pyramid
+from dudmap.core.frames.observation import Observation, Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.rolling_shutter import recorded_mask
 from dudmap.core.frames.stream_check import Rejection, StreamCheck
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -32,7 +33,7 @@ from dudmap.core.result import FrameResult, SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
@@ -93,10 +94,11 @@ class Slam(SlamResults, Stateful):
         self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed)
         self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
-        given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
+        registered = start is None or start.is_registered(replace(camera, distortion=()))
+        given = None if start is None or (registered and start.depth_readout == 0) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
-        self.preprocess = Preprocessor(camera, config.preprocess, given)
+        self.preprocess = Preprocessor(camera, config.preprocess, None if registered else given)
         self.camera = self.preprocess.camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
@@ -140,14 +142,10 @@ class Slam(SlamResults, Stateful):
         """
         if isinstance(frame, Frame):
             start = time.perf_counter()
-            observation = self.preprocess(frame)
-            _ = observation.num_readings  # cached there for the result
-            pyramid = Pyramid.of(observation, self.camera, self.config)
-            if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
-                _ = pyramid.corners  # cached there for the comparison with other images
-            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
-            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
-            frame = FrameView(observation, pyramid, segmentation, timer)
+            frame = self._viewed(self.preprocess(frame))
+            if self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
+                _ = frame.pyramid.corners  # cached there for the comparison with other images
+            frame.timer.timings["preprocess"] = 1000 * (time.perf_counter() - start)
         if dynamic_mask is not None:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
         return frame
@@ -182,7 +180,7 @@ class Slam(SlamResults, Stateful):
         view = self._resumed(view)
         if self.stream.repeats in ("frame", "depth") and self._last is not None:
             return self._repeat(view, self._last)
-        view = self.color_motion.predicted(view)
+        view = self.color_motion.predicted(self._rectified(view))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=True) if self._is_blind(view) else view
@@ -214,6 +212,22 @@ class Slam(SlamResults, Stateful):
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _viewed(self, observation: Observation) -> FrameView:
+        """A preprocessed frame with what needs no other frame."""
+        _ = observation.num_readings  # cached there for the result
+        pyramid = Pyramid.of(observation, self.camera, self.config)
+        return FrameView(observation, pyramid, self.detector.segment(pyramid.labelled, self.config.volume.voxel_size))
+
+    def _rectified(self, view: FrameView) -> FrameView:
+        """The frame at the time of its middle row; itself where all rows are taken at once or the camera rests."""
+        with view.timer("rectify"):
+            observation = self.color_motion.rectified(view.observation)
+            if observation is view.observation:
+                return view
+            known = view.known_dynamic
+            known = None if known is None or observation.sources is None else known.reshape(-1)[observation.sources]
+            return replace(self._viewed(observation), timer=view.timer, known_dynamic=known)
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""
@@ -370,7 +384,7 @@ class Slam(SlamResults, Stateful):
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
-            dynamic_mask=self.preprocess.distorted(dynamic_mask),
+            dynamic_mask=self.preprocess.distorted(recorded_mask(dynamic_mask, view.observation)),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=tracking, timings=view.timer.timings, submap=self.atlas.current, blind=view.blind,

@@ -14,6 +14,8 @@ from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.estimator import (
     EVIDENCE,
     MIN_PAIRS,
+    SHUTTER,
+    SHUTTER_PARAMETER,
     TESTED,
     CalibrationEstimator,
     Estimate,
@@ -73,7 +75,7 @@ def kind_of(parameter: str) -> str:
 
 def findings(estimate: "Estimate") -> list[str]:
     """One sentence per group of parameters: estimated, tested and kept, or assumed, and the standard deviations."""
-    out = []
+    out = [_shutter_finding(estimate)]
     for name, members in TESTED.items():
         evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
         if np.isnan(evidence):
@@ -92,6 +94,19 @@ def findings(estimate: "Estimate") -> list[str]:
             )
         out.append(f"colour camera, {name}: {said}")
     return out
+
+
+def _shutter_finding(estimate: "Estimate") -> str:
+    """Sentence on the rolling shutter of the depth camera."""
+    evidence, readout = estimate.evidence[SHUTTER], 1000 * estimate.calibration.depth_readout
+    taken = f"rows are taken to be read out within {readout:.1f} ms"
+    if np.isnan(evidence):
+        said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+    elif SHUTTER_PARAMETER in estimate.calibration.estimated:
+        said = f"estimated; other images fit {evidence:.1f} standard errors better; {taken}"
+    else:
+        said = f"not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} are needed); {taken}"
+    return f"depth camera, {SHUTTER}: {said}"
 
 
 def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:

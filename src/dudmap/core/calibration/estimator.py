@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment, Fit, PairSet, select_across, select_pairs
+from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet, select_across, select_pairs
+from dudmap.core.calibration.depth_readout import ReadoutSearch, rectified_keyframe
 from dudmap.core.calibration.keyframes import ColorKeyframe
 from dudmap.core.calibration.vignetting import Brightness
 from dudmap.core.geometry.calibration import MAX_VIGNETTING, NUM_PARAMETERS, PARAMETERS, Calibration
@@ -28,11 +29,15 @@ PAIRS = 80
 """Pairs that decide what is estimated; half as many more, across the halves, enter the result."""
 STRIDE = 2
 """Every so many points of a frame decide what is estimated; all of them enter the result."""
-MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.1}
+SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
+"""Group of the readout of the depth, which is estimated before all others, and the name of its parameter."""
+MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.1, SHUTTER: 0.01}
 """Share by which it must decrease: less is not worth leaving the given values, however certain it is. A depth image
 bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
 recording with such a depth (TUM fr1_xyz) the geometry gained up to 7 % and its use made the poses worse; a colour
 camera 25 mm beside gains 19 to 30 %."""
+SAME_READOUT = 0.002
+"""Change of the readout of the depth, seconds, after which the colour camera is not estimated anew."""
 EVIDENCE = 3.0
 """Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
 pairs of the other half, in the sum of both. Chance does so once in 700 times."""
@@ -44,8 +49,8 @@ class Estimate:
 
     Attributes:
         calibration: What was found, with its standard deviations; as given where there is no evidence.
-        evidence: Per group of ``TESTED``, the decrease of the cost of pairs that were not used, in standard errors; NaN
-            where there were too few pairs.
+        evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of pairs that were not used, in
+            standard errors; NaN where there were too few pairs.
         gain: Share by which the cost of pairs that were not used decreased.
         pairs: Number of pairs.
     """
@@ -99,6 +104,12 @@ class _Trial:
         return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
 
 
+def _halves(keyframes: Sequence[ColorKeyframe]) -> list[list[Pair]]:
+    """Pairs of either half of the time."""
+    middle = len(keyframes) // 2
+    return [select_pairs(part, PAIRS // 2) for part in (keyframes[:middle], keyframes[middle:])]
+
+
 def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
     """Mask (13,) of parameters."""
     return np.array([name in names for name in PARAMETERS])
@@ -125,6 +136,7 @@ class CalibrationEstimator:
 
     def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
         self.given = given
+        self.sensor = sensor
         self.workers = workers
         self.adjustment = Adjustment(given, sensor)
 
@@ -136,10 +148,49 @@ class CalibrationEstimator:
         What merely absorbs errors of another kind, such as a bent depth image, does so differently from place to place
         and fails.
         """
+        halves = _halves(keyframes)
+        if min(len(pairs) for pairs in halves) < MIN_PAIRS:
+            unknown = dict.fromkeys((*TESTED, SHUTTER), float("nan"))
+            return Estimate(self.given, unknown, 0.0, sum(map(len, halves)))
+        given = self.given
+        readout, evidence, gain = self._depth_readout(halves, given)
+        estimate = self._estimate_color(keyframes, readout)
+        # while the colours are late, no readout explains what both do together
+        again, evidence, gain = self._depth_readout(halves, estimate.calibration)
+        if abs(again - readout) > SAME_READOUT:
+            readout, estimate = again, self._estimate_color(keyframes, again)
+        found, moved = estimate.calibration, (SHUTTER_PARAMETER,) if readout != given.depth_readout else ()
+        return Estimate(
+            replace(found, estimated=(*found.estimated, *moved)),
+            estimate.evidence | {SHUTTER: evidence},
+            1 - (1 - gain) * (1 - estimate.gain),
+            estimate.pairs,
+        )
+
+    def _depth_readout(self, halves: list[list[Pair]], color: Calibration) -> tuple[float, float, float]:
+        """Readout of the depth in seconds, as given where another one is not proven, the evidence for another one, and
+        the share by which the cost decreased with it; ``color`` is a calibration of the colour camera."""
+        given, adjustment = self.given, self.adjustment
+        with ThreadPoolExecutor(self.workers) as pool:
+            searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, color, adjustment, STRIDE), halves))
+        sets, nothing = [PairSet(pairs, STRIDE) for pairs in halves], np.zeros(NUM_PARAMETERS, dtype=bool)
+        one, other = searches
+        before = _Trial(nothing, [], [other.cost(given.depth_readout), one.cost(given.depth_readout)], sets)
+        after = _Trial(nothing, [], [other.cost(one.best), one.cost(other.best)], sets)
+        evidence, gain = after.improvement(before)
+        if not after.proves(before, SHUTTER):
+            return given.depth_readout, evidence, 0.0
+        return (one.best + other.best) / 2, evidence, gain
+
+    def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
+        """Calibration of the colour camera beside a depth camera with a known readout."""
+        rectified = CalibrationEstimator(self.given.with_depth_readout(depth_readout), self.sensor, self.workers)
+        return rectified._beside_rectified([rectified_keyframe(frame, depth_readout) for frame in keyframes])
+
+    def _beside_rectified(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
+        """Calibration of the colour camera beside a depth camera whose images are rectified."""
         middle = len(keyframes) // 2
-        within = [select_pairs(part, PAIRS // 2) for part in (keyframes[:middle], keyframes[middle:])]
-        if min(len(pairs) for pairs in within) < MIN_PAIRS:
-            return Estimate(self.given, dict.fromkeys(TESTED, float("nan")), 0.0, sum(map(len, within)))
+        within = _halves(keyframes)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
         fits = [

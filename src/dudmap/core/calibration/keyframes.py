@@ -53,6 +53,7 @@ class ColorKeyframe:
         brightness: (h, w) float32 of the smallest of them, not filtered.
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
+        depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
     """
 
     timestamp: float
@@ -65,6 +66,7 @@ class ColorKeyframe:
     brightness: NDArray[np.float32]
     T_world_camera: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    depth_readout: float = 0.0
 
 
 def halvings_to(width: int, camera: Camera) -> int:
@@ -110,7 +112,7 @@ def keyframe(
     points, tangents = (image[::POINT_STRIDE, ::POINT_STRIDE][smooth] for image in (points, tangents))
     return ColorKeyframe(
         observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, brightness,
-        T_world_camera, velocity,
+        T_world_camera, velocity, observation.depth_readout,
     )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ def color_projection(calibration: Calibration, twist: NDArray[np.float64], offse
         calibration.camera.intrinsics,
         calibration.lens.astype(np.float32),
         offset + calibration.delay,
-        calibration.readout,
+        calibration.depth_readout + calibration.readout,
         calibration.camera.height,
         calibration.vignetting,
     )
@@ -61,6 +61,13 @@ def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.fl
     return known[halvings]
 
 
+def typical_depth(depth: NDArray[np.float32]) -> float:
+    """Median of some readings of an image (H, W), metres; 1 where it has none."""
+    readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
+    readings = readings[readings > 0]
+    return float(median(readings)) if len(readings) else 1.0
+
+
 def register_color(
     color: NDArray[Pixel],
     depth: NDArray[np.float32],
@@ -75,9 +82,6 @@ def register_color(
     """
     import cv2
 
-    readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
-    readings = readings[readings > 0]
-    fallback = float(median(readings)) if len(readings) else 1.0
     out, none = np.empty(depth.shape + color.shape[2:], color.dtype), np.empty
     if color.ndim == 3:
         words, outputs = cv2.cvtColor(color, cv2.COLOR_RGB2RGBA), (none((0, 0), np.float32), out)
@@ -85,7 +89,7 @@ def register_color(
         words, outputs = np.ascontiguousarray(color), (out, none((0, 0, 3), np.uint8))
     size = len(depth), *color.shape[:2]
     run_team(
-        register, -(-len(depth) // BAND_ROWS), BAND_ROWS, depth, camera.intrinsics, projection, np.float32(fallback),
-        size, words.view(np.int32).reshape(-1), *outputs,
+        register, -(-len(depth) // BAND_ROWS), BAND_ROWS, depth, camera.intrinsics, projection,
+        np.float32(typical_depth(depth)), size, words.view(np.int32).reshape(-1), *outputs,
     )  # fmt: skip
     return out

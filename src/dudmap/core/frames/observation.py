@@ -35,6 +35,8 @@ class Observation:
             synchronous are so only once the camera's motion is known (``core/tracking/color_motion.py``).
         recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
         color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
+        depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
+        sources: (H, W) int32, number of the recorded pixel that each pixel shows then; None for its own.
     """
 
     timestamp: float
@@ -44,6 +46,8 @@ class Observation:
     rgb: NDArray[np.uint8]
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
+    depth_readout: float = 0.0
+    sources: NDArray[np.int32] | None = None
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(
         default_factory=list, repr=False, metadata=CACHE

@@ -32,15 +32,19 @@ class Calibration:
 
     A point X of the depth camera at the time of the depth image is seen by the colour camera at
     ``T_color_depth exp(-tau xi) X``, with the twist xi of the depth camera's motion (its own axes, per second) and
-    tau = difference of the two time stamps + ``delay`` + ``readout`` (row / height - 1/2), seconds.
+    tau = difference of the two time stamps + ``delay`` + (``depth_readout`` + ``readout``) (row / height - 1/2),
+    seconds. The rows of the depth image are taken one after the other as well, ``depth_readout`` (row / height - 1/2)
+    after its middle row, at whose time it is rectified before anything else (``core/frames/rolling_shutter.py``).
 
     Attributes:
         camera: Intrinsics of the colour camera; its ``depth_scale`` has no meaning.
         T_color_depth: (4, 4) points of the depth camera into the colour camera.
         delay: Time of the middle row of the colour image minus that of the depth image, beyond the time stamps, s.
-        readout: Time from the first to the last row of the colour image (rolling shutter), s.
+        readout: Time from the first to the last row of the colour image (rolling shutter) beyond that of the depth
+            image, s: 0 where both rows of a pixel are taken together.
         sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
         estimated: Names of the parameters that were estimated; the others are as given.
+        depth_readout: Time from the first to the last row of the depth image (rolling shutter), s.
         vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
             with the squared distance to the middle.
         vignetting_sigma: Its standard deviation, NaN where unknown.
@@ -52,6 +56,7 @@ class Calibration:
     readout: float = 0.0
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(NUM_PARAMETERS, np.nan))
     estimated: tuple[str, ...] = ()
+    depth_readout: float = 0.0
     vignetting: float = 0.0
     vignetting_sigma: float = float("nan")
 
@@ -64,8 +69,10 @@ class Calibration:
             and np.allclose(T[3], (0, 0, 0, 1))
         ):
             raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
-        if not np.all(np.isfinite([self.delay, self.readout])):
-            raise DatasetError(f"the delay is {self.delay} s and the readout {self.readout} s; expected finite numbers")
+        times = {"delay": self.delay, "readout": self.readout, "depth_readout": self.depth_readout}
+        if not np.all(np.isfinite([*times.values()])):
+            found = ", ".join(f"{name} {value} s" for name, value in times.items())
+            raise DatasetError(f"the calibration has {found}; expected finite numbers")
         if not abs(self.vignetting) <= MAX_VIGNETTING:
             limit = f"a number from -{MAX_VIGNETTING:g} to {MAX_VIGNETTING:g}"
             raise DatasetError(f"the vignetting is {self.vignetting}; expected {limit}")
@@ -82,6 +89,17 @@ class Calibration:
         plain = self.delay == 0 and self.readout == 0 and self.vignetting == 0
         return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
+    def time_sigma(self, assumed: float) -> float:
+        """Standard deviation of the time between the colour and the depth of a pixel, seconds.
+
+        Where the times of the rows of either image were estimated that of the delay and of the rows (sigma / sqrt 12),
+        else ``assumed``.
+        """
+        if not {"readout", "depth_readout"} & set(self.estimated):
+            return assumed
+        delay, readout = (self.sigma[PARAMETERS.index(name)] for name in ("delay", "readout"))
+        return float(np.hypot(delay, readout / np.sqrt(12)))
+
     def is_instant(self, offset: float) -> bool:
         """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
         return self.delay + offset == 0 and self.readout == 0
@@ -92,6 +110,13 @@ class Calibration:
         out = np.zeros(5)
         out[: len(self.camera.distortion)] = self.camera.distortion
         return out
+
+    def with_depth_readout(self, depth_readout: float) -> "Calibration":
+        """The same colour camera beside a depth camera of another readout, seconds: the rows of the colour image keep
+        their times where these were estimated, else their times relative to those of the depth image."""
+        known = "readout" in self.estimated
+        readout = self.readout + self.depth_readout - depth_readout if known else self.readout
+        return replace(self, readout=readout, depth_readout=depth_readout)
 
     def retract(self, step: NDArray[np.float64]) -> "Calibration":
         """Calibration after a step (13,) of ``PARAMETERS``; rotation and translation are updated in colour axes."""
@@ -142,6 +167,7 @@ class Calibration:
             "T_color_depth": self.T_color_depth.tolist(),
             "delay": self.delay,
             "readout": self.readout,
+            "depth_readout": self.depth_readout,
             "vignetting": self.vignetting,
             "estimated": list(self.estimated),
             "camera": camera,
@@ -176,6 +202,7 @@ class Calibration:
                 float(tree["readout"]),
                 np.array([float(known.get(name, np.nan)) for name in PARAMETERS]),
                 tuple(tree.get("estimated", ())),
+                float(tree.get("depth_readout", 0.0)),
                 float(tree.get("vignetting", 0.0)),
                 float(known.get("vignetting", np.nan)),
             )

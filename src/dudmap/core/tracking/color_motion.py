@@ -11,6 +11,7 @@ from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level, Observation, Pyramid
+from dudmap.core.frames.rolling_shutter import rectified
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful
@@ -77,6 +78,10 @@ class ColorMotion(Stateful):
         self.given = given
         self.calibration = given
 
+    def time_sigma(self, assumed: float) -> float:
+        """See ``Calibration.time_sigma``; ``assumed`` without a calibration."""
+        return assumed if self.calibration is None else self.calibration.time_sigma(assumed)
+
     def start(self, view: FrameView) -> None:
         """A map was made of this frame, whose velocity is not known yet."""
         self._is_first = not self.is_prepared(view.observation)
@@ -123,9 +128,19 @@ class ColorMotion(Stateful):
         return replace(frame, color=register_color(frame.color, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
-        """Whether the frame was prepared with all that is known."""
+        """Whether the frame was prepared with all that is known of its colours."""
         calibration = self.calibration
-        return calibration is None or (calibration is self.given and calibration.is_instant(observation.color_offset))
+        if calibration is None or calibration.is_registered(observation.camera):
+            return True
+        return calibration is self.given and calibration.is_instant(observation.color_offset)
+
+    def rectified(self, observation: Observation) -> Observation:
+        """A frame at the time of its middle row, by the velocity so far; itself where all rows are taken at once."""
+        readout = 0.0 if self.calibration is None else self.calibration.depth_readout
+        if readout == 0 or not self.motion.velocity.any():
+            return observation
+        with_color = self.is_prepared(observation)
+        return rectified(observation, readout, self.motion.velocity, with_color=with_color)
 
     def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
         observation = view.observation

@@ -118,7 +118,8 @@ class FrontEnd(Stateful):
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], unverified)
             pose, exposure = found.T_world_camera, found.exposure
-            velocity, time_sigma = self.motion.velocity_to(view.timestamp, pose), self.config.sensor.color_time_sigma
+            velocity = self.motion.velocity_to(view.timestamp, pose)
+            time_sigma = self.color_motion.time_sigma(self.config.sensor.color_time_sigma)
             discount = motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
             color_weight = tracker.config.color_weight * discount
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)

@@ -15,7 +15,7 @@ NEAREST = np.float32(0.05)
 
 
 @scalar
-def _filled(source, fallback, target):
+def fill_gaps(source, fallback, target):
     """Depths of a row with gaps filled by the last reading before them, at its start by the first after them."""
     first = fallback
     for u in range(source.size):
@@ -113,7 +113,7 @@ def register_rows(start, stop, depth, intrinsics, projection, fallback, size, wo
     first, around = np.empty(w, np.int32), np.empty((4, w), np.int32)
     values = around.view(np.float32)
     for v in range(start, stop):
-        _filled(depth[v], fallback, filled)
+        fill_gaps(depth[v], fallback, filled)
         color_places(v, filled, intrinsics, projection, size, first, across, down, gain)
         for u in range(w):
             n = np.uintp(first[u])
