@@ -6,7 +6,7 @@ import numpy as np
 
 from dudmap import Config
 from dudmap.app.pipeline.calibration import calibrate_start, findings
-from dudmap.core.calibration.estimator import GROUPS, SHUTTER, Estimate
+from dudmap.core.calibration.estimator import GROUPS, SHUTTER, TESTED, Estimate
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 
@@ -15,8 +15,8 @@ CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
 
 def estimate(sigma: float, evidence: float, estimated: tuple[str, ...] = ()) -> Estimate:
     found = Calibration.registered(CAMERA)
-    found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated)
-    return Estimate(found, dict.fromkeys((*GROUPS, SHUTTER), evidence), 0.0, 80)
+    found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated, vignetting_sigma=sigma)
+    return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), evidence), 0.0, 80)
 
 
 def test_what_was_not_tested_is_called_assumed():
@@ -24,10 +24,11 @@ def test_what_was_not_tested_is_called_assumed():
 
 
 def test_what_was_tested_and_kept_has_its_uncertainty():
-    shutter, timing, _, geometry = findings(estimate(0.025, -0.5))
+    shutter, timing, _, geometry, vignetting = findings(estimate(0.025, -0.5))
     assert "not proven (-0.5 standard errors, 3 are needed); rows are taken to be read out within 0.0 ms" in shutter
     for text in ("assumed as given; tested", "-0.5 standard errors", "delay 25 ms"):
         assert text in timing
+    assert "vignetting 2.5 %" in vignetting
     for text in ("translation 25 mm", "rotation 1.4 deg", "focal length 2.5 %"):
         assert text in geometry
 

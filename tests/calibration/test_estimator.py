@@ -12,6 +12,7 @@ from dudmap.config import Config, PreprocessConfig, SensorConfig
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.core.calibration.keyframes import KeyframeCollector, keyframe
+from dudmap.core.calibration.vignetting import Brightness
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
@@ -136,10 +137,32 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
         "shutter and timing": {"shutter", "timing"},
     }  # fmt: skip
     assert moved >= expected[name]
+    assert result.calibration.vignetting == 0
     if name == "as given":
         assert not result.calibration.estimated
         assert result.calibration.is_registered(CAMERA)
     assert np.all(np.isfinite(result.calibration.sigma))
+
+
+@pytest.mark.parametrize(("name", "vignetting"), zip(STEPS, (0.1, 0.5, 0.3), strict=True))
+def test_vignetting_is_found_beside_all_other_faults(name, vignetting):
+    v, u = np.indices(CAMERA.shape)
+    away = (np.square(u - 79.5) + np.square(v - 59.5)) / (79.5**2 + 59.5**2)
+    left = np.exp(-vignetting * away)[..., None]
+    frames = [replace(frame, color=np.round(frame.color * left).astype(np.uint8)) for frame in recorded(name)[1]]
+    found = estimate(frames).calibration
+    assert "vignetting" in found.estimated
+    assert abs(found.vignetting - vignetting) < max(3 * found.vignetting_sigma, 0.01)
+    assert found.vignetting_sigma < 0.02
+
+
+def test_where_nothing_can_be_compared_no_vignetting_is_claimed():
+    numbers, none = np.array([[0, 1]]), np.zeros(0)
+    nothing = Brightness(numbers, np.zeros(0, np.int64), none, none)
+    found, sigma = nothing.fitted()
+    assert found == 0
+    assert np.isnan(sigma)
+    assert nothing.costs(0.3).tolist() == [0.0]
 
 
 class Walls:

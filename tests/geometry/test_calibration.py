@@ -19,6 +19,10 @@ def calibration(**changes) -> Calibration:
     return Calibration(COLOR, T_COLOR_DEPTH, **({"delay": 0.02, "readout": 0.025} | changes))
 
 
+WHOLE = "T_color_depth = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\ndelay = 0.0\nreadout = 0.0\n"
+WHOLE += "camera = {fx = 100.0, fy = 100.0, cx = 48.0, cy = 36.0, width = 96, height = 72}\n"
+
+
 def color_pixels(depth, projection, *, camera=DEPTH, color=COLOR):
     """Coordinates u, v (h, w) in the colour image of the pixels of a depth image, moved to its border where they lie
     outside of it: what they show in two images of these coordinates."""
@@ -112,6 +116,20 @@ def test_a_plane_seen_by_two_cameras_has_one_colour():
     assert np.abs(elsewhere[:120, :160].astype(int) - color).mean() > 10
 
 
+@pytest.mark.parametrize("vignetting", [0.0, 0.4, -0.1])
+def test_the_light_that_vignetting_took_is_given_back(vignetting):
+    camera = Camera(100.0, 100.0, 47.5, 35.5, 96, 72)
+    v, u = np.indices(camera.shape)
+    lost = np.exp(-vignetting * (np.square(u - 47.5) + np.square(v - 35.5)) / (47.5**2 + 35.5**2))
+    seen = np.repeat(np.round(200 * lost)[..., None], 3, axis=2).clip(0, 255).astype(np.uint8)
+    projection = color_projection(Calibration(camera, vignetting=vignetting), np.zeros(6), 0.0)
+    depth = np.full(camera.shape, 2.0, np.float32)
+    np.testing.assert_allclose(register_color(seen, depth, camera, projection), 200, atol=1)
+    shades = register_color(lost.astype(np.float32), depth, camera, projection)
+    np.testing.assert_allclose(shades, 1, atol=2e-3)
+    assert (register_color(np.full_like(seen, 254), depth, camera, projection) >= 200).all()  # never around the end
+
+
 def test_a_step_and_its_inverse():
     step = np.linspace(-0.02, 0.03, NUM_PARAMETERS)
     start = calibration()
@@ -122,13 +140,19 @@ def test_a_step_and_its_inverse():
 
 
 def test_the_file_holds_everything(tmp_path):
-    before = calibration(sigma=np.array([*np.arange(12) / 7, np.nan]), estimated=("delay",))
+    sigma = np.array([*np.arange(12) / 7, np.nan])
+    before = calibration(sigma=sigma, estimated=("delay",), vignetting=0.2, vignetting_sigma=0.01)
     before.save(tmp_path / "calibration.toml")
     after = Calibration.load(tmp_path / "calibration.toml")
     assert after.camera == before.camera
     assert np.array_equal(after.T_color_depth, before.T_color_depth)
     assert (after.delay, after.readout, after.estimated) == (before.delay, before.readout, before.estimated)
     assert np.array_equal(after.sigma, before.sigma, equal_nan=True)
+    assert (after.vignetting, after.vignetting_sigma) == (0.2, 0.01)
+    (tmp_path / "old.toml").write_text("\n".join(
+        line for line in (tmp_path / "calibration.toml").read_text().splitlines() if "vignetting" not in line
+    ))  # fmt: skip
+    assert Calibration.load(tmp_path / "old.toml").vignetting == 0
     assert len(PARAMETERS) == len(after.sigma)
 
 
@@ -138,6 +162,8 @@ def test_the_file_holds_everything(tmp_path):
         ("delay = [", "not valid TOML"),
         ("delay = 0.0\nreadout = 0.0", "lacks camera"),
         ("camera = 3", "cannot understand"),
+        (f"{WHOLE}vignetting = 5.0", "vignetting is 5.0; expected a number from -2 to 2"),
+        (f"{WHOLE}vignetting = nan", "vignetting is nan"),
     ],
 )
 def test_a_bad_file_gets_a_sentence(tmp_path, text, complaint):
@@ -154,6 +180,7 @@ def test_a_missing_file_gets_a_sentence(tmp_path):
 def test_only_a_registered_camera_is_taken_as_it_is():
     assert Calibration.registered(DEPTH).is_registered(DEPTH)
     assert not calibration().is_registered(DEPTH)
+    assert not Calibration(DEPTH, vignetting=0.1).is_registered(DEPTH)
     for index in range(NUM_PARAMETERS):
         step = np.zeros(NUM_PARAMETERS)
         step[index] = 1e-3

@@ -60,19 +60,19 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     from rich.table import Table
 
     from dudmap.app.pipeline.calibration import UNITS, kind_of
-    from dudmap.core.geometry.calibration import PARAMETERS
 
     out = Table("parameter", "change", "sigma", "unit", "")
-    change = given.step_to(estimate.calibration)
-    for name, value, sigma in zip(PARAMETERS, change, estimate.calibration.sigma, strict=True):
+    found = estimate.calibration
+    change = [*given.step_to(found), found.vignetting - given.vignetting]
+    for (name, sigma), value in zip(found.sigmas.items(), change, strict=True):
         unit, factor = UNITS[kind_of(name)]
-        found = name in estimate.calibration.estimated
+        is_found = name in found.estimated
         out.add_row(
             name,
-            f"{factor * value:+.3f}" if found else "",
+            f"{factor * value:+.3f}" if is_found else "",
             f"{factor * sigma:.3f}" if np.isfinite(sigma) else "",
             unit,
-            "estimated" if found else "as given",
+            "estimated" if is_found else "as given",
         )
     return out
 

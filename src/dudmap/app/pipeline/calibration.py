@@ -13,10 +13,10 @@ from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.estimator import (
     EVIDENCE,
-    GROUPS,
     MIN_PAIRS,
     SHUTTER,
     SHUTTER_PARAMETER,
+    TESTED,
     CalibrationEstimator,
     Estimate,
     mask_of,
@@ -24,7 +24,7 @@ from dudmap.core.calibration.estimator import (
 from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import HALVING_BAND
-from dudmap.core.geometry.calibration import PARAMETERS, Calibration
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import is_timed
@@ -46,6 +46,7 @@ UNITS = {
     "k2": ("", 1.0),
     "delay": ("ms", 1000.0),
     "readout": ("ms", 1000.0),
+    "vignetting": ("%", 100.0),
 }
 """Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
 ASSUMED = "assumed as given, not tested"
@@ -75,8 +76,8 @@ def kind_of(parameter: str) -> str:
 def findings(estimate: "Estimate") -> list[str]:
     """One sentence per group of parameters: estimated, tested and kept, or assumed, and the standard deviations."""
     out = [_shutter_finding(estimate)]
-    for name, members in GROUPS.items():
-        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, name)
+    for name, members in TESTED.items():
+        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
         if np.isnan(evidence):
             said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
         elif members[0] in estimate.calibration.estimated:
@@ -108,12 +109,11 @@ def _shutter_finding(estimate: "Estimate") -> str:
     return f"depth camera, {SHUTTER}: {said}"
 
 
-def _sigma(calibration: Calibration, group: str) -> str:
-    """Standard deviations of the parameters of a group, of several axes the largest, as text."""
+def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
+    """Standard deviations of these parameters, of several axes the largest, as text."""
     largest: dict[str, float] = {}
-    for name, sigma in zip(PARAMETERS, calibration.sigma, strict=True):
-        if name in GROUPS[group]:
-            largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), float(sigma))
+    for name in members:
+        largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), calibration.sigmas[name])
     said = []
     for kind, sigma in largest.items():
         unit, factor = UNITS[kind]

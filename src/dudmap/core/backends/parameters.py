@@ -112,6 +112,7 @@ class ColorProjection(NamedTuple):
         offset: Time of the middle row of the colour image minus that of the depth image, s.
         readout: Time from the first to the last row of the colour image, s.
         height: Rows of the colour image.
+        vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners.
     """
 
     place: NDArray[np.float32]
@@ -122,6 +123,7 @@ class ColorProjection(NamedTuple):
     offset: float
     readout: float
     height: int
+    vignetting: float
 
 
 class RaycastParameters(NamedTuple):

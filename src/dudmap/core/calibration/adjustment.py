@@ -37,7 +37,8 @@ class PairSet:
         numbers: (P, 2) int64, the first and the second frame of every pair, in the order of time.
         Ts_camera_world: (F, 4, 4) of the frames as tracked.
         camera: Of the depth images.
-        depths: (F, h, w) float32; ``images``: (F, h, w) float32 filtered intensities per size, coarse to fine.
+        depths: (F, h, w) float32; ``images``: (F, h, w) float32 filtered intensities per size, coarse to fine;
+            ``brightness``: (F, h, w) float32 of the smallest size, not filtered.
         points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) where those of each begin.
         residual_starts: (P + 1,) where the residuals of each pair begin: one per point of its first frame.
         twists: (F, 6) float32 velocities; ``color_offsets``: (F,) float32.
@@ -53,6 +54,7 @@ class PairSet:
         self.camera = frames[0].camera
         self.depths = np.stack([frame.depth for frame in frames])
         self.images = [np.stack(images) for images in zip(*(frame.intensities for frame in frames), strict=True)]
+        self.brightness = np.stack([frame.brightness for frame in frames])
         self.points = np.concatenate([frame.points[::stride] for frame in frames])
         self.tangents = np.concatenate([frame.tangents[::stride] for frame in frames])
         counts = np.array([len(frame.points[::stride]) for frame in frames])

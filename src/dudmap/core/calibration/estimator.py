@@ -11,7 +11,8 @@ from dudmap.config import SensorConfig
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet, select_across, select_pairs
 from dudmap.core.calibration.depth_readout import ReadoutSearch, rectified_keyframe
 from dudmap.core.calibration.keyframes import ColorKeyframe
-from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
+from dudmap.core.calibration.vignetting import Brightness
+from dudmap.core.geometry.calibration import MAX_VIGNETTING, NUM_PARAMETERS, PARAMETERS, Calibration
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "timing": ("delay", "readout"),
@@ -20,6 +21,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """Parameters that leave their given values together. A translation looks much like a rotation, but only both together
 explain the colours of the near and of the far half of a recording."""
+TESTED = GROUPS | {"vignetting": ("vignetting",)}
+"""All that is tested and reported: the vignetting changes no place, and is found once the others are."""
 MIN_PAIRS = 14
 """Pairs of either half of the time without which nothing is estimated: one more than parameters."""
 PAIRS = 80
@@ -46,7 +49,7 @@ class Estimate:
 
     Attributes:
         calibration: What was found, with its standard deviations; as given where there is no evidence.
-        evidence: Per group of ``GROUPS``, and ``SHUTTER``, the decrease of the cost of pairs that were not used, in
+        evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of pairs that were not used, in
             standard errors; NaN where there were too few pairs.
         gain: Share by which the cost of pairs that were not used decreased.
         pairs: Number of pairs.
@@ -147,7 +150,7 @@ class CalibrationEstimator:
         """
         halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
-            unknown = dict.fromkeys((*GROUPS, SHUTTER), float("nan"))
+            unknown = dict.fromkeys((*TESTED, SHUTTER), float("nan"))
             return Estimate(self.given, unknown, 0.0, sum(map(len, halves)))
         known = self.given.depth_readout
         readout, evidence, gain = self._depth_readout(halves)
@@ -210,8 +213,27 @@ class CalibrationEstimator:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
         sigma *= self._disagreement(halves, proven.fits)
         estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
+        vignetting, vignetting_sigma, evidence["vignetting"] = self._vignetting(proven, Brightness.of(pairs, fit))
+        if vignetting != self.given.vignetting:
+            estimated = (*estimated, "vignetting")
         gain = 1 - float(np.concatenate(proven.costs, axis=1).mean() / np.concatenate(start.costs, axis=1).mean())
-        return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
+        found = replace(
+            found, sigma=sigma, estimated=estimated, vignetting=vignetting, vignetting_sigma=vignetting_sigma
+        )
+        return Estimate(found, evidence, gain, len(pairs))
+
+    def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
+        """Vignetting, as given where another is not proven by the other half of the time, its standard deviation, which
+        admits what both halves differ by, and the evidence for it."""
+        given = self.given.vignetting
+        halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
+        found = [half.fitted()[0] for half in halves]
+        gains = [halves[n].costs(given) - halves[n].costs(found[1 - n]) for n in (1, 0)]
+        evidence = proven.evidence(np.concatenate(gains))
+        vignetting, sigma = everything.fitted()
+        sigma = float(np.hypot(sigma, (found[0] - found[1]) / 2))
+        is_proven = evidence >= EVIDENCE and EVIDENCE * sigma <= abs(vignetting - given) <= MAX_VIGNETTING
+        return vignetting if is_proven else given, sigma, evidence
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
         """Factor (at least 1) by which standard deviations are too small: the root mean square difference between the

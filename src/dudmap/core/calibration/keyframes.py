@@ -50,6 +50,7 @@ class ColorKeyframe:
         tangents: (n, 6) float32, two directions of the surface at each point.
         intensities: (h, w) float32 of the colour image as recorded, filtered with ``BAND``, coarse to fine; NaN where
             something moves.
+        brightness: (h, w) float32 of the smallest of them, not filtered.
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
@@ -62,6 +63,7 @@ class ColorKeyframe:
     points: NDArray[np.float32]
     tangents: NDArray[np.float32]
     intensities: list[NDArray[np.float32]]
+    brightness: NDArray[np.float32]
     T_world_camera: NDArray[np.float64]
     velocity: NDArray[np.float64]
     depth_readout: float = 0.0
@@ -95,13 +97,13 @@ def keyframe(
     readings = depth[moving & (depth > 0)]
     distance = float(median(readings)) if len(readings) else 1.0
     depth = np.where(moving, np.float32(0), depth)
-    intensities = [
-        _filtered(
-            recorded_intensity(observation, number),
-            _seen_moving(moving, distance, camera, given.camera.scaled(number), given.T_color_depth),
-        )
-        for number in color_levels(given.camera)
+    levels = color_levels(given.camera)
+    seen_moving = [
+        _seen_moving(moving, distance, camera, given.camera.scaled(number), given.T_color_depth) for number in levels
     ]
+    recorded = [recorded_intensity(observation, number) for number in levels]
+    intensities = [_filtered(image, mask) for image, mask in zip(recorded, seen_moving, strict=True)]
+    brightness = np.where(seen_moving[0], np.float32(np.nan), recorded[0])
     smooth = _off_edges(depth)[::POINT_STRIDE, ::POINT_STRIDE]
     points = camera.backproject(depth)
     tangents = np.zeros((*depth.shape, 6), np.float32)
@@ -109,8 +111,8 @@ def keyframe(
     tangents[1:-1, :, 3:] = points[2:] - points[:-2]
     points, tangents = (image[::POINT_STRIDE, ::POINT_STRIDE][smooth] for image in (points, tangents))
     return ColorKeyframe(
-        observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, T_world_camera,
-        velocity, observation.depth_readout,
+        observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, brightness,
+        T_world_camera, velocity, observation.depth_readout,
     )  # fmt: skip
 
 

@@ -42,6 +42,7 @@ def color_projection(calibration: Calibration, twist: NDArray[np.float64], offse
         offset + calibration.delay,
         calibration.depth_readout + calibration.readout,
         calibration.camera.height,
+        calibration.vignetting,
     )
 
 

@@ -22,6 +22,8 @@ PARAMETERS = (
 """Parameters that can be estimated, in the order of a step (13,): metres, radians, logarithm of the focal lengths,
 pixels of the colour image, the first two coefficients of radial lens distortion (thesis eq. 3.88), seconds."""
 NUM_PARAMETERS = len(PARAMETERS)
+MAX_VIGNETTING = 2.0
+"""Largest vignetting: no camera whose colours are of use loses seven eighths of the light in its corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,9 @@ class Calibration:
         depth_late: Time by which the stamps of the depth images are later than the images, s: no image is stamped
             before it is taken, so that where both have stamps of their own and the colours were found to be taken later
             by a ``delay``, it is the depth that is stamped too late.
+        vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
+            with the squared distance to the middle.
+        vignetting_sigma: Its standard deviation, NaN where unknown.
     """
 
     camera: Camera
@@ -56,6 +61,8 @@ class Calibration:
     estimated: tuple[str, ...] = ()
     depth_readout: float = 0.0
     depth_late: float = 0.0
+    vignetting: float = 0.0
+    vignetting_sigma: float = float("nan")
 
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
@@ -71,6 +78,9 @@ class Calibration:
         if not np.all(np.isfinite([*times.values()])):
             found = ", ".join(f"{name} {value} s" for name, value in times.items())
             raise DatasetError(f"the calibration has {found}; expected finite numbers")
+        if not abs(self.vignetting) <= MAX_VIGNETTING:
+            limit = f"a number from -{MAX_VIGNETTING:g} to {MAX_VIGNETTING:g}"
+            raise DatasetError(f"the vignetting is {self.vignetting}; expected {limit}")
 
     @classmethod
     def registered(cls, camera: Camera) -> "Calibration":
@@ -78,11 +88,11 @@ class Calibration:
         return cls(replace(camera, distortion=()))
 
     def is_registered(self, depth_camera: Camera) -> bool:
-        """Whether the pixels of both images correspond as they are, time stamps aside."""
+        """Whether the pixels of both images correspond, as bright as they are, time stamps aside."""
         one, other = self.camera, depth_camera
         same = (one.fx, one.fy, one.cx, one.cy, one.shape) == (other.fx, other.fy, other.cx, other.cy, other.shape)
-        still = self.delay == 0 and self.readout == 0
-        return same and still and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
+        plain = self.delay == 0 and self.readout == 0 and self.vignetting == 0
+        return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
     def time_sigma(self, assumed: float) -> float:
         """Standard deviation of the time between the colour and the depth of a pixel, seconds.
@@ -148,9 +158,14 @@ class Calibration:
             ]
         )
 
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations of ``PARAMETERS`` and of the vignetting by name, NaN where unknown."""
+        return dict(zip((*PARAMETERS, "vignetting"), (*self.sigma.tolist(), self.vignetting_sigma), strict=True))
+
     def tree(self) -> dict[str, Any]:
         """Nested dictionary of numbers, lists and words, as in the file and in metrics.json; NaN is left out."""
-        sigma = {name: float(value) for name, value in zip(PARAMETERS, self.sigma, strict=True) if np.isfinite(value)}
+        sigma = {name: value for name, value in self.sigmas.items() if np.isfinite(value)}
         camera = asdict(self.camera) | {"distortion": list(self.camera.distortion)}
         del camera["depth_scale"]
         return {
@@ -159,6 +174,7 @@ class Calibration:
             "readout": self.readout,
             "depth_readout": self.depth_readout,
             "depth_late": self.depth_late,
+            "vignetting": self.vignetting,
             "estimated": list(self.estimated),
             "camera": camera,
             "sigma": sigma,
@@ -194,6 +210,8 @@ class Calibration:
                 tuple(tree.get("estimated", ())),
                 float(tree.get("depth_readout", 0.0)),
                 float(tree.get("depth_late", 0.0)),
+                float(tree.get("vignetting", 0.0)),
+                float(known.get("vignetting", np.nan)),
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error

@@ -30,7 +30,7 @@ def fill_gaps(source, fallback, target):
 
 
 @scalar
-def color_places(v, depth, intrinsics, projection, size, first, across, down):
+def color_places(v, depth, intrinsics, projection, size, first, across, down, gain):
     """Where the pixels of a row of a depth image lie in the colour image, which is continued at its borders.
 
     A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera, the
@@ -46,6 +46,7 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down):
         size: Heights of the depth image and of the colour image, width of the colour image.
         first: (w,) int32 out, number of the upper left of the four colour pixels around the point.
         across, down: (w,) float32 out, its place between them, 0 to 1.
+        gain: (w,) float32 out, what vignetting leaves of the brightness there, inverted.
     """
     zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
     p, s, b = elements(projection.place), elements(projection.speed), elements(projection.bend)
@@ -55,6 +56,9 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down):
     offset, readout, height = np.float32(projection.offset), np.float32(projection.readout), np.float32(size[1])
     last_u, last_v, stride = np.float32(size[2] - 1), np.float32(size[1] - 1), np.int32(size[2])
     by_height, by_fx = one / height, one / intrinsics[0]
+    third, falloff = np.float32(1 / 3), np.float32(projection.vignetting)
+    middle_u, middle_v = half * last_u, half * last_v
+    falloff /= middle_u * middle_u + middle_v * middle_v
     y_ray = ray(v, intrinsics[3], intrinsics[1])
     guess = offset + readout * ((np.float32(v) + half) / np.float32(size[0]) - half)
     c_guess = half * guess * guess
@@ -77,6 +81,9 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down):
         left, top = min(np.floor(to_u), last_u - one), min(np.floor(to_v), last_v - one)
         first[u] = np.int32(np.int32(top) * stride + np.int32(left))
         across[u], down[u] = to_u - left, to_v - top
+        a, d = to_u - middle_u, to_v - middle_v
+        loss = falloff * (a * a + d * d)
+        gain[u] = one + loss * (one + half * loss * (one + third * loss))  # exp(loss)
 
 
 @scalar
@@ -87,26 +94,27 @@ def blended(a, b, c, d, across, down):
 
 
 @scalar
-def blended_byte(a, b, c, d, shift, across, down):
-    """The same of one byte of four words, rounded."""
+def blended_byte(a, b, c, d, shift, across, down, gain):
+    """The same of one byte of four words times a gain, rounded."""
     byte = np.int32(255)
     value = blended(
         np.float32((a >> shift) & byte), np.float32((b >> shift) & byte), np.float32((c >> shift) & byte),
         np.float32((d >> shift) & byte), across, down,
     )  # fmt: skip
-    return np.int32(value + np.float32(0.5))
+    return np.int32(min(gain * value, np.float32(255)) + np.float32(0.5))
 
 
 @scalar
 def register_rows(start, stop, depth, intrinsics, projection, fallback, size, words, shades, colors):
     """Colours, or intensities, of rows ``start`` to ``stop``; see ``register``."""
     w, next_row = depth.shape[1], np.uintp(size[2])
-    filled, across, down = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    filled, across = np.empty(w, np.float32), np.empty(w, np.float32)
+    down, gain = np.empty(w, np.float32), np.empty(w, np.float32)
     first, around = np.empty(w, np.int32), np.empty((4, w), np.int32)
     values = around.view(np.float32)
     for v in range(start, stop):
         fill_gaps(depth[v], fallback, filled)
-        color_places(v, filled, intrinsics, projection, size, first, across, down)
+        color_places(v, filled, intrinsics, projection, size, first, across, down, gain)
         for u in range(w):
             n = np.uintp(first[u])
             around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
@@ -115,14 +123,15 @@ def register_rows(start, stop, depth, intrinsics, projection, fallback, size, wo
         if shades.size > 0:
             row = shades[v]
             for u in range(w):
-                row[u] = blended(values[0, u], values[1, u], values[2, u], values[3, u], across[u], down[u])
+                shade = blended(values[0, u], values[1, u], values[2, u], values[3, u], across[u], down[u])
+                row[u] = gain[u] * shade
             continue
         for u in range(w):
             a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
-            red, green = (
-                blended_byte(a, b, c, d, 0, across[u], down[u]), blended_byte(a, b, c, d, 8, across[u], down[u])
-            )  # fmt: skip
-            first[u] = red | green << 8 | blended_byte(a, b, c, d, 16, across[u], down[u]) << 16
+            red = blended_byte(a, b, c, d, 0, across[u], down[u], gain[u])
+            green = blended_byte(a, b, c, d, 8, across[u], down[u], gain[u])
+            blue = blended_byte(a, b, c, d, 16, across[u], down[u], gain[u])
+            first[u] = red | green << 8 | blue << 16
         target = colors[v].reshape(-1)
         for u in range(w):
             k, word = np.uintp(3 * u), first[u]

@@ -17,12 +17,12 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
     zero, half, height = np.float32(0), np.float32(0.5), np.float32(size[1])
     w, next_row, stride = depth.shape[1], np.uintp(size[2]), np.int32(size[2])
     source_row, across, down = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    first = np.empty(w, np.int32)
+    first, gain = np.empty(w, np.int32), np.empty(w, np.float32)
     recorded = depth.reshape(-1)
     speed_x, speed_y, speed_z = projection.speed[2, 0], projection.speed[2, 1], projection.speed[2, 3]
     for v in range(start, stop):
         fill_gaps(depth[v], fallback, source_row)
-        color_places(v, source_row, intrinsics, projection, size, first, across, down)
+        color_places(v, source_row, intrinsics, projection, size, first, across, down, gain)
         for u in range(w):
             n, row = np.uintp(first[u]), first[u] // stride
             a, b = recorded[n], recorded[n + np.uintp(1)]
@@ -45,9 +45,9 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
             n, k = np.uintp(first[u]), np.uintp(3 * u)
             a, b = words[n], words[n + np.uintp(1)]
             c, d = words[n + next_row], words[n + next_row + np.uintp(1)]
-            target[k] = np.uint8(blended_byte(a, b, c, d, 0, across[u], down[u]))
-            target[k + np.uintp(1)] = np.uint8(blended_byte(a, b, c, d, 8, across[u], down[u]))
-            target[k + np.uintp(2)] = np.uint8(blended_byte(a, b, c, d, 16, across[u], down[u]))
+            target[k] = np.uint8(blended_byte(a, b, c, d, 0, across[u], down[u], gain[u]))
+            target[k + np.uintp(1)] = np.uint8(blended_byte(a, b, c, d, 8, across[u], down[u], gain[u]))
+            target[k + np.uintp(2)] = np.uint8(blended_byte(a, b, c, d, 16, across[u], down[u], gain[u]))
 
 
 @kernel
