@@ -16,7 +16,7 @@ MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
 """Shares of the pixels of a segment that must be dynamic by themselves for all of it to be: with evidence that the
 others have moved as well, and without."""
 STARTED_SHARE = 0.1
-"""Share of a segment that must be seeds for its pixels in unknown space to move."""
+"""Share of a segment that must be seeds for its pixels in unknown space to move, and of a region grown from seeds."""
 DISTANCE_SCALE = 1.0
 """Mean distance to the map of a segment that has moved, standard deviations of a reading."""
 MISMATCH_SCALE = 1 / 3
