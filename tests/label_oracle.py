@@ -20,6 +20,7 @@ from dudmap.core.backends.cpu.segment_motion import (
     GRADIENT_NOISE,
     LEAST_SHARE,
     MAX_SHARE,
+    MEAN_DEVIATION,
     MIN_DYNAMIC,
     NEARLY_ALL,
     SETTLED_SIGMAS,
@@ -116,7 +117,16 @@ def still(segments, dynamic, gap, difference):
     displaced = np.abs(gap) > SETTLED_SIGMAS * np.maximum(segments.least_sigma, segments.sigma)
     parts = segments.labels + np.where(dynamic, count, 0)
     found = evidence(segments, parts, 2 * count, compared, displaced, gap, difference)
-    size, visible, moves, distance, mismatch = found.T
+    size, visible, moves, distance, _ = found.T
+    ones = cv2.blur(compared.astype(np.float32), (segments.window, segments.window))
+    mean = cv2.blur(np.where(compared, difference, np.float32(0)), (segments.window, segments.window))
+    mean /= np.maximum(ones, LEAST_SHARE)
+    mismatch = np.zeros(2 * count + 1)
+    for n in np.unique(parts[compared & ~displaced & (parts > 0)]):
+        inside = compared & ~displaced & (parts == n)
+        deviation = MEAN_DEVIATION * median(np.abs(mean[inside] - median(mean[inside])))
+        texture = median(segments.gradient[inside])
+        mismatch[n] = deviation * texture / (texture + GRADIENT_NOISE) ** 2
     visible = (visible > 0.7) & (size >= segments.min_pixels)
     limit = 1.2 * max(COMMON_MISMATCH, quartile(mismatch[visible]))
     return (visible & (moves < 0.1) & (np.abs(distance) < 1) & (mismatch < limit))[count + 1 :]

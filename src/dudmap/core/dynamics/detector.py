@@ -20,7 +20,7 @@ from dudmap.core.backends.cpu.evidence import (
     static_sigma,
     weigh_readings,
 )
-from dudmap.core.backends.cpu.segment_motion import moving_segments, stand_still
+from dudmap.core.backends.cpu.segment_motion import STARTED_SHARE, moving_segments, stand_still
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
@@ -46,8 +46,6 @@ SWEEPS = 4
 """Sweeps of the mean field over the image."""
 MIN_REGION = 0.0008
 """Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
-SEEDED_SHARE = 0.25
-"""Share of a grown region that must be seeds for it to move."""
 EROSION, DILATION, FLOOD_STEP = 15 / 640, 10 / 640, 0.007
 """Radii of the threshold rule's structuring elements, as shares of the image width, and the largest depth step to a
 neighbouring pixel in its flood, as a share of the depth, in an image 640 pixels wide (Palazzolo et al. 2019, code)."""
@@ -178,7 +176,7 @@ class DynamicDetector(Stateful):
         offset, slope = mixture.coefficients
         dynamic, seeds = (np.empty(depth.shape, np.bool_) for _ in range(2))
         rules = RegionRules(
-            MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, SEEDED_SHARE,
+            MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, STARTED_SHARE,
             config.free_space, config.regions,
         )  # fmt: skip
         moving_pixels(

@@ -100,6 +100,17 @@ class Level:
         """Intensities (h, w) in grey values from 0 to 255."""
         return np.clip(255 * self.intensity, 0, 255).astype(np.uint8)
 
+    @cached_property
+    def foreground(self) -> NDArray[np.bool_]:
+        """Pixels (h, w) of the nearest surface in the window of a corner: a window across a depth edge follows the
+        foreground, not the surface behind it."""
+        import cv2
+
+        side = scaled_window(WINDOW, self.camera.width)
+        readings = np.where(self.depth > 0, self.depth, np.float32(np.inf))
+        nearest = np.asarray(cv2.erode(readings, np.ones((side, side), np.uint8)))
+        return (self.depth > 0) & (nearest > np.float32(0.93) * self.depth)
+
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
     """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
@@ -183,8 +194,7 @@ def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> i
 def _corners(level: Level) -> NDArray[np.int64]:
     """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
 
-    A corner has a depth reading and lies on the nearest surface in its window: a window across a depth edge follows the
-    foreground, not the surface behind it.
+    A corner lies on the foreground in its window.
     """
     import cv2
 
@@ -197,8 +207,5 @@ def _corners(level: Level) -> NDArray[np.int64]:
     strongest = tiles.argmax(axis=1)
     rows = np.arange(height * width) // width * cell + strongest // cell
     columns = np.arange(height * width) % width * cell + strongest % cell
-    z = level.depth[rows, columns]
-    window = scaled_window(WINDOW, image.shape[1])
-    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((window, window), np.uint8))
-    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
+    useful = (tiles.max(axis=1) > 1e-4) & level.foreground[rows, columns]
     return np.stack([columns, rows], axis=1)[useful]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.median import nth
 from dudmap.core.backends.parameters import SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar
 
@@ -15,7 +16,7 @@ MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
 """Shares of the pixels of a segment that must be dynamic by themselves for all of it to be: with evidence that the
 others have moved as well, and without."""
 STARTED_SHARE = 0.1
-"""Share of a segment that must be seeds for its pixels in unknown space to move."""
+"""Share of a segment that must be seeds for its pixels in unknown space to move, and of a region grown from seeds."""
 DISTANCE_SCALE = 1.0
 """Mean distance to the map of a segment that has moved, standard deviations of a reading."""
 MISMATCH_SCALE = 1 / 3
@@ -34,6 +35,8 @@ SIZE, COMPARED, DYNAMIC, DISTANCE, MISMATCH = range(5)
 frame) has a surface near, and the share that is dynamic by itself; of those that are compared and not dynamic, the mean
 of distance / sigma, and the intensity mismatch in pixels of motion: the mean absolute deviation D of their intensity
 difference from its mean, over their mean gradient G, damped where G is no larger than noise: D G / (G + noise)^2."""
+MEAN_DEVIATION = 1.183
+"""Mean absolute deviation of normally distributed values, over their median one."""
 f64 = np.float64
 
 
@@ -277,13 +280,40 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
     return labels, count
 
 
+@exact_scalar
+def median_mismatches(segments, labels, count, compared, moving, difference):
+    """Intensity mismatch (count + 1,) of segments by medians: pixels beside something near show its colours, so that
+    what stands differs along its outline, while what has moved differs nearly everywhere. Arguments as of
+    ``segment_evidence``."""
+    means = window_means(compared, difference, segments.window)
+    sizes, out = np.zeros(count + 1, np.int64), np.zeros(count + 1)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            sizes[labels[v, u]] += compared[v, u] and not moving[v, u]
+    ends = np.cumsum(sizes)
+    places, values = ends - sizes, np.empty((2, ends[count]), np.float32)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            if compared[v, u] and not moving[v, u]:
+                n = labels[v, u]
+                values[0, places[n]], values[1, places[n]] = means[v, u], segments.gradient[v, u]
+                places[n] += 1
+    for n in range(1, count + 1):
+        if sizes[n] > 0:
+            middle, (differences, gradients) = sizes[n] // 2, values[:, ends[n] - sizes[n] : ends[n]]
+            texture, deviations = f64(nth(gradients, middle)), np.abs(differences - nth(differences, middle))
+            damped = texture / ((texture + GRADIENT_NOISE) * (texture + GRADIENT_NOISE))
+            out[n] = MEAN_DEVIATION * nth(deviations, middle) * damped
+    return out
+
+
 @exact
 def stand_still(segments, dynamic, gap, difference, settled):
     """Keep of the settled segments those whose dynamic part stands where it stood in an older frame.
 
     That is where more than 0.7 of its pixels are visible, less than 0.1 of them lie off by more than SETTLED_SIGMAS,
-    the mean distance is below one sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or
-    COMMON_MISMATCH).
+    the mean distance is below one sigma, and the intensity mismatch by medians below 1.2 times the frame's upper
+    quartile (or COMMON_MISMATCH).
 
     Args:
         segments: SegmentImage.
@@ -294,7 +324,7 @@ def stand_still(segments, dynamic, gap, difference, settled):
     count, (h, w) = segments.count, dynamic.shape
     parts = np.empty((h, w), np.int32)  # the dynamic part of segment n is n + count
     compared, displaced = np.empty((h, w), np.bool_), np.empty((h, w), np.bool_)
-    visible, mismatches = np.zeros(2 * count + 1, np.bool_), np.empty(2 * count + 1)
+    visible, quartile_of = np.zeros(2 * count + 1, np.bool_), np.empty(2 * count + 1)
     for v in range(h):
         for u in range(w):
             parts[v, u] = segments.labels[v, u] + (count if dynamic[v, u] else 0)
@@ -302,13 +332,14 @@ def stand_still(segments, dynamic, gap, difference, settled):
             sigma = max(segments.least_sigma, segments.sigma[v, u])
             displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
     evidence, found = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, difference), 0
+    mismatches = median_mismatches(segments, parts, 2 * count, compared, displaced, difference)
     for n in range(2 * count + 1):
         visible[n] = evidence[n, COMPARED] > 0.7 and evidence[n, SIZE] >= segments.min_pixels
         if visible[n]:
-            mismatches[found] = evidence[n, MISMATCH]
+            quartile_of[found] = mismatches[n]
             found += 1
-    limit = 1.2 * max(COMMON_MISMATCH, upper_quartile(mismatches[:found]))
+    limit = 1.2 * max(COMMON_MISMATCH, upper_quartile(quartile_of[:found]))
     for n in range(1, count + 1):
         e = evidence[n + count]
-        still = visible[n + count] and e[DYNAMIC] < 0.1 and abs(e[DISTANCE]) < 1 and e[MISMATCH] < limit
+        still = visible[n + count] and e[DYNAMIC] < 0.1 and abs(e[DISTANCE]) < 1 and mismatches[n + count] < limit
         settled[n] = settled[n] and still
