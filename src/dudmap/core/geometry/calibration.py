@@ -97,10 +97,10 @@ class Calibration:
     def time_sigma(self, assumed: float) -> float:
         """Standard deviation of the time between the colour and the depth of a pixel, seconds.
 
-        Where the times of the rows of either image were estimated that of the delay and of the rows (sigma / sqrt 12),
-        else ``assumed``.
+        Where the rolling shutter of the depth was estimated, and the images are rectified, that of the delay and of the
+        row times of the colours (sigma / sqrt 12), else ``assumed``.
         """
-        if not {"readout", "depth_readout"} & set(self.estimated):
+        if "depth_readout" not in self.estimated:
             return assumed
         delay, readout = (self.sigma[PARAMETERS.index(name)] for name in ("delay", "readout"))
         return float(np.hypot(delay, readout / np.sqrt(12)))
