@@ -181,7 +181,7 @@ class ColorCalibration(Stateful):
             found = self._estimation.found()
             if found is None:
                 return False
-            self._color_motion.calibration = found
+            self._color_motion.use(found, view.timestamp)
             self._atlas.recolor(gradually=self._live)
             return True
 

@@ -71,7 +71,8 @@ class ColorMotion(Stateful):
 
     given: Remembered[Calibration | None]
     calibration: Remembered[Calibration | None]
-    _is_first: Remembered[bool] = False  # whether the last frame began a map, with colours that are not registered yet
+    _is_first: Remembered[bool] = False  # whether the last frame began a map, with images of an unknown velocity
+    _rectified_from: Remembered[float] = -np.inf  # time stamp of the first frame whose rolling shutter was known
 
     def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
         self.motion = motion
@@ -84,12 +85,12 @@ class ColorMotion(Stateful):
 
     def start(self, view: FrameView) -> None:
         """A map was made of this frame, whose velocity is not known yet."""
-        self._is_first = not self.is_prepared(view.observation)
+        self._is_first = not self.is_prepared(view.observation) or self._depth_readout != 0
 
     def first_frame(
         self, first: FrameView | None, timestamp: float, T_world_camera: NDArray[np.float64]
     ) -> FrameView | None:
-        """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
+        """The first frame of a map rectified and its colours registered, once the pose (4, 4) of the next is known.
 
         None where the map is right as it is, where its first frame is forgotten, or where too much time has passed for
         the velocity to be known.
@@ -97,7 +98,8 @@ class ColorMotion(Stateful):
         is_first, self._is_first = self._is_first, False
         if first is None or not is_first or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
             return None
-        return self._with_colors(first, self.motion.velocity_to(timestamp, T_world_camera))
+        velocity = self.motion.velocity_to(timestamp, T_world_camera)
+        return self._with_colors(replace(first, observation=self.rectified(first.observation, velocity)), velocity)
 
     def predicted(self, view: FrameView) -> FrameView:
         """The frame with the intensities of its pyramid registered by the velocity so far."""
@@ -124,7 +126,10 @@ class ColorMotion(Stateful):
         if self.calibration is None:
             return frame
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
-        projection = color_projection(self.calibration, velocity, offset)
+        calibration = self.calibration
+        if frame.timestamp <= self._rectified_from:  # its depth has the rows' motion that its colours share
+            calibration = replace(calibration, depth_readout=0.0)
+        projection = color_projection(calibration, velocity, offset)
         return replace(frame, color=register_color(frame.color, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
@@ -134,13 +139,27 @@ class ColorMotion(Stateful):
             return True
         return calibration is self.given and calibration.is_instant(observation.color_offset)
 
-    def rectified(self, observation: Observation) -> Observation:
-        """A frame at the time of its middle row, by the velocity so far; itself where all rows are taken at once."""
-        readout = 0.0 if self.calibration is None else self.calibration.depth_readout
-        if readout == 0 or not self.motion.velocity.any():
+    def rectified(self, observation: Observation, velocity: NDArray[np.float64] | None = None) -> Observation:
+        """A frame at the time of its middle row; itself where all rows are taken at once.
+
+        Args:
+            observation: As recorded.
+            velocity: (6,) twist of the camera per second; None for that so far.
+        """
+        velocity = self.motion.velocity if velocity is None else velocity
+        if self._depth_readout == 0 or not velocity.any():
             return observation
-        with_color = self.is_prepared(observation)
-        return rectified(observation, readout, self.motion.velocity, with_color=with_color)
+        return rectified(observation, self._depth_readout, velocity, with_color=self.is_prepared(observation))
+
+    def use(self, calibration: Calibration, timestamp: float) -> None:
+        """Take a calibration for all frames after this time stamp."""
+        if calibration.depth_readout != self._depth_readout:
+            self._rectified_from = timestamp
+        self.calibration = calibration
+
+    @property
+    def _depth_readout(self) -> float:
+        return 0.0 if self.calibration is None else self.calibration.depth_readout
 
     def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
         observation = view.observation
