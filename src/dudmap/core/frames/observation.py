@@ -47,7 +47,7 @@ class Observation:
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
     depth_readout: float = 0.0
-    sources: NDArray[np.int32] | None = None
+    sources: NDArray[np.int32] | None = field(default=None, repr=False, metadata=CACHE)
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(
         default_factory=list, repr=False, metadata=CACHE
