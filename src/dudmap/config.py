@@ -309,8 +309,7 @@ class SubmapsConfig(ConfigSection):
     enabled: bool = True
     """Start a new submap when relocalisation fails, and merge it when a known place is recognised."""
     patience: float = Field(default=1.0, ge=0)
-    """Time since tracking was lost before a new submap is started, seconds; or that for which the camera was tracked in
-    the current one, if it is less."""
+    """Time since tracking was lost before a new submap is started, seconds."""
     min_readings: float = Field(default=0.2, ge=0, le=1)
     """Smallest share of valid depth readings in the first frame of a submap."""
 

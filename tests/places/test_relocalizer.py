@@ -51,17 +51,13 @@ class Places:
         return list(self.candidates)
 
 
-def relocalizer(
-    candidates=(), *, current=1, prior_map=None, num_features=100, history=True, overrides=(), tracked_seconds=9.0
-):
+def relocalizer(candidates=(), *, current=1, prior_map=None, num_features=100, history=True, overrides=()):
     atlas = SimpleNamespace(
         keyframes=Places(candidates, num_features),
         volumes={0: "map 0", 1: "map 1"},
         volume_around=lambda number, T_world_camera: f"map {number}",
         current=current,
         history=object() if history else None,
-        saved=None,
-        tracked_seconds=tracked_seconds,
     )
     return Relocalizer(Config().override(overrides), atlas, prior_map)
 
@@ -224,39 +220,6 @@ def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeyp
         view.pyramid = timestamp
         wanted.append(subject.wants_new_submap(view))
     assert any(wanted) != slow
-
-
-def test_images_too_far_apart_to_be_compared_leave_the_word_to_newer_ones(monkeypatch):
-    """A fast camera: after 0.2 s little of the surface is found again, though nothing is seen to move."""
-    near, far = motion_of(moving_share=0.1, share=0.9), motion_of(moving_share=0.0, share=0.5)
-    monkeypatch.setattr(
-        "dudmap.core.places.relocalizer.dominant_motion",
-        lambda before, after, _: None if after - before > 0.3 else far if after - before > 0.15 else near,
-    )
-    subject = relocalizer()
-    subject.lost(0.0, mostly_dynamic=True)
-    wanted = []
-    for timestamp in np.arange(0.05, 1.5, 0.05):
-        view = lost_view(timestamp)
-        view.pyramid = timestamp
-        wanted.append(subject.wants_new_submap(view))
-    assert wanted.index(True) == np.searchsorted(np.arange(0.05, 1.5, 0.05), 1.0 - 1e-9)
-
-
-@pytest.mark.parametrize(("tracked", "waited"), [(0.0, 0.0), (0.3, 0.3), (5.0, 1.0)])
-def test_a_map_is_waited_for_no_longer_than_it_was_tracked(tracked, waited):
-    subject = relocalizer(overrides=["dynamics.start_seconds=0"], tracked_seconds=tracked)
-    subject.lost(2.0)
-    assert subject.wants_new_submap(lost_view(2.0 + waited + 1e-6))
-    assert waited == 0 or not subject.wants_new_submap(lost_view(2.0 + 0.9 * waited))
-
-
-def test_a_saved_map_is_waited_for_as_configured():
-    subject = relocalizer(overrides=["dynamics.start_seconds=0"], tracked_seconds=0.0)
-    subject.atlas.saved = subject.atlas.current
-    subject.lost(2.0)
-    assert not subject.wants_new_submap(lost_view(2.9))
-    assert subject.wants_new_submap(lost_view(3.1))
 
 
 @pytest.mark.parametrize("crowded", [False, True])

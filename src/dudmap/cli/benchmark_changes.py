@@ -25,7 +25,7 @@ def changes(
         Option(help="These in each pair, as for `synth`; none: nothing changed.", metavar="THING:KIND,..."),
     ] = None,
     edge: Annotated[float | None, Option(help="Longest edge of boxes, balls and bins.", metavar="M")] = None,
-    keep: Annotated[
+    keep_runs: Annotated[
         Path | None, Option(help="Keep the run folders of rendered pairs here, and use them again.", metavar="FOLDER")
     ] = None,
     assignments: o.SetOption = None,
@@ -48,6 +48,6 @@ def changes(
     given: dict[str, Any] = {} if changes is None else {"changes": parsed_changes(changes)}
     given |= {} if edge is None else {"size": edge}
     config = o.read_config(None, None, assignments)
-    rows, text = measure_changes(seed, count, config, out, min_size, told, recording, given, keep)
+    rows, text = measure_changes(seed, count, config, out, min_size, told, recording, given, keep_runs)
     tree = {"rows": rows, "figures": figures(rows), "out": out}
     answer(tree, f"{text}\nwritten to {out}", as_json=as_json)

@@ -46,30 +46,26 @@ class ReadoutSearch:
         stride: Every so many points of a keyframe.
 
     Attributes:
-        best: Calibration with the readout of the smallest cost.
+        given: Calibration with the readout as given, and the timing that goes with it.
+        best: That with the readout of the smallest cost.
     """
-
-    best: Calibration
 
     def __init__(
         self, pairs: Sequence[Pair], given: Calibration, adjustment: Adjustment, free: NDArray[np.bool_], stride: int
     ) -> None:
         self._pairs, self._given, self._adjustment, self._stride = pairs, given, adjustment, stride
         self._free = free
-        self._found: dict[float, tuple[float, Calibration]] = {}  # mean cost and calibration by readout
-        for readout in (-STEP, 0.0, STEP):
-            self.fitted(readout)
-        self.fitted(self._vertex())
-        self.best = self.fitted(self._vertex())
+        fitted = {readout: self._fitted(readout) for readout in {-STEP, 0.0, STEP, given.depth_readout}}
+        for _ in range(2):
+            lowest = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
+            fitted[lowest] = self._fitted(lowest)
+        self.given, self.best = fitted[given.depth_readout][1], fitted[lowest][1]
 
-    def fitted(self, readout: float) -> Calibration:
-        """Calibration with a readout in seconds and the timing of the colours that goes with it."""
-        if readout not in self._found:
-            pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
-            levels = self._adjustment.levels[-2:]
-            fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, levels)
-            self._found[readout] = float(self._adjustment.costs(pairs, fit).mean()), fit.calibration
-        return self._found[readout][1]
+    def _fitted(self, readout: float) -> tuple[float, Calibration]:
+        """Mean cost with a readout in seconds, and the calibration with the timing of the colours that goes with it."""
+        pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
+        fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, self._adjustment.levels[-2:])
+        return float(self._adjustment.costs(pairs, fit).mean()), fit.calibration
 
     def costs(self, calibration: Calibration) -> NDArray[np.float64]:
         """Costs (2, P) of intensities and depths of every pair with a calibration, such as that of other pairs."""
@@ -83,11 +79,12 @@ class ReadoutSearch:
         moved = {key: rectified_keyframe(frame, readout) for key, frame in frames.items()}
         return PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)
 
-    def _vertex(self) -> float:
-        """Minimum of the parabola through the three readouts around the best one."""
-        readouts = np.array(sorted(self._found))
-        values = np.array([self._found[readout][0] for readout in readouts.tolist()])
-        middle = min(max(int(values.argmin()), 1), len(values) - 2)
-        a, b, _ = np.polyfit(readouts[middle - 1 : middle + 2], values[middle - 1 : middle + 2], 2)
-        lowest = -b / (2 * a) if a > 0 else readouts[values.argmin()]
-        return float(np.clip(lowest, -LONGEST, LONGEST))
+
+def _vertex(costs: dict[float, float]) -> float:
+    """Minimum of the parabola through the three readouts around the best one, by mean cost."""
+    readouts = np.array(sorted(costs))
+    values = np.array([costs[readout] for readout in readouts.tolist()])
+    middle = min(max(int(values.argmin()), 1), len(values) - 2)
+    a, b, _ = np.polyfit(readouts[middle - 1 : middle + 2], values[middle - 1 : middle + 2], 2)
+    lowest = -b / (2 * a) if a > 0 else readouts[values.argmin()]
+    return float(np.clip(lowest, -LONGEST, LONGEST))

@@ -174,10 +174,8 @@ class CalibrationEstimator:
         sets = [PairSet(pairs, STRIDE) for pairs in halves]
         before, after = (
             _Trial(timing, [], [other.costs(of_one), one.costs(of_other)], sets)
-            for of_one, of_other in (
-                (one.fitted(given.depth_readout), other.fitted(given.depth_readout)), (one.best, other.best)
-            )
-        )  # fmt: skip
+            for of_one, of_other in ((one.given, other.given), (one.best, other.best))
+        )
         evidence, gain = after.improvement(before)
         if not after.proves(before, SHUTTER):
             return given.depth_readout, evidence, 0.0

@@ -174,12 +174,6 @@ class Atlas(Stateful):
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
-    @property
-    def tracked_seconds(self) -> float:
-        """Time from the first to the last pose in the current submap, seconds."""
-        stamps = [pose.timestamp for pose in self.poses if pose.submap == self.current]
-        return stamps[-1] - stamps[0] if stamps else 0.0
-
     def clear_map(self) -> None:
         """Empty the current map, which is the newest, and forget the frames stored of it."""
         self.volume.clear()

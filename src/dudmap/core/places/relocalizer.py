@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
-from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE, SHORTEST_BASELINE
+from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.map.volume import TsdfVolume
@@ -18,8 +18,6 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 
-LostImage = tuple[float, Pyramid, Segmentation]
-"""Time, images and segments of a lost frame."""
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
 """Registers and labels the lost frame against a map, starting from a pose (4, 4) in the world of that map."""
 
@@ -44,7 +42,8 @@ class Relocalizer(Stateful):
 
     _lost_since: Remembered[float | None] = None
     _mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
-    _recent: Remembered[deque[LostImage]]  # those of LONGEST_BASELINE
+    # time, images and segments of the last lost frames, those of LONGEST_BASELINE
+    _recent: Remembered[deque[tuple[float, Pyramid, Segmentation]]]
     _place_unknown: Remembered[bool] = False
     _counted: Remembered[tuple[float, int]]
 
@@ -114,21 +113,20 @@ class Relocalizer(Stateful):
     def wants_new_submap(self, view: FrameView) -> bool:
         """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
-        That is the case if the camera has been lost for ``submaps.patience`` seconds, or for as long as it was tracked
-        in the current map if that is less, the frame has enough depth readings for a map and enough features for a
-        keyframe, and it is not of people: see ``_shows_static_world``. It is compared with the last lost image, in
-        which fast people are found again, and with the oldest of LONGEST_BASELINE that can be compared, since when slow
-        people have moved.
+        That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
+        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``. It
+        is compared with the last lost image, in which fast people are found again, and with one LONGEST_BASELINE older,
+        since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
         if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
         while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
             self._recent.popleft()
-        recent = list(self._recent)
+        recent = [(pyramid, segmentation) for _, pyramid, segmentation in self._recent]
         if self._compares_images:
             self._recent.append((view.timestamp, view.pyramid, view.segmentation()))
-        if observation.timestamp - self._lost_since < min(config.patience, self._worth_waiting):
+        if observation.timestamp - self._lost_since < config.patience:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
@@ -137,49 +135,28 @@ class Relocalizer(Stateful):
             count = len(self.atlas.keyframes.extract(observation))
         if count < self.config.relocalization.min_inliers:
             return False
-        if not self._compares_images:
-            return True
-        latest = self._shows_static_world(recent[-1], view) if recent else None
-        if latest is False:
-            return False
-        older, compared = [], np.inf
-        for image in reversed(recent[:-1]):
-            if min(view.timestamp, compared) - image[0] >= SHORTEST_BASELINE:
-                older, compared = [image, *older], image[0]
-        known = (self._shows_static_world(image, view, far=True) for image in older)
-        slow = next((shown for shown in known if shown is not None), latest)
-        return not self._mostly_dynamic if slow is None else slow
-
-    @property
-    def _worth_waiting(self) -> float:
-        """Longest time to wait for the current map to be recognised, seconds: as long as the camera was tracked in it.
-
-        A new map loses the time tracked in the old one, and waiting the time waited. Who waits until both are equal
-        loses at most twice what the better of both would have lost, however long the camera stays lost (the ski rental
-        problem). A saved map is worth any time.
-        """
-        return np.inf if self.atlas.current == self.atlas.saved else self.atlas.tracked_seconds
+        if len(recent) < 2:
+            return self._shows_static_world(recent[0] if recent else None, view)
+        return self._shows_static_world(recent[-1], view) and self._shows_static_world(recent[0], view)
 
     @property
     def _compares_images(self) -> bool:
         return self.config.dynamics.method == "em" and self.config.dynamics.start_seconds > 0
 
-    @staticmethod
-    def _shows_static_world(before: LostImage, view: FrameView, *, far: bool = False) -> bool | None:
-        """Whether the motion from an earlier lost image to this one is certainly that of the camera; None where both
-        cannot be compared.
+    def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
+        """Whether the motion from an earlier lost image to this one is certainly that of the camera.
 
         Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
         near; the static world may fill most of the surface, since it is far. A map is only begun where one motion does
         both: at least AGREED of the surface and most of the pixels follow it. Without a common motion, as in images
-        without texture, it is begun unless most of the view moved when the camera was lost. Where much of
-        the surface is not found again in a ``far`` older image, though little is seen to move, both are too far apart.
-        Nothing is examined where images are not compared (``dynamics.start_seconds`` = 0).
+        without texture, it is begun unless most of the view moved when the camera was lost. Nothing is examined where
+        images are not compared (``dynamics.start_seconds`` = 0).
         """
-        motion = dominant_motion(before[1], view.pyramid, (before[2], view.segmentation()))
+        if not self._compares_images:
+            return True
+        motion = None
+        if before is not None:
+            motion = dominant_motion(before[0], view.pyramid, (before[1], view.segmentation()))
         if motion is None:
-            return None
-        if motion.share >= AGREED:
-            return not is_majority_dynamic(motion.moving_after, view.labelled)
-        competes = np.count_nonzero(motion.moving_after) >= (1 - AGREED) * view.labelled.num_readings
-        return None if far and not competes else False
+            return not self._mostly_dynamic
+        return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

@@ -238,10 +238,6 @@ class PosePredictor(Stateful):
             if motion is None or T_image is None:
                 return by_velocity
             slow = self._slow_motion(view, T_image, motion.moving_after)
-            if slow is not None and not self.ego_motion.slow_motion_is_hidden(timestamp):
-                T_slow, level = slow.T_world_camera, pyramid.coarse  # the map holds no slow motion any more
-                contradicted = self.fits_better(volume, T_image, T_slow, level, previously_dynamic)
-                slow = None if contradicted else slow
             if timestamp in self._known_poses:
                 T_image = T_expected
             elif slow is not None:
