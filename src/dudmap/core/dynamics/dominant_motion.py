@@ -254,7 +254,8 @@ def dominant_motion(
     )
     targets, points, moves = targets[kept], points[kept], moves[kept]
     columns, rows = _nearest_pixels(targets, fine_after).T
-    z, seen = fine_after.depth[rows, columns].astype(np.float64), fine_after.foreground[rows, columns]
+    z = fine_after.depth[rows, columns].astype(np.float64)
+    seen = z > 0
     points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], z)[seen]
     return DominantMotion(
         T,
