@@ -56,10 +56,10 @@ class ReadoutSearch:
         self._pairs, self._given, self._adjustment, self._stride = pairs, given, adjustment, stride
         self._free = free
         fitted = {readout: self._fitted(readout) for readout in {-STEP, 0.0, STEP, given.depth_readout}}
-        for _ in range(2):
-            lowest = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
-            fitted[lowest] = self._fitted(lowest)
-        self.given, self.best = fitted[given.depth_readout][1], fitted[lowest][1]
+        near = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
+        fitted[near] = self._fitted(near)
+        lowest = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
+        self.given, self.best = fitted[given.depth_readout][1], self._fitted(lowest)[1]
 
     def _fitted(self, readout: float) -> tuple[float, Calibration]:
         """Mean cost with a readout in seconds, and the calibration with the timing of the colours that goes with it."""
