@@ -225,8 +225,7 @@ class Slam(SlamResults, Stateful):
             observation = self.color_motion.rectified(view.observation)
             if observation is view.observation:
                 return view
-            known = view.known_dynamic
-            known = None if known is None or observation.sources is None else known.reshape(-1)[observation.sources]
+            known = None if view.known_dynamic is None else view.known_dynamic.reshape(-1)[observation.sources]
             return replace(self._viewed(observation), timer=view.timer, known_dynamic=known)
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
@@ -397,10 +396,5 @@ class Slam(SlamResults, Stateful):
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.device)
         return make_volume(
-            self.camera,
-            config.volume,
-            config.sensor,
-            config.preprocess.depth_max,
-            backend,
-            self.arguments.max_blocks,
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.arguments.max_blocks
         )
