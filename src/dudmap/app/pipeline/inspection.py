@@ -168,7 +168,7 @@ def inspect(
     )
     found.warnings = [
         *_focal_warnings(sequence, found.sources),
-        *_depth_warnings(found, readings),
+        *_depth_warnings(found, readings, "depth_unit" in getattr(sequence, "options", ("depth_unit",))),
         *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
@@ -195,7 +195,7 @@ def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
     return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > limit)]
 
 
-def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> Iterator[str]:
+def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_open: bool) -> Iterator[str]:
     if found.unreadable:
         yield f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
     if found.median_depth is None:
@@ -203,7 +203,9 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> Iterato
         return
     median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
     implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
-    if implausible or not NEAR <= median <= FAR:
+    if (implausible or not NEAR <= median <= FAR) and not unit_is_open:
+        yield f"nine tenths of the readings lie from {near:.2g} to {far:.2g} m, which depth cameras hardly measure"
+    elif implausible or not NEAR <= median <= FAR:
         units = median * found.depth_scale
         fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
         proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
