@@ -302,6 +302,21 @@ def test_implausible_depth_is_warned_of_with_the_unit_that_fits(tmp_path):
     assert inspect(open_sequence(folder, depth_unit=1e-4)).warnings == []
 
 
+@pytest.mark.parametrize(("start", "warned"), [(1305031100.0, False), (1628069033.0, True), (0.0, False)])
+def test_a_recording_that_borrows_the_name_of_tum(tmp_path, start, warned):
+    from dudmap.app.pipeline.inspection import inspect
+
+    folder, pairs = tmp_path / "rgbd_dataset_freiburg1_xyz", ""
+    for k in range(3):
+        stamp = f"{start + k / 30:.6f}"
+        write_color(folder / f"rgb/{stamp}.png", k, 640, 480)
+        write_depth(folder / f"depth/{stamp}.png", k, 5000, 640, 480)
+        pairs += f"{stamp} rgb/{stamp}.png {stamp} depth/{stamp}.png\n"
+    (folder / "associations.txt").write_text(pairs)
+    said = [text for text in inspect(open_sequence(folder)).warnings if "taken after that data set" in text]
+    assert len(said) == warned
+
+
 def test_no_unit_is_asked_for_where_the_format_gives_it(tmp_path):
     from dudmap.app.pipeline.inspection import inspect
 

@@ -44,6 +44,8 @@ LATE = 0.015
 """Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
 RUN = 6
 """Number of frames in a row that are compared with each other at every sampled place."""
+TUM_ENDED = 1356998400.0
+"""The year 2013, seconds since 1970: what is named as in TUM RGB-D but was taken later is of another camera."""
 SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
 """Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
 USUAL = (0.4, 8.0)
@@ -250,6 +252,11 @@ def _focal_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[s
     intrinsics = sources.get("intrinsics", "")
     if not intrinsics.endswith(BY_NAME) or sequence.calibration is not None:
         return
+    if "TUM" in intrinsics and sequence.timestamps[0] > TUM_ENDED:
+        yield (
+            f"the camera is {intrinsics}, but the images were taken after that data set: give --camera, or an "
+            "intrinsics.txt"
+        )
     error, fx = focal_error(sequence), sequence.camera.fx
     if error is not None and abs(error - 1) >= WRONG:
         yield (
