@@ -26,7 +26,7 @@ from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
-from dudmap.core.frames.observation import Level, exposed
+from dudmap.core.frames.observation import Level, Pyramid, exposed
 from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
@@ -105,24 +105,25 @@ class DynamicDetector(Stateful):
         self.memory = TemporalMemory(config)
         self.background = BackgroundModel(config)
 
-    def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
-        """Begin to segment the surface an image shows; needs no map.
+    def segment(self, levels: Callable[[], Pyramid], voxel_size: float, *, now: bool) -> Callable[[], Segmentation]:
+        """Segments of the surface an image shows; needs no map.
 
         Args:
-            level: The image, at the resolution of the labels.
+            levels: Returns the pyramid of the image.
             voxel_size: Edge of the map's voxels, metres.
+            now: Begin to compute them in another thread, where the configuration needs them.
 
         Returns:
-            A function that waits for the segmentation. It is computed in another thread, or, where the configuration
-            does not need it, when the function is first called.
+            A function that waits for the segmentation, or computes it when it is first called.
         """
 
         def compute() -> Segmentation:
+            level = levels().labelled
             return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
-        return cache(submit(compute) if needed else compute)
+        return cache(submit(compute) if now and needed else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
         """Begin with the first frame of a map, of which no pixel is known to move.
