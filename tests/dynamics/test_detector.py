@@ -12,6 +12,7 @@ from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
 from dudmap.core.backends.device import make_backend
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Mixture, fit_mixture
+from dudmap.core.dynamics.segments import segment
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.camera import Camera
@@ -155,8 +156,8 @@ def test_the_map_decides_about_what_images_show_to_move_only_where_it_has_enough
     level = Level(SMALL, depth, texture[..., 0].astype(np.float32) / 255)
     detector = DynamicDetector(config.dynamics, config.sensor)
     detector.start(0.0, level, np.eye(4))
-    segmentation = detector.segment(level, volume.voxel_size)
-    labels = detector.detect(volume, level, np.eye(4), 0.1, segmentation, moving=person)
+    segmentation = segment(level, np.full(SMALL.shape, 0.1, np.float32))
+    labels = detector.detect(volume, level, np.eye(4), 0.1, lambda: segmentation, moving=person)
     inside = person.copy()
     inside[:40] = False  # beside the border of what the map has
     assert np.mean(labels.dynamic[inside]) == pytest.approx(0.0 if stands else 1.0, abs=0.05)
