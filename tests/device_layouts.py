@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 
-from layout_images import Layout, color, open3d_camera, pose, write_color, write_depth
+from layout_images import Layout, color, exr, millimetres, open3d_camera, pose, write_color, write_depth
 
 
 def nerfstudio(folder):
@@ -101,6 +101,32 @@ def polycam(folder):
     (folder / "mesh_info.json").write_text(json.dumps({"faceCount": 0, "alignmentTransform": [0.0] * 16}))
     stamps = [82 + 0.25 * k for k in range(3)]
     return Layout("Polycam", (60, 61, 31, 23), stamps=stamps, color=(120, 122, 62.5, 46.5, (96, 128)))
+
+
+def record3d(folder):
+    """As the application exports "EXR + JPG sequence"; some of the frames were deleted."""
+    (folder / "depth").mkdir()
+    for number, k in ((0, 0), (1, 1), (3, 2)):
+        write_color(folder / f"rgb/{number}.jpg", k, 128, 96)
+        (folder / f"depth/{number}.exr").write_bytes(exr({"R": (millimetres(k) / 1000).astype(np.float32)}))
+    tree = {
+        "w": 128, "h": 96, "dw": 64, "dh": 48, "fps": 60, "cameraType": 1, "initPose": [0, 0, 0, 1, 0, 0, 0],
+        "K": [120.0, 0, 0, 0, 122.0, 0, 62.5, 46.5, 1], "frameTimestamps": [0, 0.0167, 0.0334, 0.05],
+        "poses": [[0, 0, 0, 1, 0, 0, 0]] * 4,
+    }  # fmt: skip
+    (folder / "metadata.json").write_text(json.dumps(tree))
+    other = (120, 122, 62.5, 46.5, (96, 128))
+    return Layout("Record3D images", (60, 61, 31, 23), stamps=[0, 0.0167, 0.05], truth=None, color=other)
+
+
+def suffixed(folder):
+    """Names of depth images are those of the colour images and a word, as in RGB-D Scenes of Washington."""
+    for k in range(3):
+        write_color(folder / f"desk_1_{k}.png", k)
+        write_depth(folder / f"desk_1_{k}_depth.png", k)
+        write_color(folder / f"desk_1_{k}_mask.png", k + 1)
+    (folder / "camera_intrinsic.json").write_text(open3d_camera())
+    return Layout("numbered images", (60, 61, 31, 23), truth=None)
 
 
 def realsense(folder):

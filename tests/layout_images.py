@@ -1,6 +1,8 @@
 """Images, poses and expectations of the folders that ``layouts.py`` and ``device_layouts.py`` write."""
 
 import json
+import struct
+import zlib
 from dataclasses import dataclass, field
 
 import cv2
@@ -53,6 +55,36 @@ def write_depth(path, k, scale=1000.0, width=64, height=48, missing=0):
     depth = np.round(millimetres(k, width, height) * (scale / 1000)).astype(np.uint16)
     depth[:5, :7] = missing
     assert cv2.imwrite(str(path), depth)
+
+
+def exr(channels, compression=3, window=(0, 0)):
+    """Bytes of an OpenEXR image in lines with these channels (H, W) by name, compressed by ZIP (3), ZIPS (2) or not."""
+    height, width = next(iter(channels.values())).shape
+    kinds = {"uint32": 0, "float16": 1, "float32": 2}
+    listed = b"".join(
+        name.encode() + struct.pack("<xi4x2i", kinds[str(values.dtype)], 1, 1)
+        for name, values in sorted(channels.items())
+    )
+    box = struct.pack("<4i", *window, window[0] + width - 1, window[1] + height - 1)
+    fields = {
+        "channels": ("chlist", listed + b"\0"), "compression": ("compression", bytes([compression])),
+        "dataWindow": ("box2i", box), "displayWindow": ("box2i", box), "lineOrder": ("lineOrder", b"\0"),
+    }  # fmt: skip
+    head = b"v/1\x01\x02\0\0\0" + b"".join(
+        f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value for name, (kind, value) in fields.items()
+    )
+    step, blocks = 16 if compression == 3 else 1, []
+    for first in range(0, height, step):
+        lines = range(first, min(first + step, height))
+        raw = b"".join(values[y].tobytes() for y in lines for _, values in sorted(channels.items()))
+        halves = np.frombuffer(raw[::2] + raw[1::2], np.uint8).astype(int)
+        differences = np.concatenate([halves[:1], (np.diff(halves) + 128) % 256]).astype(np.uint8)
+        packed = zlib.compress(differences.tobytes())
+        block = packed if compression and len(packed) < len(raw) else raw
+        blocks.append(struct.pack("<2i", window[1] + first, len(block)) + block)
+    start = len(head) + 1 + 8 * len(blocks)
+    places = [start + sum(map(len, blocks[:k])) for k in range(len(blocks))]
+    return head + b"\0" + struct.pack(f"<{len(places)}Q", *places) + b"".join(blocks)
 
 
 def rows(matrix):

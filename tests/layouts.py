@@ -7,7 +7,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from device_layouts import arkit_scenes, azure_kinect, nerfstudio, polycam, realsense, stray_scanner, timed, zed
+from device_layouts import (
+    arkit_scenes,
+    azure_kinect,
+    nerfstudio,
+    polycam,
+    realsense,
+    record3d,
+    stray_scanner,
+    suffixed,
+    timed,
+    zed,
+)
 from layout_images import (
     Layout,
     millimetres,
@@ -302,7 +313,7 @@ def epfl(folder):
 LAYOUTS = (
     tum, bonn, icl_nuim, icl_nuim_loop, corbs, seven_scenes, tsdf_fusion, with_matrices, bop, volume_deform, scannet,
     replica, redwood, redwood_object, openloris, epfl, nerfstudio, stray_scanner, arkit_scenes, polycam, realsense,
-    azure_kinect, zed, timed,
+    azure_kinect, zed, timed, record3d, suffixed,
 )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.segments import intensity_gradient, segment
 from dudmap.core.dynamics.temporal_memory import TemporalMemory
 from dudmap.core.frames.frame import Frame
-from dudmap.core.frames.observation import Level
+from dudmap.core.frames.observation import Level, Pyramid
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
@@ -139,7 +139,7 @@ def test_images_are_not_believed_on_a_segment_that_stands_where_the_map_has_it(x
     for n in range(4):
         volume.integrate(Frame(n / 30, known, np.repeat(grey[..., None], 3, axis=2)), np.eye(4))
     detector, (image, board) = DynamicDetector(DynamicsConfig(), SensorConfig()), scene(x)
-    surface = detector.segment(image, 0.02)
+    surface = detector.segment(lambda: Pyramid([], image), 0.02, now=True)
     moving = detector.detect(volume, image, np.eye(4), 0.2, surface, board).dynamic
     assert detector.detect(volume, image, np.eye(4), 0.2, surface, board, slow=board).dynamic[board].all()
     assert not moving[~board].any()

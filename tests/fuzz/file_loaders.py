@@ -78,10 +78,13 @@ INTRINSICS = (
 )
 
 
-IMAGES = "depth", "color", "tiff", "webp", "pnm", "bmp"
+IMAGES = "depth", "color", "tiff", "webp", "pnm", "bmp", "exr"
 
 
 def image(kind, folder):
+    if kind == "exr":
+        (folder / "image.exr").write_bytes(layout_images.exr({"Z": np.ones((20, 8), np.float16)}))
+        return folder / "image.exr"
     extension = {"depth": ".png", "color": ".jpg", "tiff": ".tiff", "webp": ".webp", "pnm": ".pgm", "bmp": ".bmp"}[kind]
     path = folder / f"image{extension}"
     (layout_images.write_depth if kind in ("depth", "tiff", "pnm") else layout_images.write_color)(

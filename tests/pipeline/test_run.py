@@ -114,7 +114,10 @@ def test_unreadable_frames_are_skipped_and_counted(slam, recording, tmp_path, ca
     metrics = go(recording, tmp_path / "out").metrics
     assert (metrics["frames"], metrics["unreadable"], metrics["tracked"]) == (8, 2, 6)
     assert "frame 3" in metrics["unreadable_frames"][0]
-    assert "skipped: frame 4" in capsys.readouterr().err.replace("\n", "")
+    said = capsys.readouterr().err.replace("\n", "")
+    assert "skipped: frame 3" in said
+    assert "skipped: frame 4" not in said, "one sentence for a gap"
+    assert "frame 5: readable again, 2 skipped" in said
 
 
 def test_a_lost_track_is_said_once_per_gap(slam, recording, tmp_path, capsys):

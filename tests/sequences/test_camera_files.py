@@ -9,8 +9,8 @@ import pytest
 
 from dudmap.errors import DatasetError
 from dudmap.io.sequences import open_sequence
-from layout_images import write_color, write_depth
-from layouts import bop, scannet, seven_scenes, tsdf_fusion, tum, with_matrices, write
+from layout_images import exr, write_color, write_depth
+from layouts import bop, record3d, scannet, seven_scenes, tsdf_fusion, tum, with_matrices, write
 
 MATRIX = np.array([[60.0, 0, 31.0], [0, 61.0, 23.0], [0, 0, 1]])
 ROS_CALIBRATION = """image_width: 64
@@ -300,3 +300,30 @@ def test_implausible_depth_is_warned_of_with_the_unit_that_fits(tmp_path):
     (warning,) = inspect(open_sequence(folder)).warnings
     assert "the median depth is 9 m; 6553.5 or 10000 would be plausible: give --depth-unit 0.0001526, which" in warning
     assert inspect(open_sequence(folder, depth_unit=1e-4)).warnings == []
+
+
+@pytest.mark.parametrize(("start", "warned"), [(1305031100.0, False), (1628069033.0, True), (0.0, False)])
+def test_a_recording_that_borrows_the_name_of_tum(tmp_path, start, warned):
+    from dudmap.app.pipeline.inspection import inspect
+
+    folder, pairs = tmp_path / "rgbd_dataset_freiburg1_xyz", ""
+    for k in range(3):
+        stamp = f"{start + k / 30:.6f}"
+        write_color(folder / f"rgb/{stamp}.png", k, 640, 480)
+        write_depth(folder / f"depth/{stamp}.png", k, 5000, 640, 480)
+        pairs += f"{stamp} rgb/{stamp}.png {stamp} depth/{stamp}.png\n"
+    (folder / "associations.txt").write_text(pairs)
+    said = [text for text in inspect(open_sequence(folder)).warnings if "taken after that data set" in text]
+    assert len(said) == warned
+
+
+def test_no_unit_is_asked_for_where_the_format_gives_it(tmp_path):
+    from dudmap.app.pipeline.inspection import inspect
+
+    folder, _ = write(record3d, tmp_path)
+    for file in (folder / "depth").iterdir():
+        file.write_bytes(exr({"R": np.full((48, 64), 0.05, np.float32)}))
+    (warning,) = inspect(open_sequence(folder)).warnings
+    assert warning == "nine tenths of the readings lie from 0.05 to 0.05 m, which depth cameras hardly measure"
+    with pytest.raises(DatasetError, match=r"Record3D images, which has no --depth-unit"):
+        open_sequence(folder, depth_unit=0.001)

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from functools import cache
 from typing import Any, Unpack
 
 import numpy as np
@@ -141,9 +142,9 @@ class Slam(SlamResults, Stateful):
             DatasetError: The images do not fit the camera or each other.
         """
         if isinstance(frame, Frame):
-            start = time.perf_counter()
-            frame = self._viewed(self.preprocess(frame))
-            if self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
+            start, now = time.perf_counter(), not self.color_motion.rectifies
+            frame = self._viewed(self.preprocess(frame), now=now)
+            if now and self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
                 _ = frame.pyramid.corners  # cached there for the comparison with other images
             frame.timer.timings["preprocess"] = 1000 * (time.perf_counter() - start)
         if dynamic_mask is not None:
@@ -213,11 +214,13 @@ class Slam(SlamResults, Stateful):
 
     # -- steps of process ---------------------------------------------------------------------------------------------
 
-    def _viewed(self, observation: Observation) -> FrameView:
-        """A preprocessed frame with what needs no other frame."""
+    def _viewed(self, observation: Observation, *, now: bool = True) -> FrameView:
+        """A preprocessed frame with its pyramid and segments, computed now or when they are asked for."""
         _ = observation.num_readings  # cached there for the result
-        pyramid = Pyramid.of(observation, self.camera, self.config)
-        return FrameView(observation, pyramid, self.detector.segment(pyramid.labelled, self.config.volume.voxel_size))
+        levels = cache(lambda: Pyramid.of(observation, self.camera, self.config))
+        if now:
+            levels()
+        return FrameView(observation, levels, self.detector.segment(levels, self.config.volume.voxel_size, now=now))
 
     def _rectified(self, view: FrameView) -> FrameView:
         """The frame at the time of its middle row; itself where all rows are taken at once or the camera rests."""
@@ -253,8 +256,7 @@ class Slam(SlamResults, Stateful):
         return result
 
     def _resumed(self, view: FrameView) -> FrameView:
-        """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
-        may be elsewhere."""
+        """The frame on the clock of the first ones; after a pause neither velocity nor place is known any more."""
         if self.stream.clock_offset != 0:
             view = replace(view, observation=self.stream.restamped(view.observation))
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
@@ -272,12 +274,11 @@ class Slam(SlamResults, Stateful):
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
-        mask = view.known_dynamic
-        mask = np.zeros(view.observation.depth.shape, dtype=bool) if mask is None else mask
+        estimate = PoseEstimate.at_origin()
+        mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
         if reason := self.bootstrap.rejection_reason(view, mask):
             return self._result(view, None, mask, reason=reason)
-        estimate = PoseEstimate.at_origin()
         self.motion.restart(view.timestamp, estimate.T_world_camera)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
@@ -308,9 +309,8 @@ class Slam(SlamResults, Stateful):
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
-        self.relocalizer.lost(
-            view.timestamp, mostly_dynamic=self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
-        )
+        mostly_dynamic = self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
+        self.relocalizer.lost(view.timestamp, mostly_dynamic=mostly_dynamic)
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):

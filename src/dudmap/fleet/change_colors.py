@@ -52,7 +52,7 @@ def recolored_pieces(
     chosen = np.zeros(len(found.state), bool)
     chosen[known[different[cell]]] = True
     out, light = [], np.median(own, axis=0) / np.maximum(np.median(other, axis=0), 1)
-    for piece in connected(found.mesh, chosen, 2 * edge):
+    for piece in connected(found, chosen, 2 * edge):
         low, high = piece.box
         inside = known[np.all((points >= low) & (points <= high), axis=1)]
         share = len(piece.vertices) / max(len(inside), 1)

@@ -75,6 +75,13 @@ class Evidence:
         return self.mesh.vertices.astype(np.float64)
 
     @cached_property
+    def areas(self) -> NDArray[np.float64]:
+        """Surface (V,) that each vertex stands for, square metres."""
+        a, b, c = np.moveaxis(self.points[self.mesh.faces], 1, 0)
+        thirds = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+        return np.bincount(self.mesh.faces.reshape(-1), np.repeat(thirds, 3), len(self.points))
+
+    @cached_property
     def parts(self) -> NDArray[np.intp]:
         """Number (V,) of the surface to which each vertex belongs if what the other map confirms is left out."""
         faces = self.mesh.faces[np.all(self.state[self.mesh.faces] != CONFIRMED, axis=1)]

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from dudmap.core.geometry.mesh import Mesh
 from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
 from dudmap.fleet.map_samples import EMPTY, OBSERVED
 
@@ -58,7 +57,7 @@ class Piece:
 
 def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
     """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
-    pieces = connected(found.mesh, opened(found, found.state == DENIED), LINK * voxel_size)
+    pieces = connected(found, opened(found, found.state == DENIED), LINK * voxel_size)
     return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
@@ -141,14 +140,16 @@ def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def connected(mesh: Mesh, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
-    """Groups of chosen vertices (V,) of a mesh that are at most about a gap (m) from each other, the largest first."""
-    numbers = np.flatnonzero(chosen)
+def connected(found: Evidence, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
+    """Groups of chosen vertices (V,) that are at most about a gap (m) from each other, the largest first."""
+    numbers, points = np.flatnonzero(chosen), found.points[chosen]
     if len(numbers) == 0:
         return []
-    places, cell = np.unique(np.floor(mesh.vertices[numbers] / (gap / 2)).astype(np.int64), axis=0, return_inverse=True)
-    group = components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))
-    return _grouped(numbers, group[cell.reshape(-1)], mesh)
+    places, cell = np.unique(np.floor(points / (gap / 2)).astype(np.int64), axis=0, return_inverse=True)
+    group = components(KDTree(places).query_pairs(2.0, p=np.inf, output_type="ndarray"), len(places))[cell.reshape(-1)]
+    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    pieces = [Piece(numbers[rows], points[rows], float(found.areas[numbers[rows]].sum())) for rows in members]
+    return sorted(pieces, key=lambda piece: -piece.area)
 
 
 def gap_between(a: Piece, b: Piece) -> float:
@@ -163,19 +164,3 @@ def joined(pieces: list[Piece]) -> Piece:
         np.concatenate([piece.vertices for piece in pieces]), np.concatenate([piece.points for piece in pieces]),
         sum(piece.area for piece in pieces),
     )  # fmt: skip
-
-
-def _grouped(numbers: NDArray[np.intp], group: NDArray[np.intp], mesh: Mesh) -> list[Piece]:
-    """Pieces of vertices (n,) by the number (n,) of their group, the largest first."""
-    areas, out = vertex_areas(mesh)[numbers], []
-    for members in np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1]):
-        points = mesh.vertices[numbers[members]].astype(np.float64)
-        out.append(Piece(numbers[members], points, float(areas[members].sum())))
-    return sorted(out, key=lambda piece: -piece.area)
-
-
-def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
-    """Surface (V,) that each vertex stands for, square metres."""
-    a, b, c = (mesh.vertices[mesh.faces[:, n]] for n in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).astype(np.float64) / 6
-    return np.bincount(mesh.faces.reshape(-1), np.repeat(areas, 3), len(mesh.vertices)).astype(np.float64)

@@ -186,7 +186,7 @@ def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:
     """Parts of the place that only one visit saw."""
     out = []
     for number, one in enumerate(found):
-        pieces = [p for p in connected(one.mesh, one.state == UNKNOWN, 4 * voxel) if p.area > LEAST_UNKNOWN]
+        pieces = [p for p in connected(one, one.state == UNKNOWN, 4 * voxel) if p.area > LEAST_UNKNOWN]
         out += [Change("unknown", None if number else p, p if number else None, 1.0) for p in pieces]
     return out
 

@@ -72,7 +72,9 @@ def align_maps(
     tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
     center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation
     for _ in range(MAX_ITERATIONS):
-        rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
+        in_a = _rows(a, np.eye(4), of_b, transformed(T_a_b, of_b.points), exposure, of_a=False)
+        in_b = _rows(b, se3.inverse(T_a_b), of_a, of_a.points, exposure, of_a=True)
+        rows = _Rows(*(np.concatenate(both) for both in zip(in_a, in_b, strict=True)))
         if len(rows.distance) < MIN_POINTS:
             return SdfAlignment(T_a_b, False, residual, 0.0, center)
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
@@ -113,40 +115,32 @@ class _Rows:
     shade_a: NDArray[np.float64]
     shade_b: NDArray[np.float64]
 
-    def joined(self, other: "_Rows") -> "_Rows":
-        names = self.__dataclass_fields__
-        return _Rows(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
+def _rows(
+    other: TsdfVolume,
+    T_other_a: NDArray[np.float64],
+    surface: SurfacePoints,
+    points: NDArray[np.float64],
+    exposure: tuple[float, float],
+    *,
+    of_a: bool,
+) -> tuple[NDArray[np.float64], ...]:
+    """Fields of ``_Rows`` of one surface, with points (n, 3) in the world of a, in the other map.
 
-def _rows_in_a(a: TsdfVolume, of_b: SurfacePoints, T_a_b: NDArray[np.float64], exposure: tuple[float, float]) -> _Rows:
-    """Residuals of the surface of b in map a: ``p_a = T_a_b p_b`` moves by ``v + omega x p_a``."""
-    points = transformed(T_a_b, of_b.points)
-    near, lit, sdf, slope, shade_a, shade_slope = _near(a, of_b, points)
-    shade_b = of_b.intensity[lit].astype(np.float64)
-    shade = shade_a - exposure[0] * shade_b - exposure[1]
-    J, J_shade = _twist_rows(points[near], slope), _twist_rows(points[lit], shade_slope)
-    return _Rows(points[near], sdf, J, shade, J_shade, shade_a, shade_b)
-
-
-def _rows_in_b(b: TsdfVolume, of_a: SurfacePoints, T_a_b: NDArray[np.float64], exposure: tuple[float, float]) -> _Rows:
-    """Residuals of the surface of a in map b: ``p_b = T_a_b^-1 p_a`` moves by ``-R_b_a (v + omega x p_a)``."""
-    points = of_a.points
-    near, lit, sdf, slope, shade_b, shade_slope = _near(b, of_a, transformed(se3.inverse(T_a_b), points))
-    shade_a = of_a.intensity[lit].astype(np.float64)
-    shade = exposure[0] * shade_b + exposure[1] - shade_a
-    R_a_b = T_a_b[:3, :3]
-    J, J_shade = -_twist_rows(points[near], slope @ R_a_b.T), -_twist_rows(points[lit], shade_slope @ R_a_b.T)
-    return _Rows(points[near], sdf, J, shade, exposure[0] * J_shade, shade_a, shade_b)
-
-
-def _near(volume: TsdfVolume, surface: SurfacePoints, points: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Which points (n,) lie near the surface of a map, and which of them have intensities in both; distance and its
-    gradient of the former, intensity and its gradient of the latter."""
-    samples = sample_map(volume, points)
-    near = (samples.state == OBSERVED) & (np.abs(samples.sdf) < IN_BAND * volume.truncation)
+    Points of b move by ``v + omega x p`` in map a; map b moves so against the points of a.
+    """
+    samples, (gain, offset) = sample_map(other, transformed(T_other_a, points)), exposure
+    near = (samples.state == OBSERVED) & (np.abs(samples.sdf) < IN_BAND * other.truncation)
     lit = near & (samples.intensity > 0) & (surface.intensity > 0)
-    values = samples.sdf[near], samples.sdf_gradient[near], samples.intensity[lit], samples.intensity_gradient[lit]
-    return near, lit, *(value.astype(np.float64) for value in values)
+    sdf, there, own = (
+        x.astype(np.float64) for x in (samples.sdf[near], samples.intensity[lit], surface.intensity[lit])
+    )
+    R_other_a = T_other_a[:3, :3]
+    J = _twist_rows(points[near], samples.sdf_gradient[near].astype(np.float64) @ R_other_a)
+    J_shade = _twist_rows(points[lit], samples.intensity_gradient[lit].astype(np.float64) @ R_other_a)
+    if of_a:
+        return points[near], -sdf, J, own - gain * there - offset, gain * J_shade, own, there
+    return points[near], sdf, J, there - gain * own - offset, J_shade, there, own
 
 
 def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:

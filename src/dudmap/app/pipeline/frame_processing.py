@@ -35,7 +35,7 @@ def process_source(
         record.dropped += source.dropped
     if isinstance(read.frame, FrameError):
         record.skip(read.frame)
-        display.note(f"skipped: {read.frame}")
+        display.skip(read.frame)
         for observer in observers:
             observer.event("unreadable", frame=index, reason=str(read.frame))
         return
@@ -52,7 +52,7 @@ def process_source(
         result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
     except FrameError as error:
         record.skip(error)
-        display.note(f"skipped: {error}")
+        display.skip(error)
         return
     end = time.perf_counter()
     if record.masked is not None:

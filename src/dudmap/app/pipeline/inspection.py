@@ -44,6 +44,8 @@ LATE = 0.015
 """Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
 RUN = 6
 """Number of frames in a row that are compared with each other at every sampled place."""
+TUM_ENDED = 1356998400.0
+"""The year 2013, seconds since 1970: what is named as in TUM RGB-D but was taken later is of another camera."""
 SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
 """Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
 USUAL = (0.4, 8.0)
@@ -168,7 +170,7 @@ def inspect(
     )
     found.warnings = [
         *_focal_warnings(sequence, found.sources),
-        *_depth_warnings(found, readings),
+        *_depth_warnings(found, readings, "depth_unit" in getattr(sequence, "options", ("depth_unit",))),
         *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
@@ -195,7 +197,7 @@ def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
     return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > limit)]
 
 
-def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> Iterator[str]:
+def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_open: bool) -> Iterator[str]:
     if found.unreadable:
         yield f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
     if found.median_depth is None:
@@ -203,7 +205,9 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> Iterato
         return
     median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
     implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
-    if implausible or not NEAR <= median <= FAR:
+    if (implausible or not NEAR <= median <= FAR) and not unit_is_open:
+        yield f"nine tenths of the readings lie from {near:.2g} to {far:.2g} m, which depth cameras hardly measure"
+    elif implausible or not NEAR <= median <= FAR:
         units = median * found.depth_scale
         fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
         proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
@@ -248,6 +252,11 @@ def _focal_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[s
     intrinsics = sources.get("intrinsics", "")
     if not intrinsics.endswith(BY_NAME) or sequence.calibration is not None:
         return
+    if "TUM" in intrinsics and sequence.timestamps[0] > TUM_ENDED:
+        yield (
+            f"the camera is {intrinsics}, but the images were taken after that data set: give --camera, or an "
+            "intrinsics.txt"
+        )
     error, fx = focal_error(sequence), sequence.camera.fx
     if error is not None and abs(error - 1) >= WRONG:
         yield (

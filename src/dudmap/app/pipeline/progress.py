@@ -13,6 +13,7 @@ from dudmap.app.terminal import plain_console
 
 if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
+    from dudmap.errors import FrameError
 
 FIGURES = (
     ("  dropped", "dropped", "{}", 1),
@@ -61,7 +62,7 @@ class RunProgress:
         )
         self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="starting")
         self._times: deque[float] = deque(maxlen=30)
-        self._lost = 0
+        self._lost = self._skipped = 0
         self._said: set[str] = set()
 
     def __enter__(self) -> "RunProgress":
@@ -73,6 +74,9 @@ class RunProgress:
 
     def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
         """Show a processed frame and the number of frames that a live run has dropped so far."""
+        if self._skipped > 1:
+            self.note(f"frame {index}: readable again, {self._skipped} skipped")
+        self._skipped = 0
         if result.state == "lost":
             if self._lost == 0:
                 self.note(f"frame {index}: lost, {result.lost_reason}")
@@ -92,6 +96,12 @@ class RunProgress:
             dynamic=result.dynamic_share,
             state=state,
         )
+
+    def skip(self, error: "FrameError") -> None:
+        """Report the first of the frames in a row that cannot be read or used."""
+        if self._skipped == 0:
+            self.note(f"skipped: {error}")
+        self._skipped += 1
 
     def note(self, sentence: str) -> None:
         """Print a sentence above the bar."""

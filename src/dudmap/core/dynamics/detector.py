@@ -26,7 +26,7 @@ from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
-from dudmap.core.frames.observation import Level, exposed
+from dudmap.core.frames.observation import Level, Pyramid, exposed
 from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
@@ -44,6 +44,8 @@ COUPLING = 4
 outvote it; the sum of both is the range of the mean field's hyperbolic tangent."""
 SWEEPS = 4
 """Sweeps of the mean field over the image."""
+MAPPED_SHARE = 0.3
+"""Share of what moves in a segment that must lie on the map for the map to decide about the rest, too."""
 MIN_REGION = 0.0008
 """Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
 EROSION, DILATION, FLOOD_STEP = 15 / 640, 10 / 640, 0.007
@@ -103,24 +105,25 @@ class DynamicDetector(Stateful):
         self.memory = TemporalMemory(config)
         self.background = BackgroundModel(config)
 
-    def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
-        """Begin to segment the surface an image shows; needs no map.
+    def segment(self, levels: Callable[[], Pyramid], voxel_size: float, *, now: bool) -> Callable[[], Segmentation]:
+        """Segments of the surface an image shows; needs no map.
 
         Args:
-            level: The image, at the resolution of the labels.
+            levels: Returns the pyramid of the image.
             voxel_size: Edge of the map's voxels, metres.
+            now: Begin to compute them in another thread, where the configuration needs them.
 
         Returns:
-            A function that waits for the segmentation. It is computed in another thread, or, where the configuration
-            does not need it, when the function is first called.
+            A function that waits for the segmentation, or computes it when it is first called.
         """
 
         def compute() -> Segmentation:
+            level = levels().labelled
             return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
-        return cache(submit(compute) if needed else compute)
+        return cache(submit(compute) if now and needed else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
         """Begin with the first frame of a map, of which no pixel is known to move.
@@ -263,16 +266,18 @@ class DynamicDetector(Stateful):
         """Pixels (h, w) that images show to move, but whose segment stands where the map has it (``stand_still``).
 
         Corners go astray on silhouettes, in blur and on patterns that repeat. What of the moving part of a segment lies
-        on the map decides for all of it: the rest has come into view. Not to be asked about slow motion: the map may be
-        as young as that.
+        on the map decides for all of it: the rest has come into view. Less than MAPPED_SHARE of it says nothing. Not to
+        be asked about slow motion: the map may be as young as that.
         """
         sample, (gain, offset) = frame.sample, frame.exposure
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))
         difference = sample.difference + (np.float32(1 - gain) * frame.level.intensity - np.float32(offset))
         difference[np.isnan(difference)] = 0  # a surface without a colour
         segments = segmentation.with_noise(frame.sigma, self.config.noise_threshold / 3)
-        still = np.arange(segments.count + 1) > 0
-        stand_still(segments, moving & (sample.occupancy == SURFACE), distance, difference, still)
+        mapped = moving & (sample.occupancy == SURFACE)
+        known, asked = (np.bincount(segments.labels[mask], minlength=segments.count + 1) for mask in (mapped, moving))
+        still = (np.arange(segments.count + 1) > 0) & (known > MAPPED_SHARE * asked)
+        stand_still(segments, mapped, distance, difference, still)
         return moving & still[segments.labels]
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:

@@ -85,7 +85,7 @@ class ColorMotion(Stateful):
 
     def start(self, view: FrameView) -> None:
         """A map was made of this frame, whose velocity is not known yet."""
-        self._is_first = not self.is_prepared(view.observation) or self._depth_readout != 0
+        self._is_first = not self.is_prepared(view.observation) or self.rectifies
 
     def first_frame(
         self, first: FrameView | None, timestamp: float, T_world_camera: NDArray[np.float64]
@@ -139,6 +139,11 @@ class ColorMotion(Stateful):
             return True
         return calibration is self.given and calibration.is_instant(observation.color_offset)
 
+    @property
+    def rectifies(self) -> bool:
+        """Whether the depth images have a rolling shutter to be taken out."""
+        return self._depth_readout != 0
+
     def rectified(self, observation: Observation, velocity: NDArray[np.float64] | None = None) -> Observation:
         """A frame at the time of its middle row; itself where all rows are taken at once.
 
@@ -147,7 +152,7 @@ class ColorMotion(Stateful):
             velocity: (6,) twist of the camera per second; None for that so far.
         """
         velocity = self.motion.velocity if velocity is None else velocity
-        if self._depth_readout == 0 or not velocity.any():
+        if not (self.rectifies and velocity.any()):
             return observation
         return rectified(observation, self._depth_readout, velocity, with_color=self.is_prepared(observation))
 
@@ -193,7 +198,7 @@ class ColorMotion(Stateful):
         def segmentation() -> Segmentation:
             return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
 
-        return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)
+        return replace(view, levels=lambda: pyramid, segmentation=segmentation, color_velocity=velocity)
 
 
 RESOLUTION = 0.5

@@ -66,7 +66,7 @@ class FrameView:
 
     Attributes:
         observation: Preprocessed images.
-        pyramid: Image pyramid of the observation.
+        levels: Returns the image pyramid of the observation.
         segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them.
         timer: Collects the processing time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
@@ -76,7 +76,7 @@ class FrameView:
     """
 
     observation: Observation
-    pyramid: Pyramid
+    levels: Callable[[], Pyramid]
     segmentation: Callable[[], Segmentation]
     timer: StageTimer = field(default_factory=StageTimer, metadata=CACHE)
     known_dynamic: NDArray[np.bool_] | None = None
@@ -87,6 +87,11 @@ class FrameView:
     def timestamp(self) -> float:
         """Time of the depth image, seconds."""
         return self.observation.timestamp
+
+    @property
+    def pyramid(self) -> Pyramid:
+        """Image pyramid of the observation."""
+        return self.levels()
 
     @property
     def labelled(self) -> Level:

@@ -154,6 +154,7 @@ READERS = (
     "phones:StrayScannerSequence",
     "phones:ArkitScenesSequence",
     "phones:PolycamSequence",
+    "phones:Record3DFolder",
     "numbered_folders:RedwoodSequence",
     "numbered_folders:EpflSequence",
     "numbered:BopSequence",
@@ -324,5 +325,5 @@ def _images_in(path: Path) -> str:
     return (
         f"{path} holds images in no known layout: recognised {' and '.join(known) or 'nothing'} by the names, missing "
         f"numbered {missing} images; there are {there}; name the files with --color PATTERN and --depth PATTERN, such "
-        f"as --depth '{places[0].name}/*.png'"
+        "as --depth 'FOLDER/*.png'"
     )

@@ -19,6 +19,7 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, open_plain, parse_json
 from dudmap.io.sequences import Recording, images, intrinsics
+from dudmap.io.sequences.phones import record3d_times
 
 SENS_VERSION = 4
 """The version of the format that ScanNet publishes."""
@@ -296,13 +297,9 @@ class Record3DRecording(Recording):
             fx, _, _, _, fy, _, cx, cy, _ = (float(number) for number in tree["K"])  # column by column
             color = Camera(fx, fy, cx, cy, int(tree["w"]), int(tree["h"]))
             size = int(tree["dw"]), int(tree["dh"])
-            stamps = tree.get("frameTimestamps") or [n / float(tree["fps"]) for n in range(max(self._numbers) + 1)]
-            times = np.array([stamps[number] for number in self._numbers], dtype=np.float64)
+            return color, size, np.array(record3d_times(tree, self._numbers, self.path))
         except DAMAGE as error:
             raise DatasetError(f"cannot understand the metadata of {self.path}: {error!r}") from None
-        if np.any(np.diff(times) <= 0):
-            raise DatasetError(f"the frame times in the metadata of {self.path} do not increase")
-        return color, size, times
 
 
 def largest_unpacked(packed: bytes) -> int:

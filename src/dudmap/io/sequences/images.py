@@ -17,6 +17,7 @@ from dudmap.core.geometry.association import LARGEST_GAP, associate
 from dudmap.core.geometry.camera import LARGEST_PIXELS, Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import damaged, load_array, read_bytes
+from dudmap.io.sequences import exr
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
@@ -43,7 +44,8 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
     """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages."""
     import cv2
 
-    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
+    raw = bytes(data)
+    image = exr.decode(raw, name) if raw.startswith(exr.MAGIC) else _decoded(data, name, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise FrameError(f"the depth image {name} has {image.shape[2]} channels; expected one with 16 bit or float")
     return metres(image, depth_scale, name)

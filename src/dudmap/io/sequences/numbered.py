@@ -118,9 +118,13 @@ def kinds_of_images(path: Path) -> dict[str, list[Path]]:
 
 
 def _sorted_out(path: Path) -> dict[str, list[Path]]:
-    """Colour and depth images among the files of one folder."""
+    """Colour and depth images among the files of one folder; ``0001.jpg`` is the colour of ``0001_depth.png``."""
     files = [file for file in sorted(path.iterdir()) if _is_numbered_image(file)]
-    return {kind: [file for file in files if _kind_of(file.stem) == kind] for kind in ("color", "depth")}
+    found = {kind: [file for file in files if _kind_of(file.stem) == kind] for kind in ("color", "depth")}
+    if not found["color"]:
+        alike = {re.sub(r"[\W_]*depth[\W_]*", "", file.stem, flags=re.IGNORECASE) for file in found["depth"]}
+        found["color"] = [file for file in files if file.stem in alike]
+    return found
 
 
 def _kind_of(name: str) -> str | None:

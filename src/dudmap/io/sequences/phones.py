@@ -1,4 +1,4 @@
-"""Recordings of phone applications: Stray Scanner, ARKitScenes, the raw data of Polycam, and nerfstudio's form.
+"""Recordings of phone applications: Stray Scanner, ARKitScenes, Polycam, exports of Record3D, nerfstudio's form.
 
 ARKit gives depth of 256x192 pixels that shows the view of the colour image, and the confidence of every reading, 0 for
 the lowest. Readings of confidence 0 are left out, as Polycam's documentation advises.
@@ -186,6 +186,46 @@ class PolycamSequence(ArkitFolder):
             T[:3] = [[float(tree[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
             poses.append((number / 1e6, T @ OPENGL_AXES))
         return rigid_trajectory(poses)
+
+
+class Record3DFolder(ImageFolder):
+    """Export of the application Record3D in images: ``rgb/N.jpg``, ``depth/N.exr`` (float metres) and metadata.json.
+
+    The metadata hold K of the colour images, column by column, and the times of the frames; their poses are estimates
+    of ARKit and no truth. Depth shows the view of the colour images and is smaller.
+    """
+
+    format = "Record3D images"
+    layout = ("metadata.json", "rgb/", "depth/*.exr")
+    color_files, depth_files = ("rgb", r"(\d+)\.(?:jpe?g|png)"), ("depth", r"(\d+)\.exr")
+    options = ()
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        super().__init__(path, camera)
+        self.sources["depth unit"] = "the format"
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        pairs, tree = super()._find_pairs(), read_json(self.path / "metadata.json")
+        stamps = record3d_times(tree, [int(depth.path.stem) for _, depth in pairs], self.path / "metadata.json")
+        self.timed = True
+        return [(TimedFile(t, c.path), TimedFile(t, d.path)) for t, (c, d) in zip(stamps, pairs, strict=True)]
+
+    def _find_intrinsics(self) -> Intrinsics:
+        K = read_json(self.path / "metadata.json")["K"]
+        return self._one_view([camera_values(K[0], K[4], K[6], K[7])], "metadata.json")
+
+
+def record3d_times(tree: dict[str, Any], numbers: list[int], source: Path) -> list[float]:
+    """Times in seconds of the frames with these numbers from Record3D's metadata.
+
+    Raises:
+        DatasetError: They do not increase.
+    """
+    stamps = tree.get("frameTimestamps") or [n / float(tree["fps"]) for n in range(max(numbers) + 1)]
+    times = [float(stamps[number]) for number in numbers]
+    if np.any(np.diff(times) <= 0):
+        raise DatasetError(f"the frame times in the metadata of {source} do not increase")
+    return times
 
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "")
