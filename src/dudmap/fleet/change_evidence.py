@@ -79,7 +79,8 @@ class Evidence:
         """Surface (V,) that each vertex stands for, square metres."""
         a, b, c = np.moveaxis(self.points[self.mesh.faces], 1, 0)
         thirds = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-        return np.bincount(self.mesh.faces.reshape(-1), np.repeat(thirds, 3), len(self.points))
+        corners = self.mesh.faces.reshape(-1)
+        return np.asarray(np.bincount(corners, np.repeat(thirds, 3), len(self.points)), np.float64)
 
     @cached_property
     def parts(self) -> NDArray[np.intp]:
