@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.consistency import measure_consistency
+from dudmap.lab.benchmark.consistency import Images, Motion, measure_consistency, pair_misfits
 
 GAPS = 2, 5, 15
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
@@ -66,3 +67,41 @@ def test_a_trajectory_of_another_recording_is_refused(room):
     true = room.ground_truth
     with pytest.raises(DatasetError, match="0 frames in common"):
         measure_consistency(room, {"other": Trajectory(true.timestamps + 1000, true.Ts_world_camera)})
+
+
+def test_a_rolling_shutter_of_the_depth_is_judged_at_the_times_of_its_rows():
+    readout, speed, wall = 0.03, 1.0, 2.0
+    tau = readout * ((np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5)
+    rolling = np.tile((wall - speed * tau)[:, None], (1, CAMERA.width)).astype(np.float32)
+    grey = np.full(CAMERA.shape, 0.5, np.float32)
+    first, second = Images(CAMERA, rolling, grey), Images(CAMERA, np.full(CAMERA.shape, wall, np.float32), grey)
+    forwards, rest = np.array([0, 0, speed, 0, 0, 0.0]), np.zeros(6)
+    known, unknown = Calibration(CAMERA, depth_readout=readout), Calibration(CAMERA)
+    wanted = 1000 * np.abs(speed * tau).mean() / wall**2
+    there = pair_misfits(first, second, [Motion(np.eye(4), (forwards, rest), each) for each in (known, unknown)])
+    back = pair_misfits(second, first, [Motion(np.eye(4), (rest, forwards), each) for each in (known, unknown)])
+    for found in (there[0], back[0]):
+        assert found[0] < 0.01
+        assert found[1] == pytest.approx(wanted, rel=0.03)
+
+
+def test_the_calibration_of_late_colours_with_vignetting_explains_their_intensities():
+    late: Any = synthetic.sequence(
+        "room", movers=[], frames=60, noise="kinect", seed=5, camera=CAMERA,
+        faults={"color_delay": 0.025, "color_readout": 0.02, "vignetting": 0.3},
+    )  # fmt: skip
+    true = Calibration(CAMERA, delay=0.025, readout=0.02, vignetting=-np.log(0.7))
+    poses = {"true": late.ground_truth, "as given": late.ground_truth}
+    found = measure_consistency(late, poses, GAPS, calibrations={"true": true})
+    assert found.excess(0, 1, 0) == pytest.approx((0, 0, 0), abs=1e-4)
+    share, low, _ = found.excess(1, 1, 0)
+    assert share > low > 0.2
+
+
+def test_poses_at_the_stamps_of_late_depth_images_are_judged_when_the_images_were_taken(room):
+    true = room.ground_truth
+    stamps = Trajectory(true.timestamps - 1 / 30, true.Ts_world_camera)
+    found = measure_consistency(
+        room, {"late": stamps, "true": true}, GAPS, calibrations={"late": Calibration(CAMERA, depth_late=1 / 30)}
+    )
+    assert found.excess(0, 0, 1)[0] == pytest.approx(0, abs=0.01)

@@ -11,9 +11,11 @@ from dudmap.app.pipeline.frame_source import read_ahead
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, DudmapError
+from dudmap.io.exporting.run_content import RunContent
 from dudmap.io.sequences import open_sequence
 from fake_slam import SECOND, FakeVolume
 from layouts import corbs, replica, write
@@ -205,6 +207,18 @@ def test_an_earlier_run_leaves_no_trace_in_the_folder(slam, recording, tmp_path)
     assert (out / "notes.txt").exists()
     assert not list(out.glob("*evaluation.json"))
     assert not list(out.glob("*error.p*"))
+
+
+def test_where_stamps_are_late_the_poses_of_the_images_are_kept_beside_those_at_the_stamps(slam, recording, tmp_path):
+    out = tmp_path / "out"
+    calibration = Calibration(open_sequence(recording).camera, depth_late=0.02)
+    go(recording, out, calibration=calibration)
+    wanted = 0.01 * np.arange(8)
+    at_stamps = Trajectory.load(out / "trajectory.txt").Ts_world_camera[:, 0, 3]
+    np.testing.assert_allclose(at_stamps, wanted + 0.002, atol=1e-8)  # 1 cm in 0.1 s
+    np.testing.assert_allclose(RunContent.load(out).trajectory.Ts_world_camera[:, 0, 3], wanted, atol=1e-8)
+    go(recording, out)
+    assert not (out / "image_poses.txt").exists()
 
 
 def test_neither_the_recording_nor_the_masks_given_are_overwritten(slam, recording, tmp_path):

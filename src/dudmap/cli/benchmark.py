@@ -1,5 +1,6 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -201,23 +202,32 @@ def consistency(
     trajectories: Annotated[
         list[Path] | None, Argument(help="Trajectories of it in TUM text, or folders of runs.")
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="calibration.toml for poses outside of run folders; default: the recording's."),
+    ] = None,
     max_frames: Annotated[int | None, Option(min=2, help="Number of frames from the start.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities."""
+    """Compare how well trajectories, and the published poses, explain a recording's own depth and intensities.
+
+    Each run is judged with the calibration of its folder: rolling shutters, delays, vignetting.
+    """
+    from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DatasetError
     from dudmap.io.exporting.run_content import RunContent
     from dudmap.lab.benchmark.consistency import measure_consistency
 
     source = reading.open(recording)
-    truth = {} if source.ground_truth is None else {"published": source.ground_truth}
-    found = truth | {
-        str(path): RunContent.load(path).trajectory if path.is_dir() else Trajectory.load(path)
-        for path in trajectories or []
-    }
-    if not found:
+    runs = {str(path): RunContent.load(path) for path in trajectories or [] if path.is_dir()}
+    found = {} if source.ground_truth is None else {"published": source.ground_truth}
+    found |= {str(path): Trajectory.load(path) for path in trajectories or [] if not path.is_dir()}
+    if not found and not runs:
         raise DatasetError(f"{recording} comes without poses; name the trajectories to compare, such as a run's folder")
-    result = measure_consistency(source, found, max_frames=max_frames)
+    cameras = {} if calibration is None else dict.fromkeys(found, Calibration.load(calibration))
+    found |= {name: run.trajectory for name, run in runs.items()}
+    cameras |= {name: replace(run.calibration, depth_late=0.0) for name, run in runs.items() if run.calibration}
+    result = measure_consistency(source, found, max_frames=max_frames, calibrations=cameras)
     low, high = result.intervals()
     answer(result._asdict() | {"means": result.means(), "low": low, "high": high}, result.table(), as_json=as_json)

@@ -38,8 +38,8 @@ LOCKED_BYTE = 1 << 20
 """Place of the locked byte on Windows, behind the text, which others must be able to read."""
 
 FILES = (
-    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
+    "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
+    "timings.csv", "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
     "merge.json", "report.html", "changes.jsonl",
 )  # fmt: skip
 SCORES = (
@@ -226,6 +226,8 @@ def write_run_folder(
         lambda: record.save_residuals(out / "residuals.npz"),
         lambda: record.save_movers(out / "movers.jsonl"),
     ]
+    if calibration.depth_late:
+        steps.append(lambda: maps[0][0].save(out / "image_poses.txt"))
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))

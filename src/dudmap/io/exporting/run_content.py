@@ -75,8 +75,8 @@ class RunContent:
     @cached_property
     def trajectory(self) -> Trajectory:
         """Poses at which the depth images of the tracked frames were taken."""
-        late = 0.0 if self.calibration is None else self.calibration.depth_late
-        return Trajectory.load(self.folder / "trajectory.txt").after(-late)
+        taken = self.folder / "image_poses.txt"
+        return Trajectory.load(taken if taken.is_file() else self.folder / "trajectory.txt")
 
     @cached_property
     def mesh(self) -> Mesh | None:

@@ -2,13 +2,15 @@
 
 A frame seen from the pose of another one must show the depth and the intensities measured there. Trajectories are
 compared on the same pixels of the same pairs of frames, so that what no pose explains, such as noise, movers and
-occlusion, concerns them all alike.
+occlusion, concerns them all alike. Each goes with a calibration of the cameras: the images stay as they were recorded,
+and a point reaches them by the pose, the velocity and the row times that both imply.
 
 Trajectories with too few frames of the recording in common are a ``DatasetError``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as List
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +18,15 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import fit_exposure
-from dudmap.core.frames.observation import Level, Pyramid, reduced
+from dudmap.core.calibration.keyframes import MAX_GAP, central_velocity, halvings_to
+from dudmap.core.frames.color_registration import recorded_intensity
+from dudmap.core.frames.observation import Pyramid, reduced
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import LARGEST_GAP
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.lens import Lens
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.io.sequences import Sequence
@@ -38,8 +45,16 @@ SMOOTH = 0.05
 """Largest step of the depth to a neighbour, as a share of it, of a surface that is interpolated."""
 TEXTURED = 0.02
 """Smallest gradient of the intensity (0..1) per pixel."""
+BLUR = 1.0
+"""Standard deviation of the Gaussian that smooths the intensities, pixels: else interpolation, which only calibrated
+colours need, would take noise from them."""
+ROW_STEPS = 3
+"""Steps of the fixed point that gives the row, and with it the time, at which a point was recorded; each leaves
+of the error readout times the image speed over the height, a tenth at most."""
 FEWEST = 200
 """Pixels that a pair must have in common; else it is left out, or its intensities are."""
+ROUNDING = 1e-4
+"""Share by which misfits differ by rounding."""
 SAMPLES, LEAST_BLOCKS = 2000, 3
 """Samples of the bootstrap, and stretches of the recording that it needs."""
 
@@ -91,7 +106,7 @@ class Consistency(NamedTuple):
             best = int(np.argmin(np.log(np.maximum(self.means()[term], 1e-9)).sum(axis=0)))
             for other in (k for k in range(len(self.names)) if k != best):
                 share, low, high = self.excess(term, other, best)
-                outcome = "{} is worse than {} by" if low > 0 else "{} and {} are undecided:"
+                outcome = "{} is worse than {} by" if low > ROUNDING else "{} and {} are undecided:"
                 named = outcome.format(self.names[other], self.names[best])
                 sentences.append(f"{name}: {named} {share:.1%} ({low:.1%} to {high:.1%})")
         return sentences
@@ -106,17 +121,54 @@ class Consistency(NamedTuple):
         return grid(head, rows, words=1) + "\n" + "\n".join(f"- {sentence}" for sentence in self.verdicts())
 
 
+class Images(NamedTuple):
+    """A frame as it was recorded.
+
+    Attributes:
+        camera: Of the depth.
+        depth: (h, w) float32, metres, 0 where there is no reading or something is known to move.
+        intensity: (hc, wc) float32, 0..1, of the colour image.
+        color_offset: Time stamp of the colour image minus that of the depth image, seconds.
+    """
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    color_offset: float = 0.0
+
+
+class Motion(NamedTuple):
+    """How a trajectory and its calibration relate two frames.
+
+    Attributes:
+        T_second_first: (4, 4) of the depth cameras at the times of the middle rows.
+        velocities: (6,) twists per second of both frames, camera axes.
+        calibration: Of the cameras.
+    """
+
+    T_second_first: NDArray[np.float64]
+    velocities: tuple[NDArray[np.float64], NDArray[np.float64]]
+    calibration: Calibration
+
+
 def measure_consistency(
     sequence: Sequence,
     trajectories: Mapping[str, Trajectory],
     gaps: tuple[int, ...] = GAPS,
     max_frames: int | None = None,
+    calibrations: Mapping[str, Calibration] | None = None,
 ) -> Consistency:
     """Compare pairs of frames of a recording, as trajectories relate them; known dynamic pixels and gaps too long for
-    the recording are left out.
+    the recording are left out. Trajectories without one of the ``calibrations`` go with that of the recording; their
+    poses are those at the stamps of the depth images, which are ``depth_late``.
     """
-    stamps = sequence.timestamps[:max_frames]
-    found = (((n, _pose(each, t)) for n, t in enumerate(stamps)) for each in trajectories.values())
+    stamps, given = sequence.timestamps[:max_frames], sequence.calibration or Calibration.registered(sequence.camera)
+    cameras = [(calibrations or {}).get(name, given) for name in trajectories]
+    late = [calibration.depth_late for calibration in cameras]
+    found = (
+        ((n, _pose(each, t - seconds)) for n, t in enumerate(stamps))
+        for each, seconds in zip(trajectories.values(), late, strict=True)
+    )
     poses = [{n: T for n, T in each if T is not None} for each in found]
     known = [n for n in range(len(stamps)) if all(n in each for each in poses)]
     least = min(gaps)
@@ -131,22 +183,28 @@ def measure_consistency(
     config, every = Config(), max(1, len(stamps) // PAIRS)
     preprocess = Preprocessor(sequence.camera, config.preprocess, calibration=sequence.calibration)
     misfits, counts = np.zeros((2, len(gaps), blocks, len(poses))), np.zeros((2, len(gaps), blocks))
-    views: dict[int, Level] = {}
+    views: dict[int, Images] = {}
 
-    def view(n: int) -> Level:
+    def view(n: int) -> Images:
         if n not in views:
-            level = Pyramid.of(preprocess(sequence[n]), preprocess.camera, config).fine
+            observation = preprocess(sequence[n])
+            level = Pyramid.of(observation, preprocess.camera, config).fine
             mask = sequence.mask(n)
             depth = level.depth if mask is None else np.where(reduced(preprocess.mask(mask), level), 0, level.depth)
-            views[n] = Level(level.camera, depth.astype(np.float32), level.intensity)
+            grey = recorded_intensity(observation, halvings_to(level.camera.width, given.camera))
+            views[n] = Images(level.camera, depth.astype(np.float32), _smoothed(grey), observation.color_offset)
         return views[n]
+
+    def motion(k: int, n: int, m: int) -> Motion:
+        first, second = (_velocity(poses[k], stamps, number) for number in (n, m))
+        return Motion(se3.inverse(poses[k][m]) @ poses[k][n], (first, second), cameras[k])
 
     shared = set(known)
     for n in known[::every]:
-        views = {number: level for number, level in views.items() if number >= n}
+        views = {number: images for number, images in views.items() if number >= n}
         for g, gap in enumerate(gaps):
             if n + gap in shared:
-                motions = [se3.inverse(each[n + gap]) @ each[n] for each in poses]
+                motions = [motion(k, n, n + gap) for k in range(len(poses))]
                 pair, block = pair_misfits(view(n), view(n + gap), motions), min((n - known[0]) // length, blocks - 1)
                 usable = np.isfinite(pair[:, 0])
                 misfits[usable, g, block] += pair[usable]
@@ -154,39 +212,108 @@ def measure_consistency(
     return Consistency(list(trajectories), gaps, misfits, counts)
 
 
-def pair_misfits(first: Level, second: Level, motions: List[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Mean misfits (2, k) of the depth (mm at 1 m) and the intensity (of 255) of two images on the same pixels, for k
-    motions (4, 4) from the first camera to the second; NaN where the images have too little in common."""
+def pair_misfits(first: Images, second: Images, motions: List[Motion]) -> NDArray[np.float64]:
+    """Mean misfits (2, k) of the depth (mm at 1 m) and the intensity (of 255) of two frames on the same pixels, for k
+    motions; NaN where the images have too little in common."""
     import cv2
 
-    camera, near, z = first.camera, np.ones((3, 3), np.uint8), first.depth
-    height, width = z.shape
-    rays = np.meshgrid((np.arange(width) - camera.cx) / camera.fx, (np.arange(height) - camera.cy) / camera.fy)
-    points = np.stack([*rays, np.ones_like(rays[0])]).astype(np.float32) * z
+    shape, near = first.depth.shape, np.ones((3, 3), np.uint8)
+    recorded = first.camera.backproject(first.depth).reshape(-1, 3).T
+    row_times = np.repeat((np.arange(shape[0]) + 0.5) / shape[0] - 0.5, shape[1]).astype(np.float32)
     step = cv2.dilate(second.depth, near) - cv2.erode(second.depth, near)
     smooth = ((cv2.erode(second.depth, near) > 0) & (step < SMOOTH * second.depth)).astype(np.float32)
-    gaps, differences, valid = [], [], z > 0
-    for T in motions:
-        x, y, depth = np.tensordot(T[:3, :3].astype(np.float32), points, 1) + T[:3, 3, None, None].astype(np.float32)
-        ahead = np.maximum(depth, np.float32(1e-3))
-        us = (x / ahead * camera.fx + camera.cx).astype(np.float32)
-        vs = (y / ahead * camera.fy + camera.cy).astype(np.float32)
-        images = second.depth, second.intensity, smooth
-        seen, grey, surface = (np.asarray(cv2.remap(image, us, vs, cv2.INTER_LINEAR)) for image in images)
+    gaps, greys, differences = [], [], []
+    valid, colored = first.depth > 0, np.ones(shape, dtype=bool)
+    for T, velocities, calibration in motions:
+        points = _moving(recorded, velocities[0])(np.float32(calibration.depth_readout) * row_times)
+        there = _moved(T, points)
+        shutter = Calibration(second.camera, depth_readout=calibration.depth_readout)
+        pixels, depth = _seen(there, shutter, velocities[1], 0.0)
+        seen, surface = (_sampled(image, pixels, shape) for image in (second.depth, smooth))
+        depth = depth.reshape(shape)
         valid &= (surface > 0.999) & (depth > 0)
-        gaps.append(np.minimum(np.abs(seen - depth) / ahead**2, WORST_DEPTH))
-        differences.append(grey - first.intensity)
+        gaps.append(np.minimum(np.abs(seen - depth) / np.maximum(depth, 1e-3) ** 2, WORST_DEPTH))
+        grey, brightness = _shades(first, points, calibration, velocities[0])
+        other, other_brightness = _shades(second, there, calibration, velocities[1])
+        colored &= np.isfinite(grey + other)
+        greys.append(grey * other_brightness / brightness)
+        differences.append(other - greys[-1])
     static = valid & (np.min(gaps, axis=0) < WORST_DEPTH)
-    textured = static & (np.linalg.norm(np.gradient(first.intensity), axis=0) > TEXTURED)
+    slopes = np.linalg.norm(np.gradient(np.mean(greys, axis=0)), axis=0)
+    textured = static & colored & (slopes > TEXTURED)  # slopes beside the image are NaN
     out = np.full((2, len(motions)), np.nan)
     if np.count_nonzero(static) >= FEWEST:
         out[0] = [1000 * gap[static].mean() for gap in gaps]
     if np.count_nonzero(textured) >= FEWEST:
-        for k, difference in enumerate(differences):
-            gain, offset = fit_exposure(first.intensity, difference, textured.astype(np.float32))
-            error = difference + np.float32(1 - gain) * first.intensity - np.float32(offset)
+        for k, (grey, difference) in enumerate(zip(greys, differences, strict=True)):
+            gain, offset = fit_exposure(grey, difference, textured.astype(np.float32))
+            error = difference + np.float32(1 - gain) * grey - np.float32(offset)
             out[1, k] = 255 * np.minimum(np.abs(error[textured]), WORST_INTENSITY).mean()
     return out
+
+
+def _moved(T: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Points (3, n) after a rigid motion (4, 4)."""
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3:].astype(np.float32)
+    return R @ points + t
+
+
+def _moving(
+    points: NDArray[np.floating], velocity: NDArray[np.float64]
+) -> Callable[[NDArray[np.float32]], NDArray[np.floating]]:
+    """Points exp(tau xi) X as a function of tau (n,) in seconds, of points X (3, n), to the second order."""
+    turn, shift = se3.hat(velocity[3:]).astype(np.float32), velocity[:3, None].astype(np.float32)
+    speed = turn @ points + shift
+    bend = np.float32(0.5) * turn @ speed
+    return lambda tau: points + tau * (speed + tau * bend)
+
+
+def _seen(
+    points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64], offset: float
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Pixels (n, 2) at which a camera beside the depth camera recorded points (3, n) of the latter, and their depths
+    (n,) there. See ``Calibration``; ``offset`` is the difference of the time stamps."""
+    camera, at = calibration.camera, _moving(points, velocity)
+    readout, delay = calibration.depth_readout + calibration.readout, np.float32(offset + calibration.delay)
+    seen = _moved(calibration.T_color_depth, at(np.full(points.shape[1], -delay)))
+    for _ in range(ROW_STEPS if readout else 0):
+        rows = np.clip(camera.fy * seen[1] / np.maximum(seen[2], np.float32(1e-3)) + camera.cy, 0, camera.height)
+        tau = delay + readout * ((rows + 0.5) / camera.height - 0.5)
+        seen = _moved(calibration.T_color_depth, at(-tau.astype(np.float32)))
+    return Lens(camera).project(seen.T.astype(np.float64))
+
+
+def _shades(
+    images: Images, points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Intensities (h, w) of points (3, h * w) in the colour image, NaN outside of it, and what vignetting leaves."""
+    height, width = images.intensity.shape
+    camera = calibration.camera.resized(width, height)
+    pixels, _ = _seen(points, replace(calibration, camera=camera), velocity, images.color_offset)
+    corner = np.array([width - 1, height - 1]) / 2
+    squares = np.sum((pixels - corner) ** 2, axis=1) / np.sum(corner**2)
+    brightness = np.exp(-calibration.vignetting * squares).astype(np.float32)
+    return _sampled(images.intensity, pixels, images.depth.shape), brightness.reshape(images.depth.shape)
+
+
+def _sampled(image: NDArray[np.float32], pixels: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Values (h, w), a shape, between the pixels of an image at places (h * w, 2), NaN outside of it."""
+    import cv2
+
+    us, vs = pixels.T.reshape(2, *shape)
+    return np.asarray(cv2.remap(image, us, vs, cv2.INTER_LINEAR, borderValue=np.nan), np.float32)
+
+
+def _smoothed(intensity: NDArray[np.float32]) -> NDArray[np.float32]:
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(intensity, (0, 0), BLUR), np.float32)
+
+
+def _velocity(poses: Mapping[int, NDArray[np.float64]], stamps: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Twist (6,) per second of frame ``n`` from the poses around it; 0 where these are not near."""
+    first, last = (m if m in poses and abs(stamps[m] - stamps[n]) <= MAX_GAP / 2 else n for m in (n - 1, n + 1))
+    return central_velocity((stamps[first], poses[first]), (stamps[last], poses[last]))
 
 
 def _pose(trajectory: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
