@@ -2,20 +2,21 @@
 
 from collections import deque
 
+import cv2
 import numpy as np
 import pytest
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu import labeling
 from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
+from dudmap.core.backends.device import make_backend
+from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Mixture, fit_mixture
-<<<<<<< HEAD
 from dudmap.core.dynamics.segments import segment
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Level
-=======
->>>>>>> parent of 9478a289 (A segment of which the map has only a fringe is not called static by it)
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
 from dudmap.lab.benchmark.suites import systems
@@ -135,7 +136,6 @@ def test_every_method_runs_and_none_labels_nothing(recording):
     assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028", step=2) > 0.1
     assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false", step=2) > 0.05
     assert overlap(recording, "dynamics.method=none", step=2) == 0.0
-<<<<<<< HEAD
 
 
 @pytest.mark.parametrize(("rows", "stands"), [(6, False), (45, True)])
@@ -162,5 +162,3 @@ def test_the_map_decides_about_what_images_show_to_move_only_where_it_has_enough
     inside[:40] = False  # beside the border of what the map has
     assert np.mean(labels.dynamic[inside]) == pytest.approx(0.0 if stands else 1.0, abs=0.05)
     assert not labels.dynamic[~person].any()
-=======
->>>>>>> parent of 9478a289 (A segment of which the map has only a fringe is not called static by it)
