@@ -10,6 +10,7 @@ import pytest
 from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
+from dudmap.core.calibration.depth_readout import lowest_readout
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.core.calibration.keyframes import KeyframeCollector, keyframe
 from dudmap.core.calibration.vignetting import Brightness
@@ -144,6 +145,30 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
         assert not result.calibration.estimated
         assert result.calibration.is_registered(CAMERA)
     assert np.all(np.isfinite(result.calibration.sigma))
+
+
+def test_what_is_not_proven_is_as_uncertain_as_the_images_say(monkeypatch):
+    monkeypatch.setattr("dudmap.core.calibration.estimator.EVIDENCE", np.inf)
+    truth, frames = recorded("lens and timing")
+    found = estimate(frames).calibration
+    assert not found.estimated
+    error = np.abs(found.step_to(truth))
+    assert np.all(error < 3 * found.sigma)
+    assert found.sigma[PARAMETERS.index("delay")] > 0.01  # of 15 ms that are missing
+
+
+def test_no_readout_is_longer_than_a_frame():
+    def lowest(a: float, b: float) -> float:
+        return lowest_readout({r: a * r * r + b * r for r in (-0.02, 0.0, 0.02)}, 0.03)
+
+    assert lowest(100, -4) == pytest.approx(0.02)
+    assert lowest(100, -10) == 0.03  # the vertex is at 50 ms
+    assert (lowest(-100, -1), lowest(-100, 1)) == (0.03, -0.03)  # the better end where the costs have no minimum
+    collector = KeyframeCollector(GIVEN)
+    for index in range(3):
+        observation = Preprocessor(CAMERA, PreprocessConfig(filter="none"))(recorded("as given")[1][index])
+        collector.add(observation, pose(index / FPS), np.zeros(CAMERA.shape, bool))
+    assert collector.keyframes[0].interval == pytest.approx(1 / FPS)
 
 
 @pytest.mark.parametrize(("name", "vignetting"), zip(STEPS, (0.1, 0.5, 0.3, 0.2, 0.4), strict=True))

@@ -14,7 +14,7 @@ from dudmap.core.geometry.calibration import Calibration
 STEP = 0.02
 """Readouts of this size, both ways, are compared with none, seconds: sensors at 30 Hz take 10 to 33 ms."""
 LONGEST = 0.05
-"""Longest readout that is believed, seconds."""
+"""Longest readout that is believed where frames are rare, seconds; no image takes longer than the next one to come."""
 
 
 def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe:
@@ -36,7 +36,7 @@ class ReadoutSearch:
 
     The colour camera's own delay and readout, which look much alike, and the poses of the frames are fitted to each
     readout. The cost is nearly quadratic: its minimum is that of the parabola through three readouts, and then once
-    more of that through the nearest three.
+    more of that through the nearest three, none longer than the interval between frames.
 
     Args:
         pairs: Of keyframes.
@@ -55,11 +55,15 @@ class ReadoutSearch:
     ) -> None:
         self._pairs, self._given, self._adjustment, self._stride = pairs, given, adjustment, stride
         self._free = free
-        fitted = {readout: self._fitted(readout) for readout in {-STEP, 0.0, STEP, given.depth_readout}}
-        near = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
-        fitted[near] = self._fitted(near)
-        lowest = _vertex({readout: cost for readout, (cost, _) in fitted.items()})
-        self.given, self.best = fitted[given.depth_readout][1], self._fitted(lowest)[1]
+        intervals = [frame.interval for pair in pairs for frame in (pair.first, pair.second)]
+        longest = min(LONGEST, float(np.median(intervals)))
+        step = min(STEP, longest)
+        fitted = {readout: self._fitted(readout) for readout in {-step, 0.0, step, given.depth_readout}}
+        for _ in range(2):
+            lowest = lowest_readout({readout: cost for readout, (cost, _) in fitted.items()}, longest)
+            fitted[lowest] = self._fitted(lowest)
+        self.given = fitted[given.depth_readout][1]
+        self.best = min(fitted.values(), key=lambda each: each[0])[1]
 
     def _fitted(self, readout: float) -> tuple[float, Calibration]:
         """Mean cost with a readout in seconds, and the calibration with the timing of the colours that goes with it."""
@@ -80,11 +84,11 @@ class ReadoutSearch:
         return PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)
 
 
-def _vertex(costs: dict[float, float]) -> float:
-    """Minimum of the parabola through the three readouts around the best one, by mean cost."""
+def lowest_readout(costs: dict[float, float], longest: float) -> float:
+    """Minimum, up to ``longest`` both ways, of the parabola through the three readouts around the best one."""
     readouts = np.array(sorted(costs))
     values = np.array([costs[readout] for readout in readouts.tolist()])
     middle = min(max(int(values.argmin()), 1), len(values) - 2)
     a, b, _ = np.polyfit(readouts[middle - 1 : middle + 2], values[middle - 1 : middle + 2], 2)
-    lowest = -b / (2 * a) if a > 0 else readouts[values.argmin()]
-    return float(np.clip(lowest, -LONGEST, LONGEST))
+    lowest = -b / (2 * a) if a > 0 else -np.copysign(longest, b)
+    return float(np.clip(lowest, -longest, longest))

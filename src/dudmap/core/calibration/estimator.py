@@ -129,7 +129,8 @@ class CalibrationEstimator:
     values. The covariance is a sandwich with one score per frame, the sum of those of its pairs: it admits that the
     pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
     for pairs counted twice). What both halves of the time differ by beyond that, such as by a bent depth image, makes
-    all standard deviations larger (Birge 1932).
+    all standard deviations larger (Birge 1932). How far a fit of all parameters is from those in use is added: given
+    values stay until others are proven, however wrong they may be, and bend those that are estimated beside them.
 
     ``given`` is the calibration as given; 2 ``workers`` (threads) do both halves of the time at once.
     """
@@ -166,7 +167,12 @@ class CalibrationEstimator:
 
     def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
         """Readout of the depth in seconds, as given where another one is not proven, its standard deviation, the
-        evidence for another one, and the share by which the cost decreased with it."""
+        evidence for another one, and the share by which the cost decreased with it.
+
+        The deviation is how far the best readouts of both halves are from it. Those of one that is proven may agree by
+        chance: the cost is nearly quadratic, so that its decrease by so many standard errors is known to half as many
+        parts of the difference.
+        """
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -179,7 +185,8 @@ class CalibrationEstimator:
         evidence, gain = after.improvement(before)
         found, is_proven = np.array([one.best.depth_readout, other.best.depth_readout]), after.proves(before, SHUTTER)
         readout = float(found.mean()) if is_proven else given.depth_readout
-        sigma = float(np.sqrt(np.mean(np.square(found - readout))))
+        unsure = (readout - given.depth_readout) / (2 * evidence) if is_proven else 0.0
+        sigma = float(np.hypot(np.sqrt(np.mean(np.square(found - readout))), unsure))
         return readout, sigma, evidence, gain if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
@@ -206,11 +213,11 @@ class CalibrationEstimator:
         if free.any():
             fit, covariance = self.adjustment.solve(pairs, fit, free)
         found = fit.calibration
-        _, uncertain = self.adjustment.solve(pairs, fit, everything, levels[-1:])
+        freed, uncertain = self.adjustment.solve(pairs, fit, everything, levels[-1:])
         sigma = np.sqrt(np.diag(uncertain))
         if covariance is not None:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
-        sigma *= self._disagreement(halves, proven.fits)
+        sigma = np.hypot(self._disagreement(halves, proven.fits) * sigma, found.step_to(freed.calibration))
         estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
         vignetting, vignetting_sigma, evidence["vignetting"] = self._vignetting(proven, Brightness.of(pairs, fit))
         if vignetting != self.given.vignetting:

@@ -1,6 +1,6 @@
 """Frames from which the calibration is estimated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,7 @@ class ColorKeyframe:
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
+        interval: Mean time from one to the next of the three frames that give the velocity, seconds.
     """
 
     timestamp: float
@@ -67,6 +68,7 @@ class ColorKeyframe:
     T_world_camera: NDArray[np.float64]
     velocity: NDArray[np.float64]
     depth_readout: float = 0.0
+    interval: float = MAX_GAP / 2
 
 
 def halvings_to(width: int, camera: Camera) -> int:
@@ -187,7 +189,8 @@ class KeyframeCollector(Stateful):
             due = self.keyframes[-1].timestamp + self._interval - 1e-3 if self.keyframes else -np.inf
             if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
                 velocity = central_velocity(before, (now, T_world_camera))
-                self.keyframes.append(keyframe(middle, self.given, T, velocity, mask))
+                taken = keyframe(middle, self.given, T, velocity, mask)
+                self.keyframes.append(replace(taken, interval=(now - before[0]) / 2))
                 if len(self.keyframes) > MAX_KEYFRAMES:
                     del self.keyframes[1::2]
                     self._interval *= 2

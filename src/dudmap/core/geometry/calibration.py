@@ -51,7 +51,7 @@ class Calibration:
         vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
             with the squared distance to the middle.
         vignetting_sigma: Its standard deviation, NaN where unknown.
-        depth_readout_sigma: That of the depth's readout: how far both halves of the time are from the one in use, s.
+        depth_readout_sigma: That of the depth's readout, s.
     """
 
     camera: Camera
