@@ -100,6 +100,15 @@ def _drawn(
     return [Pair(keyframes[int(first[n])], keyframes[int(second[n])]) for n in found[np.sort(order)].tolist()]
 
 
+def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> float:
+    """That of the sum of values (P,) of pairs of frames with ``numbers`` (P, 2), where pairs that share a frame err
+    together (Aronow, Samii and Assenova 2015)."""
+    apart = values - values.mean()
+    of_frames = sum(np.bincount(frames, apart, numbers.max() + 1) for frames in numbers.T)
+    squares = np.square(apart).sum()
+    return float(np.sqrt(max(np.square(of_frames).sum() - squares, squares)))
+
+
 PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
 """Standard deviations of a camera about which nothing is known but what is given, in the units of ``PARAMETERS``; that
 of the principal point is a share of the width. Colour cameras lie 15 to 32 mm from their depth cameras, on one board

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
+from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet, standard_error
 from dudmap.core.calibration.keyframes import ColorKeyframe
 from dudmap.core.frames.rolling_shutter import rectified_images
 from dudmap.core.geometry.calibration import Calibration
@@ -48,6 +48,8 @@ class ReadoutSearch:
     Attributes:
         given: Calibration with the readout as given, and the timing that goes with it.
         best: That with the readout of the smallest cost.
+        sigma: Standard deviation of this readout, seconds: a sandwich of the slopes of all pairs' costs; that of any
+            readout up to the longest where the costs have no minimum.
     """
 
     def __init__(
@@ -60,16 +62,23 @@ class ReadoutSearch:
         step = min(STEP, longest)
         fitted = {readout: self._fitted(readout) for readout in {-step, 0.0, step, given.depth_readout}}
         for _ in range(2):
-            lowest = lowest_readout({readout: cost for readout, (cost, _) in fitted.items()}, longest)
+            lowest = lowest_readout({readout: cost.mean() for readout, (cost, _) in fitted.items()}, longest)
             fitted[lowest] = self._fitted(lowest)
         self.given = fitted[given.depth_readout][1]
-        self.best = min(fitted.values(), key=lambda each: each[0])[1]
+        self.best = min(fitted.values(), key=lambda each: each[0].mean())[1]
+        before, middle, after = (fitted[readout][0] for readout in (-step, 0.0, step))
+        bend = (before + after - 2 * middle) / step**2
+        slopes = (after - before) / (2 * step) + bend * self.best.depth_readout
+        unknown = longest / np.sqrt(3)
+        error = standard_error(slopes, PairSet(pairs, stride).numbers)
+        self.sigma = min(error / bend.sum(), unknown) if bend.sum() > 0 else unknown
 
-    def _fitted(self, readout: float) -> tuple[float, Calibration]:
-        """Mean cost with a readout in seconds, and the calibration with the timing of the colours that goes with it."""
+    def _fitted(self, readout: float) -> tuple[NDArray[np.float64], Calibration]:
+        """Costs (P,) of every pair with a readout in seconds, and the calibration with the timing of the colours that
+        goes with it."""
         pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
         fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, self._adjustment.levels[-2:])
-        return float(self._adjustment.costs(pairs, fit).mean()), fit.calibration
+        return self._adjustment.costs(pairs, fit).sum(axis=0), fit.calibration
 
     def costs(self, calibration: Calibration) -> NDArray[np.float64]:
         """Costs (2, P) of intensities and depths of every pair with a calibration, such as that of other pairs."""

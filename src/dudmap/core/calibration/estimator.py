@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet, select_across, select_pairs
+from dudmap.core.calibration.adjustment import (
+    Adjustment,
+    Fit,
+    Pair,
+    PairSet,
+    select_across,
+    select_pairs,
+    standard_error,
+)
 from dudmap.core.calibration.depth_readout import ReadoutSearch, rectified_keyframe
 from dudmap.core.calibration.keyframes import ColorKeyframe
 from dudmap.core.calibration.vignetting import Brightness
@@ -82,13 +90,10 @@ class _Trial:
         return np.concatenate(other.costs, axis=1) - np.concatenate(self.costs, axis=1)
 
     def evidence(self, gains: NDArray[np.float64]) -> float:
-        """Mean of gains (P,) of all pairs in standard errors, where pairs that share a frame err together (Aronow,
-        Samii and Assenova 2015)."""
+        """Mean of gains (P,) of all pairs in standard errors."""
         second, first = (pairs.numbers for pairs in self.halves)
-        frames, apart = np.concatenate([first, second + 1 + first.max()]), gains - gains.mean()
-        of_frames = sum(np.bincount(numbers, apart, frames.max() + 1) for numbers in frames.T)
-        squares = np.square(apart).sum()
-        return float(gains.sum() / max(np.sqrt(max(np.square(of_frames).sum() - squares, squares)), 1e-12))
+        error = standard_error(gains, np.concatenate([first, second + 1 + first.max()]))
+        return float(gains.sum() / max(error, 1e-12))
 
     def improvement(self, other: "_Trial") -> tuple[float, float]:
         """Decrease of the cost from another trial on, in standard errors, and as a share, the smaller one of both
@@ -167,12 +172,7 @@ class CalibrationEstimator:
 
     def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
         """Readout of the depth in seconds, as given where another one is not proven, its standard deviation, the
-        evidence for another one, and the share by which the cost decreased with it.
-
-        The deviation is how far the best readouts of both halves are from it. Those of one that is proven may agree by
-        chance: the cost is nearly quadratic, so that its decrease by so many standard errors is known to half as many
-        parts of the difference.
-        """
+        evidence for another one, and the share by which the cost decreased with it."""
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -185,8 +185,10 @@ class CalibrationEstimator:
         evidence, gain = after.improvement(before)
         found, is_proven = np.array([one.best.depth_readout, other.best.depth_readout]), after.proves(before, SHUTTER)
         readout = float(found.mean()) if is_proven else given.depth_readout
-        unsure = (readout - given.depth_readout) / (2 * evidence) if is_proven else 0.0
-        sigma = float(np.hypot(np.sqrt(np.mean(np.square(found - readout))), unsure))
+        apart = np.sqrt(np.mean(np.square(found - readout)))
+        # of a nearly quadratic cost, a decrease by so many standard errors gives its place to half as many parts
+        unsure = (readout - given.depth_readout) / (2 * evidence) if is_proven else np.hypot(one.sigma, other.sigma) / 2
+        sigma = float(np.hypot(apart, unsure))
         return readout, sigma, evidence, gain if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
