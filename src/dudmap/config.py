@@ -41,7 +41,8 @@ class SensorConfig(ConfigSection):
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
-    row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""
+    row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters.
+    Where the timing was estimated, its own standard deviation counts."""
 
     self_calibration: bool = True
     """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated

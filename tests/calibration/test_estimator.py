@@ -130,6 +130,8 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
         assert abs(value) < TOLERANCE.get(key, TOLERANCE.get(key.split("_")[0], np.inf)), (key, value)
     assert displacement(result.calibration, truth) < 0.3
     assert result.calibration.depth_readout == pytest.approx(truth.depth_readout, abs=3e-3)
+    off = abs(result.calibration.depth_readout - truth.depth_readout)
+    assert off < max(3 * result.calibration.depth_readout_sigma, 1e-3)
     keys = {"timing": "delay", "lens": "k1", "geometry": "log_focal", "shutter": "depth_readout"}
     moved = {group for group, key in keys.items() if key in result.calibration.estimated}
     expected = {

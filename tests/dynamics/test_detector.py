@@ -2,14 +2,21 @@
 
 from collections import deque
 
+import cv2
 import numpy as np
 import pytest
 
 from dudmap.config import Config
 from dudmap.core.backends.cpu import labeling
 from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
+from dudmap.core.backends.device import make_backend
+from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Mixture, fit_mixture
+from dudmap.core.dynamics.segments import segment
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
 from dudmap.lab.benchmark.suites import systems
@@ -129,3 +136,29 @@ def test_every_method_runs_and_none_labels_nothing(recording):
     assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028", step=2) > 0.1
     assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false", step=2) > 0.05
     assert overlap(recording, "dynamics.method=none", step=2) == 0.0
+
+
+@pytest.mark.parametrize(("rows", "stands"), [(6, False), (45, True)])
+def test_the_map_decides_about_what_images_show_to_move_only_where_it_has_enough_of_it(rows, stands):
+    """Somebody turns before a wall; of what stands there the map has ``rows`` of 60 rows, which fit."""
+    depth = np.full(SMALL.shape, 2.0, np.float32)
+    person = np.zeros(SMALL.shape, np.bool_)
+    person[30:90, 50:90] = True
+    depth[person] = 1.0
+    texture = np.random.default_rng(0).integers(0, 255, (*SMALL.shape, 1), np.uint8).repeat(3, axis=2)
+    texture = cv2.GaussianBlur(texture, (0, 0), 3)
+    known = ~person
+    known[30 : 30 + rows] = True
+    config = Config()
+    volume = TsdfVolume(SMALL, config.volume, depth_max=5.0, backend=make_backend("cpu"))
+    for _ in range(3):
+        volume.integrate(Frame(0.0, depth, texture), np.eye(4), known)
+    level = Level(SMALL, depth, texture[..., 0].astype(np.float32) / 255)
+    detector = DynamicDetector(config.dynamics, config.sensor)
+    detector.start(0.0, level, np.eye(4))
+    segmentation = segment(level, np.full(SMALL.shape, 0.1, np.float32))
+    labels = detector.detect(volume, level, np.eye(4), 0.1, lambda: segmentation, moving=person)
+    inside = person.copy()
+    inside[:40] = False  # beside the border of what the map has
+    assert np.mean(labels.dynamic[inside]) == pytest.approx(0.0 if stands else 1.0, abs=0.05)
+    assert not labels.dynamic[~person].any()

@@ -1,5 +1,7 @@
 """Calibration of a colour camera: file, step, and the registration of its image against a plain NumPy oracle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -142,6 +144,7 @@ def test_a_step_and_its_inverse():
 def test_the_file_holds_everything(tmp_path):
     sigma = np.array([*np.arange(12) / 7, np.nan])
     before = calibration(sigma=sigma, estimated=("delay",), vignetting=0.2, vignetting_sigma=0.01)
+    before = replace(before, depth_readout=0.03, depth_readout_sigma=0.002)
     before.save(tmp_path / "calibration.toml")
     after = Calibration.load(tmp_path / "calibration.toml")
     assert after.camera == before.camera
@@ -149,11 +152,21 @@ def test_the_file_holds_everything(tmp_path):
     assert (after.delay, after.readout, after.estimated) == (before.delay, before.readout, before.estimated)
     assert np.array_equal(after.sigma, before.sigma, equal_nan=True)
     assert (after.vignetting, after.vignetting_sigma) == (0.2, 0.01)
+    assert (after.depth_readout, after.depth_readout_sigma) == (0.03, 0.002)
     (tmp_path / "old.toml").write_text("\n".join(
         line for line in (tmp_path / "calibration.toml").read_text().splitlines() if "vignetting" not in line
     ))  # fmt: skip
     assert Calibration.load(tmp_path / "old.toml").vignetting == 0
     assert len(PARAMETERS) == len(after.sigma)
+
+
+def test_colours_count_in_motion_as_well_as_their_time_is_known():
+    sigma = np.full(len(PARAMETERS), np.nan)
+    sigma[-2:] = 0.001, 0.002 * np.sqrt(12)
+    known = calibration(sigma=sigma, estimated=("delay", "readout"), depth_readout_sigma=0.002 * np.sqrt(12))
+    assert known.time_sigma(0.009) == pytest.approx(0.003)
+    assert replace(known, estimated=()).time_sigma(0.009) == 0.009
+    assert replace(known, depth_readout_sigma=np.nan).time_sigma(0.009) == 0.009
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,8 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
 
     out = Table("parameter", "change", "sigma", "unit", "")
     found = estimate.calibration
-    change = [*given.step_to(found), found.vignetting - given.vignetting]
+    shutter = found.depth_readout - given.depth_readout
+    change = [*given.step_to(found), found.vignetting - given.vignetting, shutter]
     for (name, sigma), value in zip(found.sigmas.items(), change, strict=True):
         unit, factor = UNITS[kind_of(name)]
         is_found = name in found.estimated

@@ -47,6 +47,7 @@ UNITS = {
     "delay": ("ms", 1000.0),
     "readout": ("ms", 1000.0),
     "vignetting": ("%", 100.0),
+    "depth_readout": ("ms", 1000.0),
 }
 """Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
 ASSUMED = "assumed as given, not tested"

@@ -153,20 +153,20 @@ class CalibrationEstimator:
             unknown = dict.fromkeys((*TESTED, SHUTTER), float("nan"))
             return Estimate(self.given, unknown, 0.0, sum(map(len, halves)))
         known = self.given.depth_readout
-        readout, evidence, gain = self._depth_readout(halves)
+        readout, sigma, evidence, gain = self._depth_readout(halves)
         estimate = self._estimate_color(keyframes, readout)
         found, moved = estimate.calibration, (SHUTTER_PARAMETER,) if readout != known else ()
         late = max(found.delay, 0.0) if any(frame.color_offset for frame in keyframes) else 0.0
         return Estimate(
-            replace(found, estimated=(*found.estimated, *moved), depth_late=late),
+            replace(found, estimated=(*found.estimated, *moved), depth_late=late, depth_readout_sigma=sigma),
             estimate.evidence | {SHUTTER: evidence},
             1 - (1 - gain) * (1 - estimate.gain),
             estimate.pairs,
         )
 
-    def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float]:
-        """Readout of the depth in seconds, as given where another one is not proven, the evidence for another one, and
-        the share by which the cost decreased with it."""
+    def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
+        """Readout of the depth in seconds, as given where another one is not proven, its standard deviation, the
+        evidence for another one, and the share by which the cost decreased with it."""
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -177,9 +177,10 @@ class CalibrationEstimator:
             for of_one, of_other in ((one.given, other.given), (one.best, other.best))
         )
         evidence, gain = after.improvement(before)
-        if not after.proves(before, SHUTTER):
-            return given.depth_readout, evidence, 0.0
-        return (one.best.depth_readout + other.best.depth_readout) / 2, evidence, gain
+        found, is_proven = np.array([one.best.depth_readout, other.best.depth_readout]), after.proves(before, SHUTTER)
+        readout = float(found.mean()) if is_proven else given.depth_readout
+        sigma = float(np.sqrt(np.mean(np.square(found - readout))))
+        return readout, sigma, evidence, gain if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
         """Calibration of the colour camera beside a depth camera with a known readout."""

@@ -51,6 +51,7 @@ class Calibration:
         vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
             with the squared distance to the middle.
         vignetting_sigma: Its standard deviation, NaN where unknown.
+        depth_readout_sigma: That of the depth's readout: how far both halves of the time are from the one in use, s.
     """
 
     camera: Camera
@@ -63,6 +64,7 @@ class Calibration:
     depth_late: float = 0.0
     vignetting: float = 0.0
     vignetting_sigma: float = float("nan")
+    depth_readout_sigma: float = float("nan")
 
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
@@ -97,13 +99,13 @@ class Calibration:
     def time_sigma(self, assumed: float) -> float:
         """Standard deviation of the time between the colour and the depth of a pixel, seconds.
 
-        Where the rolling shutter of the depth was estimated, and the images are rectified, that of the delay and of the
-        row times of the colours (sigma / sqrt 12), else ``assumed``.
+        Where the timing was estimated that of the delay and of the row times (sigma / sqrt 12) of the colours and of
+        the depth, whose images are bent by a readout that they do not show clearly enough; else ``assumed``.
         """
-        if "depth_readout" not in self.estimated:
+        if not {"delay", "depth_readout"} & set(self.estimated) or np.isnan(self.depth_readout_sigma):
             return assumed
         delay, readout = (self.sigma[PARAMETERS.index(name)] for name in ("delay", "readout"))
-        return float(np.hypot(delay, readout / np.sqrt(12)))
+        return float(np.linalg.norm([delay, readout / np.sqrt(12), self.depth_readout_sigma / np.sqrt(12)]))
 
     def is_instant(self, offset: float) -> bool:
         """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
@@ -160,8 +162,9 @@ class Calibration:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Standard deviations of ``PARAMETERS`` and of the vignetting by name, NaN where unknown."""
-        return dict(zip((*PARAMETERS, "vignetting"), (*self.sigma.tolist(), self.vignetting_sigma), strict=True))
+        """Standard deviations by name, NaN where unknown."""
+        others = {"vignetting": self.vignetting_sigma, "depth_readout": self.depth_readout_sigma}
+        return dict(zip(PARAMETERS, self.sigma.tolist(), strict=True)) | others
 
     def tree(self) -> dict[str, Any]:
         """Nested dictionary of numbers, lists and words, as in the file and in metrics.json; NaN is left out."""
@@ -212,6 +215,7 @@ class Calibration:
                 float(tree.get("depth_late", 0.0)),
                 float(tree.get("vignetting", 0.0)),
                 float(known.get("vignetting", np.nan)),
+                float(known.get("depth_readout", np.nan)),
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
