@@ -11,6 +11,7 @@ from dudmap.config import Config
 from dudmap.core.frames.observation import Observation
 from dudmap.core.frames.stream_check import AGREEING, StreamCheck, sudden_factor
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.mapper import Mapper
 from dudmap.errors import ConfigError
 from dudmap.lab import synthetic
 from dudmap.lab.benchmark.stream_faults import fault_row, measure_stream_faults, table_head
@@ -55,6 +56,19 @@ def test_no_fault_leads_to_a_wrong_pose_that_is_called_tracked(runs, fault):
         assert run.rejected.get(REJECTED[fault], 0) > 0
     else:
         assert run.rejected == {}
+
+
+def test_black_images_are_not_fused_later_either(recording, monkeypatch):
+    fused, integrate = [], Mapper.integrate
+
+    def recorded(mapper, view, *arguments):
+        fused.append(view.blind)
+        integrate(mapper, view, *arguments)
+
+    monkeypatch.setattr(Mapper, "integrate", recorded)
+    list(measure_stream_faults(recording, CONFIG, ["black"]))
+    assert fused
+    assert not any(fused)
 
 
 def test_table_has_one_line_per_fault(runs):

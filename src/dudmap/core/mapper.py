@@ -245,7 +245,7 @@ class Mapper:
                 atlas.keyframes.add(view.observation, T_world_camera, dynamic_mask, atlas.current)
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
-        if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+        if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp) and not view.blind:
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
     def refine_first_poses(self, tracker: Tracker) -> NDArray[np.float64] | None:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps of a rigid motion (Marquardt 1963): the step, the new pose, and whether it is accepted."""
+"""Levenberg-Marquardt steps of a rigid motion (Marquardt 1963): step, acceleration, new pose, and acceptance."""
 
 import numpy as np
 
@@ -9,9 +9,10 @@ FLOOR = 1e-9
 """Share of the largest diagonal element that is always added, so that a direction without information stays still."""
 FACTOR, LEAST = 5.0, 1e-6
 """The damping grows and shrinks by this factor, down to the least one."""
+LONGEST, SHORTEST = 3.0, 0.5
+"""Limits of an accelerated step, in steps that are not."""
 SHORT_STEP = 4.0
-"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
-on the finest level whatever it costs."""
+"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes."""
 
 _rotation = scalar(rodrigues)
 
@@ -58,6 +59,28 @@ def damped_step(H, b, basis, damping):
 
 
 @scalar
+def accelerated(step, last, taken):
+    """Step (6,) of Anderson's acceleration with a memory of one step (Walker and Ni 2011).
+
+    Where robust weights decide, each step is shorter than the one before by much the same factor: their sum is taken at
+    once.
+
+    Args:
+        step: From this pose.
+        last, taken: From the pose before, and what was taken from there to this one; zeros if there is none.
+    """
+    along, squared = np.float64(0), np.float64(0)
+    for i in range(6):
+        change = step[i] - last[i]
+        along, squared = along + step[i] * change, squared + change * change
+    theta = min(max(along / squared, 1 - LONGEST), SHORTEST) if squared > 0 else np.float64(0)
+    out = np.empty(6)
+    for i in range(6):
+        out[i] = step[i] - theta * (taken[i] + step[i] - last[i])
+    return out
+
+
+@scalar
 def moved(T_world_camera, step):
     """Pose (4, 4) after a twist (v, omega) about the camera's centre, world axes."""
     R = _rotation(step[3], step[4], step[5])
@@ -72,16 +95,17 @@ def moved(T_world_camera, step):
 
 
 @scalar
-def judged(cost, trial, length, damping, rules):
+def judged(change, cost, length, damping, rules):
     """Whether a trial step is accepted, the next damping, and whether it is the last step.
 
     Args:
-        cost, trial: Costs before and after the step.
+        change: Of the cost by the step.
+        cost: Before the step.
         length: Norm of the step, metres and radians.
         damping: Of this step.
         rules: DescentRules.
     """
-    settled = length < SHORT_STEP * rules.stop and abs(trial - cost) < rules.stop_gain * cost
-    if trial < cost or length < rules.accept_below:
+    settled = length < SHORT_STEP * rules.stop and abs(change) < rules.stop_gain * cost
+    if change < 0:
         return True, max(damping / FACTOR, LEAST), settled
     return False, damping * FACTOR, settled

@@ -17,7 +17,6 @@ from dudmap.core.backends.parameters import (
     SensorNoise,
     TruncationBand,
 )
-from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
@@ -28,7 +27,7 @@ from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, Gradient
 FINEST_DAMPING = 1e-4
 """Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
 directions, along which more damping shortens the steps until they are taken for convergence."""
-NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0, accept_below=0.0)
+NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0)
 """Rules of a registration that ends where it begins, with the normal equations there."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
@@ -270,17 +269,11 @@ class Tracker:
         return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
-        """Rules of the steps of a level along all directions.
-
-        A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
-        and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
-        decide which are, and where the registration ends.
-        """
+        """Rules of the steps of a level along all directions."""
         config, basis = self.config, COMPLETE.observable
         if finest:
-            damping, short = min(config.damping, FINEST_DAMPING), SHORT_STEP * config.stop
-            return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, accept_below=short)
-        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain, accept_below=0.0)
+            return DescentRules(basis, min(config.damping, FINEST_DAMPING), limit, config.stop, stop_gain=0.0)
+        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain)
 
     def linearize(
         self,

@@ -13,7 +13,7 @@ from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import BLOCK, ImageStack, NormalEquations
 from dudmap.core.backends.threads import kernel, scalar
-from dudmap.core.formulas.damping import damped_step, judged, moved
+from dudmap.core.formulas.damping import accelerated, damped_step, judged, moved
 from dudmap.core.formulas.pixel import elements, rotate
 from dudmap.core.formulas.residual import normal_terms, trilinear, weigh
 from dudmap.core.formulas.voxel import intensity_of, sdf_steps
@@ -232,6 +232,7 @@ def descend(
     unit, step_size = np.float32(voxel_size), np.float32(sdf_unit)
     T, accepted, T_trial = T_first, first, T_first
     kept, count, settled, damping, length = -1, 0, False, rules.damping, np.inf
+    last, taken, step, plain, follows = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), False
     while True:
         if leads:
             if count > 0 or is_known:
@@ -244,7 +245,8 @@ def descend(
                     largest = max(largest, H[i, i])
                 if not largest > 0:
                     break
-                step = damped_step(H, accepted[21:27], rules.basis, damping)
+                plain = damped_step(H, accepted[21:27], rules.basis, damping)
+                step = accelerated(plain, last, taken) if follows else plain
                 T_trial, length = moved(T, step), np.sqrt(np.sum(step * step))
                 if length < rules.stop:  # too short to need another linearisation
                     T, settled = T_trial, True
@@ -277,9 +279,13 @@ def descend(
             if count == 1 and not is_known:
                 accepted, kept = total, buffer
                 continue
-            better, damping, settled = judged(accepted[COST], total[COST], length, damping, rules)
+            change = np.float64(0)  # by the mean of the gradients before and after the step
+            for i in range(6):
+                change += (accepted[21 + i] + total[21 + i]) / 2 * step[i]
+            better, damping, settled = judged(change, accepted[COST], length, damping, rules)
             if better:
                 T, accepted, kept = T_trial, total, buffer
+            last, taken, follows = plain, step, better
             if settled:
                 break
     if leads:
