@@ -13,7 +13,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.fleet.change_evidence import DEVIATIONS
+from dudmap.fleet.change_evidence import DEVIATIONS, components
 from dudmap.fleet.change_objects import LEAST_FACING
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, transformed
 
@@ -185,17 +185,9 @@ class ChangeWatch(RunObserver):
         if len(rows) < wanted:
             return
         centres = _centres(cells.codes[rows])
-        tree, left = KDTree(centres), set(range(len(rows)))
-        while left:
-            group, edge = set[int](), {left.pop()}
-            while edge:
-                group |= edge
-                near = tree.query_ball_point(centres[list(edge)], 2.5 * CELL)
-                edge = {n for part in near for n in part} & left
-                left -= edge
-            if len(group) < wanted:
-                continue
-            members = sorted(group)
+        group = components(KDTree(centres).query_pairs(2.5 * CELL, output_type="ndarray"), len(centres))
+        for number in np.flatnonzero(np.bincount(group) >= wanted):
+            members = np.flatnonzero(group == number)
             cells.reported[rows[members]] = True
             box = np.stack([centres[members].min(axis=0) - CELL / 2, centres[members].max(axis=0) + CELL / 2])
             if self._is_known(kind, box):

@@ -327,17 +327,8 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
     elif not any(enough):
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
-    return TrueChange(
-        thing.name,
-        kind,
-        thing.size,
-        thing.T_after_before,
-        changed[0],
-        changed[1],
-        THINGS[thing.name][2],
-        at,
-        bool(common),
-    )
+    symmetric = THINGS[thing.name][2]
+    return TrueChange(thing.name, kind, thing.size, thing.T_after_before, *changed, symmetric, at, bool(common))
 
 
 def _moved(T: Array, oriented: Array) -> Array:
