@@ -17,7 +17,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.se3 import agree
 from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_objects import Piece
-from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
+from dudmap.fleet.map_samples import OBSERVED, transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS, TRIED = 20_000, 400, 12
@@ -46,12 +46,12 @@ LIGHT, DAMPING = 0.2, 0.02
 weight of its direction per point."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
-LEAST_FIT, LEAST_SHAPE, LEAST_SEEN = 0.8, 0.6, 0.25
-"""Shares of the surface that must lie on the other's: of what would else hang in free space, of what would else hang
-there or lie under the other's surface (the back of a thin thing does), and of the larger of both surfaces."""
-PLAIN, MAX_COLOR, MAX_CHROMA = 5.0, 0.25, 0.04
-"""Largest median difference of the colours in one light: grey levels of a thing without texture, share of the
-brightness of one with texture; and of the shares of red, green and blue."""
+LEAST_FIT, LEAST_SEEN = 0.8, 0.25
+"""Shares of the surface that must lie on the other's: of what would else hang in free space, and of the larger of both
+surfaces."""
+PLAIN, MAX_CHROMA = 5.0, 0.04
+"""Largest median difference in one light of the colours of a thing without texture, grey levels, and of the shares of
+red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
 """Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
 two that are one: things of one make have the same texture, any others have about none."""
@@ -161,11 +161,7 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
         _judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first[:REFINED]
     ]
     motions = sorted((one for one in judged if one is not None), key=lambda one: -one.explained)
-    alike = [
-        one
-        for one in motions
-        if one.explained > 0.5 * motions[0].explained and one.agreement > AS_GOOD * motions[0].agreement
-    ]
+    alike = [one for one in motions if one.agreement > AS_GOOD * motions[0].agreement]
     others = len(_different([one.T_after_before for one in alike], centre, 0.3 * coarse.size, 20.0))
     if others > 1:
         smallest = min(alike, key=lambda one: se3.rotation_angle(one.T_after_before))
@@ -307,7 +303,7 @@ def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> 
     sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
     meets, hangs, sunk = np.sum([side.count for side in sides], axis=0)
     most = max(missing.denied.sum(), new.denied.sum())
-    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SHAPE * (meets + hangs + sunk), LEAST_SEEN * most, MIN_POINTS):
+    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SEEN * most, MIN_POINTS):
         return None
     mine = np.concatenate([sides[0].own, sides[1].other])
     theirs = np.concatenate([sides[0].other, sides[1].own])
@@ -351,9 +347,8 @@ def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
     samples = there.sample(points)
-    known = ~meets & (samples.state == OBSERVED)
-    hangs = (~meets & (samples.state == EMPTY)) | (known & (samples.sdf > limit))
-    sunk = known & (samples.sdf < -limit)
+    hangs = ~meets & samples.is_free(limit)
+    sunk = ~meets & (samples.state == OBSERVED) & (samples.sdf < -limit)
     each = own.denied.sum() / len(points)
     count = each * np.array([meets.sum(), hangs.sum(), sunk.sum()])
     return _Landed(count, moved.colors[meets], other.colors[near[meets]], normals[meets])
@@ -364,7 +359,7 @@ def _alike(mine: Array, theirs: Array) -> bool:
     shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
     if np.abs(shares[0] - shares[1]).max() > MAX_CHROMA:
         return False
-    grey, off = (mine.mean(axis=1), theirs.mean(axis=1)), np.median(np.abs(mine - theirs))
+    grey = mine.mean(axis=1), theirs.mean(axis=1)
     if min(grey[0].std(), grey[1].std()) < TEXTURE:
-        return bool(off < PLAIN)
-    return bool(off < MAX_COLOR * theirs.mean() and np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)
+        return bool(np.median(np.abs(mine - theirs)) < PLAIN)
+    return bool(np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)
