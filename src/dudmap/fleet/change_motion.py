@@ -17,7 +17,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.se3 import agree
 from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_objects import Piece
-from dudmap.fleet.map_samples import OBSERVED, transformed
+from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS, TRIED = 20_000, 400, 12
@@ -301,7 +301,7 @@ def _different(poses: list[Array], centre: Array, distance: float, angle_deg: fl
 def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
     """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
     sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
-    meets, hangs, sunk = np.sum([side.count for side in sides], axis=0)
+    meets, hangs = np.sum([side.count for side in sides], axis=0)
     most = max(missing.denied.sum(), new.denied.sum())
     if meets < max(LEAST_FIT * (meets + hangs), LEAST_SEEN * most, MIN_POINTS):
         return None
@@ -315,7 +315,7 @@ def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> 
     explained = float(agree * meets - hangs)
     flat = np.linalg.eigvalsh(normals.T @ normals / len(normals))[1] < FLAT
     ambiguous = "one flat face of it was seen; another may look the same" if flat else None
-    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs + sunk), ambiguous)
+    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs), ambiguous)
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
@@ -331,8 +331,8 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Landed:
-    """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, hang in free space or
-    lie under the other's surface; colours (n, 3) of some that lie on it and of the other's points, and its normals."""
+    """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, and that hang in free
+    space; colours (n, 3) of some that lie on it and of the other's points, and its normals."""
 
     count: Array
     own: Array
@@ -346,11 +346,8 @@ def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
     gap, near = (np.asarray(found) for found in other.tree.query(points))
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
-    samples = there.sample(points)
-    hangs = ~meets & samples.is_free(limit)
-    sunk = ~meets & (samples.state == OBSERVED) & (samples.sdf < -limit)
-    each = own.denied.sum() / len(points)
-    count = each * np.array([meets.sum(), hangs.sum(), sunk.sum()])
+    hangs = ~meets & there.sample(points).is_free(limit)
+    count = np.array([meets.sum(), hangs.sum()]) * own.denied.sum() / len(points)
     return _Landed(count, moved.colors[meets], other.colors[near[meets]], normals[meets])
 
 
