@@ -212,7 +212,7 @@ class _Meeting:
             points = np.einsum("kij,nj->kni", T[:, :3, :3], some.points) + T[:, None, :3, 3]
             colors = np.broadcast_to(self.shade * some.colors, points.shape)
             gap = tree.query(np.concatenate([points, colors], axis=2).reshape(-1, 6), distance_upper_bound=gate)[0]
-            scores += np.isfinite(gap).reshape(len(starts), -1).mean(axis=1)
+            scores += np.isfinite(gap).reshape(len(starts), len(some.points)).mean(axis=1)
         return [starts[n] for n in np.argsort(-scores, kind="stable")]
 
     def share(self, T: Array, gate: float) -> float:
@@ -300,14 +300,14 @@ def _different(poses: list[Array], centre: Array, distance: float, angle_deg: fl
 
 def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
     """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
-    sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
-    meets, hangs = np.sum([side.count for side in sides], axis=0)
+    count, mine, theirs, normals = _landed(after, missing, new, T)
+    count_back, theirs_back, mine_back, normals_back = _landed(before, new, missing, se3.inverse(T))
+    meets, hangs = count + count_back
     most = max(missing.denied.sum(), new.denied.sum())
     if meets < max(LEAST_FIT * (meets + hangs), LEAST_SEEN * most, MIN_POINTS):
         return None
-    mine = np.concatenate([sides[0].own, sides[1].other])
-    theirs = np.concatenate([sides[0].other, sides[1].own])
-    normals = np.concatenate([sides[0].normals, sides[1].normals @ T[:3, :3].T])
+    mine, theirs = np.concatenate([mine, mine_back]), np.concatenate([theirs, theirs_back])
+    normals = np.concatenate([normals, normals_back @ T[:3, :3].T])
     lit = _gains(mine.mean(axis=1), theirs.mean(axis=1), normals)[:, None] * mine
     if not _alike(lit, theirs):
         return None
@@ -329,18 +329,9 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
     return np.exp(np.clip(A @ x, -0.7, 0.7))
 
 
-@dataclass(frozen=True, eq=False)
-class _Landed:
-    """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, and that hang in free
-    space; colours (n, 3) of some that lie on it and of the other's points, and its normals."""
-
-    count: Array
-    own: Array
-    other: Array
-    normals: Array
-
-
-def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
+def _landed(there: Visit, own: Body, other: Body, T: Array) -> tuple[Array, Array, Array, Array]:
+    """Numbers (2,) of the denied vertices of a thing that lie on the other's surface after a motion, and that hang in
+    free space; colours (n, 3) of some that lie on it and of the other's points, and their normals after it."""
     moved = own.chosen(own.denied).sample(FINE)
     points, normals = transformed(T, moved.points), moved.normals @ T[:3, :3].T
     gap, near = (np.asarray(found) for found in other.tree.query(points))
@@ -348,7 +339,7 @@ def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
     hangs = ~meets & there.sample(points).is_free(limit)
     count = np.array([meets.sum(), hangs.sum()]) * own.denied.sum() / len(points)
-    return _Landed(count, moved.colors[meets], other.colors[near[meets]], normals[meets])
+    return count, moved.colors[meets], other.colors[near[meets]], normals[meets]
 
 
 def _alike(mine: Array, theirs: Array) -> bool:

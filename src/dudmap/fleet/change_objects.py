@@ -10,14 +10,10 @@ from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, com
 
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
-BRIDGE = 0.15
-"""The same where no free space was seen between them, metres."""
 REACH = 0.5
-"""The same beside a larger piece, in its lengths."""
+"""The same where no free space was seen between them, in lengths of the larger piece."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
-LEAST_WIDTH = 0.5
-"""Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 LEAST_FACING = 0.1
 """Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
 LEAST_COVER = 0.125
@@ -74,7 +70,7 @@ def assembled(pieces: list[Piece], own: Visit) -> list[Piece]:
 
 def is_part(piece: Piece, thing: Piece, own: Visit) -> bool:
     """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
-    return gap_between(thing, piece) < max(BRIDGE, REACH * thing.length) and is_hidden_between(thing, piece, own)
+    return gap_between(thing, piece) < REACH * thing.length and is_hidden_between(thing, piece, own)
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
@@ -97,8 +93,7 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
         return False
     if piece.area < LEAST_COVER * np.prod(np.sort(piece.box[1] - piece.box[0])[1:]):
         return False
-    blur = float(np.median(found.blur[piece.vertices]))
-    return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
+    return is_wide(piece.points, 0.7 * min_size, 3 * float(np.median(found.blur[piece.vertices])))
 
 
 def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
