@@ -152,14 +152,11 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
     centre = np.eye(4)
     centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
-    first = [
-        coarse.registered(T, 0.3 * coarse.size) for T in _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
-    ]
-    first = [T for T in first if coarse.share(T, coarse.gate) > LEAST_SEEN / 2]
-    first = _different(sorted(first, key=lambda T: -coarse.share(T, coarse.gate)), centre, 0.05, 10.0)
-    judged = [
-        _judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first[:REFINED]
-    ]
+    tried = _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
+    rated = [(coarse.share(T), T) for T in (coarse.registered(T, 0.3 * coarse.size) for T in tried)]
+    rated = sorted((row for row in rated if row[0] > LEAST_SEEN / 2), key=lambda row: -row[0])
+    first = _different([T for _, T in rated], centre, 0.05, 10.0)[:REFINED]
+    judged = [_judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first]
     motions = sorted((one for one in judged if one is not None), key=lambda one: -one.explained)
     alike = [one for one in motions if one.agreement > AS_GOOD * motions[0].agreement]
     others = len(_different([one.T_after_before for one in alike], centre, 0.3 * coarse.size, 20.0))
@@ -215,9 +212,9 @@ class _Meeting:
             scores += np.isfinite(gap).reshape(len(starts), len(some.points)).mean(axis=1)
         return [starts[n] for n in np.argsort(-scores, kind="stable")]
 
-    def share(self, T: Array, gate: float) -> float:
+    def share(self, T: Array) -> float:
         """Mean share of both surfaces that meet the other."""
-        return float(self.pairs(T, gate)[1].mean())
+        return float(self.pairs(T, self.gate)[1].mean())
 
     def registered(self, T: Array, gate: float, *, lit: bool = False) -> Array:
         """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks; at last by the intensities
