@@ -327,8 +327,8 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
     elif not any(enough):
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
-    symmetric = THINGS[thing.name][2]
-    return TrueChange(thing.name, kind, thing.size, thing.T_after_before, *changed, symmetric, at, bool(common))
+    symmetric, (before, after) = THINGS[thing.name][2], changed
+    return TrueChange(thing.name, kind, thing.size, thing.T_after_before, before, after, symmetric, at, bool(common))
 
 
 def _moved(T: Array, oriented: Array) -> Array:
