@@ -17,7 +17,7 @@ from dudmap.fleet import change_benchmark
 from dudmap.fleet.change_benchmark import draw_pair, figures, score_pair
 from dudmap.fleet.change_colors import recolored_pieces
 from dudmap.fleet.change_evidence import BEHIND, CONFIRMED, DENIED, Visit
-from dudmap.fleet.change_motion import Body, _gains
+from dudmap.fleet.change_motion import Body, _gains, motion_between
 from dudmap.fleet.change_objects import Piece, is_hidden_between
 from dudmap.fleet.change_watch import WATCH_FILE, ChangeWatch
 from dudmap.fleet.changes import find_changes, vertical
@@ -102,6 +102,15 @@ def test_slopes_are_those_of_the_intensities_along_the_surface():
     grey = 50 + 300 * points[:, 0] - 100 * points[:, 1]
     body = Body(points, np.tile([0.0, 0, 1], (800, 1)), np.tile(grey[:, None], 3), np.ones(800, bool), 0.01)
     assert np.allclose(body.slopes, [300, -100, 0], atol=3)
+
+
+def test_things_without_a_like_colour_are_not_one(changed):
+    points = np.random.default_rng(6).uniform(0, 0.3, (200, 3))
+    black, white = (
+        Body(points, np.tile([0.0, 0, 1], (200, 1)), np.full((200, 3), grey), np.ones(200, bool), 0.01)
+        for grey in (0.0, 255.0)
+    )
+    assert motion_between(*changed.visits, black, white, np.array([0.0, 0, 1])) is None
 
 
 def test_a_motion_that_is_not_the_only_likely_one_says_so(changed):

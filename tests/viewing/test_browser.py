@@ -5,6 +5,7 @@ Needs the package playwright and a Chromium, on the PATH (on Debian: apt install
 
 import socket
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ from browsers import SOFTWARE, find_chromium
 from dudmap.app.viewing.report import write_report
 from dudmap.app.viewing.run_files import RunFiles
 from dudmap.app.viewing.snapshot import DEPTH_RANGE, RESIDUAL_RANGE
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.fleet.change_report import change_page
 from run_folders import write_run
 from security.hostile_runs import MARKUP, write_hostile_run
 
@@ -235,3 +238,20 @@ def test_the_window_tells_a_browser_without_webgl(driver, window):
     page.goto(window.url)
     page.wait_for_selector("text=WebGL is unavailable", timeout=30000)
     browser.close()
+
+
+def test_the_page_on_changes_flies_to_a_change(browser, tmp_path):
+    corners = np.random.default_rng(1).uniform(0, 1, (60, 3)).astype(np.float32)
+    faces, colors = np.arange(60, dtype=np.int32).reshape(-1, 3), np.full((60, 3), 90, np.uint8)
+    mesh = Mesh(corners, faces, colors, np.tile(np.float32([0, 0, 1]), (60, 1)))
+    visit = SimpleNamespace(keyframes=np.eye(4)[None], mesh=mesh)
+    row = {"id": 1, "kind": "appeared", "box": [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3]], "confidence": 0.9}
+    tree = {"before": "a", "after": "b", "notes": [], "counts": {"appeared": 1}, "changes": [row]}
+    (tmp_path / "page.html").write_text(change_page(tree, [mesh, mesh], [visit, visit], [None]))
+    tab = Tab(browser)
+    tab.page.goto((tmp_path / "page.html").as_uri())
+    tab.page.wait_for_selector("html[data-ready=true]", timeout=30000)
+    assert (tab.errors, tab.page.text_content("#notice")) == ([], "")
+    far = tab.picture()
+    tab.page.click("#changes li")
+    assert np.abs(tab.picture() - far).max() > 50

@@ -172,9 +172,8 @@ def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArra
         depth = visit.volume.raycast(T_map @ T, camera).depth
         nearest = cv2.erode(depth, np.ones((3, 3), np.uint8))
         local = transformed(se3.inverse(T), points)
-        u, v = np.rint(np.nan_to_num(camera.project(local), nan=-1, posinf=-1, neginf=-1)).astype(np.int64).T
-        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        counts[inside] += nearest[v[inside], u[inside]] > (local[:, 2] + 2 * margin)[inside]
+        rows, u, v = camera.nearest_pixels(local)
+        counts[rows] += nearest[v, u] > (local[:, 2] + 2 * margin)[rows]
     return counts
 
 

@@ -17,7 +17,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.se3 import agree
 from dudmap.fleet.change_evidence import Evidence, Visit
 from dudmap.fleet.change_objects import Piece
-from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
+from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS, TRIED = 20_000, 400, 12
@@ -46,12 +46,12 @@ LIGHT, DAMPING = 0.2, 0.02
 weight of its direction per point."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
-LEAST_FIT, LEAST_SHAPE, LEAST_SEEN = 0.8, 0.6, 0.25
-"""Shares of the surface that must lie on the other's: of what would else hang in free space, of what would else hang
-there or lie under the other's surface (the back of a thin thing does), and of the larger of both surfaces."""
-PLAIN, MAX_COLOR, MAX_CHROMA = 5.0, 0.25, 0.04
-"""Largest median difference of the colours in one light: grey levels of a thing without texture, share of the
-brightness of one with texture; and of the shares of red, green and blue."""
+LEAST_FIT, LEAST_SEEN = 0.8, 0.25
+"""Shares of the surface that must lie on the other's: of what would else hang in free space, and of the larger of both
+surfaces."""
+PLAIN, MAX_CHROMA = 5.0, 0.04
+"""Largest median difference in one light of the colours of a thing without texture, grey levels, and of the shares of
+red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
 """Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
 two that are one: things of one make have the same texture, any others have about none."""
@@ -152,20 +152,13 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
     starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
     centre = np.eye(4)
     centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
-    first = [
-        coarse.registered(T, 0.3 * coarse.size) for T in _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
-    ]
-    first = [T for T in first if coarse.share(T, coarse.gate) > LEAST_SEEN / 2]
-    first = _different(sorted(first, key=lambda T: -coarse.share(T, coarse.gate)), centre, 0.05, 10.0)
-    judged = [
-        _judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first[:REFINED]
-    ]
+    tried = _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
+    rated = [(coarse.share(T), T) for T in (coarse.registered(T, 0.3 * coarse.size) for T in tried)]
+    rated = sorted((row for row in rated if row[0] > LEAST_SEEN / 2), key=lambda row: -row[0])
+    first = _different([T for _, T in rated], centre, 0.05, 10.0)[:REFINED]
+    judged = [_judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first]
     motions = sorted((one for one in judged if one is not None), key=lambda one: -one.explained)
-    alike = [
-        one
-        for one in motions
-        if one.explained > 0.5 * motions[0].explained and one.agreement > AS_GOOD * motions[0].agreement
-    ]
+    alike = [one for one in motions if one.agreement > AS_GOOD * motions[0].agreement]
     others = len(_different([one.T_after_before for one in alike], centre, 0.3 * coarse.size, 20.0))
     if others > 1:
         smallest = min(alike, key=lambda one: se3.rotation_angle(one.T_after_before))
@@ -216,12 +209,12 @@ class _Meeting:
             points = np.einsum("kij,nj->kni", T[:, :3, :3], some.points) + T[:, None, :3, 3]
             colors = np.broadcast_to(self.shade * some.colors, points.shape)
             gap = tree.query(np.concatenate([points, colors], axis=2).reshape(-1, 6), distance_upper_bound=gate)[0]
-            scores += np.isfinite(gap).reshape(len(starts), -1).mean(axis=1)
+            scores += np.isfinite(gap).reshape(len(starts), len(some.points)).mean(axis=1)
         return [starts[n] for n in np.argsort(-scores, kind="stable")]
 
-    def share(self, T: Array, gate: float) -> float:
+    def share(self, T: Array) -> float:
         """Mean share of both surfaces that meet the other."""
-        return float(self.pairs(T, gate)[1].mean())
+        return float(self.pairs(T, self.gate)[1].mean())
 
     def registered(self, T: Array, gate: float, *, lit: bool = False) -> Array:
         """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks; at last by the intensities
@@ -304,14 +297,14 @@ def _different(poses: list[Array], centre: Array, distance: float, angle_deg: fl
 
 def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
     """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
-    sides = _landed(after, missing, new, T), _landed(before, new, missing, se3.inverse(T))
-    meets, hangs, sunk = np.sum([side.count for side in sides], axis=0)
+    count, mine, theirs, normals = _landed(after, missing, new, T)
+    count_back, theirs_back, mine_back, normals_back = _landed(before, new, missing, se3.inverse(T))
+    meets, hangs = count + count_back
     most = max(missing.denied.sum(), new.denied.sum())
-    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SHAPE * (meets + hangs + sunk), LEAST_SEEN * most, MIN_POINTS):
+    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SEEN * most, MIN_POINTS):
         return None
-    mine = np.concatenate([sides[0].own, sides[1].other])
-    theirs = np.concatenate([sides[0].other, sides[1].own])
-    normals = np.concatenate([sides[0].normals, sides[1].normals @ T[:3, :3].T])
+    mine, theirs = np.concatenate([mine, mine_back]), np.concatenate([theirs, theirs_back])
+    normals = np.concatenate([normals, normals_back @ T[:3, :3].T])
     lit = _gains(mine.mean(axis=1), theirs.mean(axis=1), normals)[:, None] * mine
     if not _alike(lit, theirs):
         return None
@@ -319,7 +312,7 @@ def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> 
     explained = float(agree * meets - hangs)
     flat = np.linalg.eigvalsh(normals.T @ normals / len(normals))[1] < FLAT
     ambiguous = "one flat face of it was seen; another may look the same" if flat else None
-    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs + sunk), ambiguous)
+    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs), ambiguous)
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
@@ -333,30 +326,17 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
     return np.exp(np.clip(A @ x, -0.7, 0.7))
 
 
-@dataclass(frozen=True, eq=False)
-class _Landed:
-    """Numbers of the denied vertices of a thing that lie on the other's surface after a motion, hang in free space or
-    lie under the other's surface; colours (n, 3) of some that lie on it and of the other's points, and its normals."""
-
-    count: Array
-    own: Array
-    other: Array
-    normals: Array
-
-
-def _landed(there: Visit, own: Body, other: Body, T: Array) -> _Landed:
+def _landed(there: Visit, own: Body, other: Body, T: Array) -> tuple[Array, Array, Array, Array]:
+    """Numbers (2,) of the denied vertices of a thing that lie on the other's surface after a motion, and that hang in
+    free space; colours (n, 3) of some that lie on it and of the other's points, and their normals after it."""
     moved = own.chosen(own.denied).sample(FINE)
     points, normals = transformed(T, moved.points), moved.normals @ T[:3, :3].T
     gap, near = (np.asarray(found) for found in other.tree.query(points))
     limit = max(own.tolerance, other.tolerance)
     meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
-    samples = there.sample(points)
-    known = ~meets & (samples.state == OBSERVED)
-    hangs = (~meets & (samples.state == EMPTY)) | (known & (samples.sdf > limit))
-    sunk = known & (samples.sdf < -limit)
-    each = own.denied.sum() / len(points)
-    count = each * np.array([meets.sum(), hangs.sum(), sunk.sum()])
-    return _Landed(count, moved.colors[meets], other.colors[near[meets]], normals[meets])
+    hangs = ~meets & there.sample(points).is_free(limit)
+    count = np.array([meets.sum(), hangs.sum()]) * own.denied.sum() / len(points)
+    return count, moved.colors[meets], other.colors[near[meets]], normals[meets]
 
 
 def _alike(mine: Array, theirs: Array) -> bool:
@@ -364,7 +344,7 @@ def _alike(mine: Array, theirs: Array) -> bool:
     shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
     if np.abs(shares[0] - shares[1]).max() > MAX_CHROMA:
         return False
-    grey, off = (mine.mean(axis=1), theirs.mean(axis=1)), np.median(np.abs(mine - theirs))
+    grey = mine.mean(axis=1), theirs.mean(axis=1)
     if min(grey[0].std(), grey[1].std()) < TEXTURE:
-        return bool(off < PLAIN)
-    return bool(off < MAX_COLOR * theirs.mean() and np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)
+        return bool(np.median(np.abs(mine - theirs)) < PLAIN)
+    return bool(np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)

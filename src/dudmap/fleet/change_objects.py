@@ -7,18 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
-from dudmap.fleet.map_samples import EMPTY, OBSERVED
 
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
-BRIDGE = 0.15
-"""The same where no free space was seen between them, metres."""
 REACH = 0.5
-"""The same beside a larger piece, in its lengths."""
+"""The same where no free space was seen between them, in lengths of the larger piece."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
-LEAST_WIDTH = 0.5
-"""Width of a change, the middle one of its three extents, in smallest sizes: edges are long and thin."""
 LEAST_FACING = 0.1
 """Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
 LEAST_COVER = 0.125
@@ -61,21 +56,21 @@ def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[P
     return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
-def assembled(pieces: list[Piece], own: Visit, reach: float = REACH) -> list[Piece]:
+def assembled(pieces: list[Piece], own: Visit) -> list[Piece]:
     """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space: something
-    stood before the middle of one thing. ``reach`` is that of the larger one, in its lengths."""
+    stood before the middle of one thing."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
         for n in reversed(range(len(out))):
-            if is_part(piece, out[n], own, reach):
+            if is_part(piece, out[n], own):
                 piece = joined([out.pop(n), piece])
         out.append(piece)
     return sorted(out, key=lambda one: -one.area)
 
 
-def is_part(piece: Piece, thing: Piece, own: Visit, reach: float = REACH) -> bool:
+def is_part(piece: Piece, thing: Piece, own: Visit) -> bool:
     """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
-    return gap_between(thing, piece) < max(BRIDGE, reach * thing.length) and is_hidden_between(thing, piece, own)
+    return gap_between(thing, piece) < REACH * thing.length and is_hidden_between(thing, piece, own)
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
@@ -85,13 +80,12 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
     ways = np.argsort(gap)[: max(5, len(some) // 5)]
     start, end = some[ways][:, None], a.points[np.asarray(near)[ways]][:, None]
     samples, clear = own.sample((start + (end - start) * steps).reshape(-1, 3)), 2 * own.volume.voxel_size
-    free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > clear))
-    return bool(np.median(free.reshape(len(ways), -1).mean(axis=1) * gap[ways]) < clear)
+    return bool(np.median(samples.is_free(clear).reshape(len(ways), -1).mean(axis=1) * gap[ways]) < clear)
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
     """Whether a piece is large enough, wider than the depth edges there, and was seen often enough, from its front."""
-    if piece.area < LEAST_FACE * min_size**2 or np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
+    if np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
         return False
     if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
         return False
@@ -99,8 +93,7 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
         return False
     if piece.area < LEAST_COVER * np.prod(np.sort(piece.box[1] - piece.box[0])[1:]):
         return False
-    blur = float(np.median(found.blur[piece.vertices]))
-    return is_wide(piece.points, 0.7 * min_size, max(LEAST_WIDTH * min_size, 3 * blur))
+    return is_wide(piece.points, 0.7 * min_size, 3 * float(np.median(found.blur[piece.vertices])))
 
 
 def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

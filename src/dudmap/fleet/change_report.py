@@ -1,8 +1,6 @@
 """The page on what changed: both maps in 3D with the changes in colours, and each change before and after."""
 
 import base64
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import __version__
-from dudmap.app.viewing.report import POLICY, Html, asset, html, joined, packed, script_source
+from dudmap.app.viewing.report import Html, filled, html, joined, packed
 from dudmap.app.viewing.snapshot import jpeg
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_simplification import simplified
@@ -55,10 +52,7 @@ def change_page(
         known = row["kind"] in TINTS
         pictures = _pictures(row, visits, pose) if known and pose is not None and row["id"] <= PICTURES else Html("")
         size = " x ".join(f"{100 * (b - a):.0f}" for a, b in zip(*row["box"], strict=True))
-        moved = (
-            f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
-        )
-        text = f"{size} cm{moved}, confidence {row['confidence']:.2f}" if known else f"{row['area']:.1f} m2 seen once"
+        text = f"{size} cm{motion_and_confidence(row)}" if known else f"{row['area']:.1f} m2 seen once"
         line = '<li data-id="{id}"><b class="{kind}">{id}. {kind}</b> <span>{text}</span>{pictures}</li>'
         rows.append(html(line, id=row["id"], kind=row["kind"], text=text, pictures=pictures))
     up = -np.mean([visit.keyframes[:, :3, 1].mean(axis=0) for visit in visits], axis=0)
@@ -69,19 +63,20 @@ def change_page(
         "changes": [{key: row[key] for key in ("id", "kind", "box")} for row in tree["changes"]],
         "tints": {kind: int.from_bytes(bytes(tint), "big") for kind, tint in TINTS.items()},
     }  # fmt: skip
-    library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
-    script = Html(asset("packed_mesh.js") + asset("changes.js"))
     counts = ", ".join(f"{count} {kind}" for kind, count in tree["counts"].items() if kind in TINTS)
     parts = {
-        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
-        "version": __version__, "css": asset("report.css"), "library": Html(library), "script": script,
         "title": f"{tree['before']} and {tree['after']}", "rows": joined(rows),
         "verdict": "; ".join([counts or "nothing changed", *tree["notes"]]),
         "before": texts[0], "after": texts[1],
-        "scene": Html(json.dumps(scene, allow_nan=False).replace("<", "\\u003c")),
         "tints": Html("".join(f".{kind} {{ color: rgb{tint} }}" for kind, tint in TINTS.items())),
     }  # fmt: skip
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), asset("changes.html"))
+    return filled("changes", scene, parts)
+
+
+def motion_and_confidence(row: dict[str, Any]) -> str:
+    """Text on how far a thing moved, if it did, and the confidence."""
+    moved = f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
+    return f"{moved}, confidence {row['confidence']:.2f}"
 
 
 def _pictures(row: dict[str, Any], visits: Sequence[Visit], T: NDArray[np.float64]) -> Html:

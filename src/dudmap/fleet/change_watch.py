@@ -13,9 +13,9 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.fleet.change_evidence import DEVIATIONS
+from dudmap.fleet.change_evidence import DEVIATIONS, components
 from dudmap.fleet.change_objects import LEAST_FACING
-from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, transformed
+from dudmap.fleet.map_samples import sample_map, transformed
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.frame_source import FrameRead
@@ -150,7 +150,7 @@ class ChangeWatch(RunObserver):
         z = depth[v, u].astype(np.float64)
         points = transformed(T, camera.points(u * step + step // 2, v * step + step // 2, z))
         samples = sample_map(self.volume, points)
-        free = (samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > self._margin(z, sensor)))
+        free = samples.is_free(self._margin(z, sensor))
         cells.count(cells.rows_of(points[free]), 1, frame.timestamp)
         rows = np.flatnonzero(cells.score > 0)
         cells.count(rows[self._looked_at(_centres(cells.codes[rows]), frame.depth, T)[0]], -1, frame.timestamp)
@@ -165,9 +165,8 @@ class ChangeWatch(RunObserver):
         ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
         ahead &= np.abs(local[:, 0]) < local[:, 2] * camera.width / camera.fx
         near = np.flatnonzero(ahead)
-        u, v = np.rint(camera.project(local[near])).astype(np.int64).T
-        inside = (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
-        near, u, v = near[inside], u[inside], v[inside]
+        rows, u, v = camera.nearest_pixels(local[near], border=1)
+        near = near[rows]
         z, reading = local[near, 2], depth[v, u]
         beside = np.minimum.reduce([reading, depth[v, u - 1], depth[v, u + 1], depth[v - 1, u]])
         margin = self._margin(z, self.volume.sensor)
@@ -185,17 +184,9 @@ class ChangeWatch(RunObserver):
         if len(rows) < wanted:
             return
         centres = _centres(cells.codes[rows])
-        tree, left = KDTree(centres), set(range(len(rows)))
-        while left:
-            group, edge = set[int](), {left.pop()}
-            while edge:
-                group |= edge
-                near = tree.query_ball_point(centres[list(edge)], 2.5 * CELL)
-                edge = {n for part in near for n in part} & left
-                left -= edge
-            if len(group) < wanted:
-                continue
-            members = sorted(group)
+        group = components(KDTree(centres).query_pairs(2.5 * CELL, output_type="ndarray"), len(centres))
+        for number in np.flatnonzero(np.bincount(group) >= wanted):
+            members = np.flatnonzero(group == number)
             cells.reported[rows[members]] = True
             box = np.stack([centres[members].min(axis=0) - CELL / 2, centres[members].max(axis=0) + CELL / 2])
             if self._is_known(kind, box):

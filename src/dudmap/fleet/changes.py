@@ -1,7 +1,7 @@
 """What changed between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from dudmap.fleet.change_objects import (
     is_part,
     joined,
 )
-from dudmap.fleet.map_samples import EMPTY, OBSERVED, transformed
-from dudmap.io.exporting.gravity import CONE, PARALLEL
+from dudmap.fleet.map_samples import transformed
+from dudmap.io.exporting.gravity import level_normal
 
 Array = NDArray[np.float64]
 ON_SURFACE = 0.02
@@ -110,12 +110,9 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
 def _moved(
     visits: tuple[Visit, Visit], found: tuple[Evidence, Evidence], pieces: tuple[list[Piece], list[Piece]], size: float
 ) -> list[Change]:
-    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists.
-
-    Pieces between which something may be hidden are looked at apart and as one."""
+    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists."""
     offered = [
-        [(p, Body.of(one, p), is_certain(p, one, size)) for p in dict.fromkeys(side + assembled(side, own, 0.0))]
-        for side, one, own in zip(pieces, found, visits, strict=True)
+        [(p, Body.of(one, p), is_certain(p, one, size)) for p in side] for side, one in zip(pieces, found, strict=True)
     ]
     up, motions = vertical(visits[0]), list[tuple[Motion, Piece, Piece]]()
     for old, missing, old_certain in offered[0]:
@@ -131,17 +128,13 @@ def _moved(
     for motion, *firsts in sorted(motions, key=lambda row: -row[0].explained):
         if any(used[first.vertices].any() for used, first in zip(taken, firsts, strict=True)):
             continue
-        T, things, length = motion.T_after_before, list[Piece](), max(first.length for first in firsts)
+        T, things = motion.T_after_before, list[Piece]()
         for side, (first, one, own, there, tree) in enumerate(
             zip(firsts, found, visits, visits[::-1], surfaces, strict=True)
         ):
             left = [p for p in pieces[side] if not np.isin(p.vertices[0], first.vertices)]
             shares = [_after_motion(p, one, there, T if side == 0 else se3.inverse(T), tree) for p in left]
-            parts = [
-                p
-                for p, (on, hangs) in zip(left, shares, strict=True)
-                if gap_between(p, first) < length and on > 0.5 and hangs < 1 - LEAST_FIT
-            ]
+            parts = [p for p, (on, hangs) in zip(left, shares, strict=True) if on > 0.5 and hangs < 1 - LEAST_FIT]
             thing = joined([first, *parts])
             parts += [
                 p
@@ -156,24 +149,19 @@ def _moved(
 
 
 def vertical(visit: Visit) -> Array:
-    """Unit vector (3,) that most of the surface faces among those near the direction in which the cameras were held."""
+    """Unit vector (3,) of the level surfaces of a visit, or in which the cameras were held."""
     held = -visit.keyframes[:, :3, 1].mean(axis=0)
     held /= np.linalg.norm(held)
-    normals = visit.mesh.normals[:: max(1, len(visit.mesh.normals) // 5000)].astype(np.float64)
-    normals = normals[normals @ held > CONE]
-    if len(normals) == 0:
-        return held
-    facing = normals @ normals[:: max(1, len(normals) // 300)].T > PARALLEL
-    mean = normals[facing[:, np.argmax(facing.sum(axis=0))]].mean(axis=0)
-    return mean / np.linalg.norm(mean)
+    some = visit.mesh.faces[:: max(1, len(visit.mesh.faces) // 20_000)]
+    level = level_normal(replace(visit.mesh, faces=some), held)
+    return held if level is None else level
 
 
 def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
     """Shares of a piece that a motion (4, 4) brings onto surface of the other visit, and into its free space."""
     points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
     on, samples = tree.query(points)[0] < limit, there.sample(points)
-    hangs = ~on & ((samples.state == EMPTY) | ((samples.state == OBSERVED) & (samples.sdf > limit)))
-    return float(on.mean()), float(hangs.mean())
+    return float(on.mean()), float((~on & samples.is_free(limit)).mean())
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:

@@ -15,7 +15,7 @@ from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.fleet.agreement import MIN_AREA, MIN_OVERLAP
 from dudmap.fleet.change_evidence import Evidence, Visit
-from dudmap.fleet.change_report import change_page, tinted
+from dudmap.fleet.change_report import change_page, motion_and_confidence, tinted
 from dudmap.fleet.changes import Change, find_changes, mesh_of
 from dudmap.fleet.map_merging import compare_maps
 from dudmap.own_folder import make_folder, remove_files
@@ -171,9 +171,7 @@ def summary(tree: dict[str, Any]) -> str:
             continue
         x, y, z = row["centre"]
         text = f"{row['id']}: {row['kind']} at {x:.2f}, {y:.2f}, {z:.2f} m, {100 * row['volume'] ** (1 / 3):.0f} cm"
-        if "distance" in row:
-            text += f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees"
-        lines.append(text + f", confidence {row['confidence']:.2f}")
+        lines.append(text + motion_and_confidence(row))
     counts = {kind: count for kind, count in tree["counts"].items() if kind != "unknown"}
     if not counts and not tree["notes"]:
         lines.append("nothing changed")

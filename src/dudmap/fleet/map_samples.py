@@ -41,6 +41,10 @@ class MapSamples:
     intensity_gradient: NDArray[np.float32]
     color: NDArray[np.float32]
 
+    def is_free(self, distance: float | NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each point (n,) was seen to be free, farther than a distance (n,) from any surface, metres."""
+        return (self.state == EMPTY) | ((self.state == OBSERVED) & (self.sdf > distance))
+
 
 def sample_map(volume: TsdfVolume, points: NDArray[np.float64]) -> MapSamples:
     """Trilinear samples of a map at points (n, 3) of its world, metres."""

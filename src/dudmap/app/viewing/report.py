@@ -183,12 +183,7 @@ def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
     found = run.mesh
     about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
-    license, three = asset("three.LICENSE.txt"), asset("three.min.js")
-    script = Html(asset("packed_mesh.js") + asset("report.js"))
-    library = f"\n/* three.js\n{license}*/\n{three}"
     parts = {
-        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
-        "version": __version__,
         "title": printable(run.metrics.get("sequence") or run.folder.name),
         "verdict": _verdict(run.metrics),
         "cards": _cards(run.metrics),
@@ -200,13 +195,21 @@ def report_page(run: RunFiles) -> str:
         ),
         "table": _table(run.metrics),
         "config": run.config or "The run folder has no config.toml.",
-        "run": Html(json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c")),
         "mesh": mesh,
-        "css": asset("report.css"),
-        "library": Html(library),
-        "script": script,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), asset("report.html"))
+    return filled("report", scene_data(run) | {"mesh": about}, parts)
+
+
+def filled(name: str, data: dict[str, Any], parts: dict[str, Any]) -> str:
+    """HTML text of a page of the page folder with its parts, style, program, three.js, and the data of the program."""
+    library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
+    script = Html(asset("scene.js") + asset(f"{name}.js"))
+    parts = parts | {
+        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
+        "version": __version__, "css": asset("report.css"), "library": Html(library), "script": script,
+        "data": Html(json.dumps(data, allow_nan=False).replace("<", "\\u003c")),
+    }  # fmt: skip
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), asset(f"{name}.html"))
 
 
 def scene_data(run: RunFiles) -> dict[str, Any]:

@@ -130,6 +130,16 @@ class Camera:
             axis=-1,
         )
 
+    def nearest_pixels(
+        self, points: NDArray[np.floating], border: int = 0
+    ) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of the points (n, 3) in the camera frame that lie in the image, not on its border of so many pixels, and
+        their nearest pixels u, v."""
+        pixels = np.rint(self.project(points))
+        inside = np.all((pixels >= border) & (pixels < (self.width - border, self.height - border)), axis=1)
+        u, v = pixels[inside].astype(np.int64).T
+        return np.flatnonzero(inside), u, v
+
 
 @lru_cache(maxsize=32)  # asked for in every frame
 def _scaled(camera: Camera, level: int) -> Camera:

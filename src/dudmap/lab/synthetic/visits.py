@@ -327,17 +327,8 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
     elif not any(enough):
         kind = "unknown"
     at = _samples(thing.before or thing.after).mean(axis=0)
-    return TrueChange(
-        thing.name,
-        kind,
-        thing.size,
-        thing.T_after_before,
-        changed[0],
-        changed[1],
-        THINGS[thing.name][2],
-        at,
-        bool(common),
-    )
+    symmetric, (before, after) = THINGS[thing.name][2], changed
+    return TrueChange(thing.name, kind, thing.size, thing.T_after_before, before, after, symmetric, at, bool(common))
 
 
 def _moved(T: Array, oriented: Array) -> Array:
@@ -361,11 +352,9 @@ def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.in
     for T_world_camera, depth in _shots(recording):
         T = se3.inverse(T_world_camera)
         points = surface.vertices @ T[:3, :3].T + T[:3, 3]
-        z = points[:, 2]
-        u, v = np.rint(np.nan_to_num(camera.project(points), nan=-1)).astype(int).T
-        inside = (z > NEAREST) & (z < FARTHEST) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        reading = np.where(inside, depth[np.where(inside, v, 0), np.where(inside, u, 0)], 0)
-        counts += inside & (reading > z + CLEAR)
+        rows, u, v = camera.nearest_pixels(points)
+        z = points[rows, 2]
+        counts[rows] += (z > NEAREST) & (z < FARTHEST) & (depth[v, u] > z + CLEAR)
     return counts
 
 

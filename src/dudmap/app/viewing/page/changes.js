@@ -3,31 +3,15 @@
 
 const data = JSON.parse(document.getElementById("scene").textContent);
 
-function boxOf(change) {
-  const [low, high] = change.box.map((corner) => new THREE.Vector3(...corner));
-  const size = high.clone().sub(low);
-  const edges = new THREE.EdgesGeometry(new THREE.BoxGeometry(size.x, size.y, size.z));
-  const lines = new THREE.LineSegments(edges, new THREE.LineBasicMaterial({ color: data.tints[change.kind] }));
-  lines.position.copy(low).add(high).multiplyScalar(0.5);
-  return lines;
-}
-
-class View {
+class View extends Stage {
   constructor() {
-    this.renderer = new THREE.WebGLRenderer({ canvas: byId("canvas"), antialias: true, preserveDrawingBuffer: true });
-    this.renderer.outputColorSpace = "srgb-linear";
-    this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(60, 1, 0.02, 500);
-    this.up = new THREE.Vector3(...data.up).normalize();
-    this.camera.up.copy(this.up);
-    this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("change", () => this.draw());
+    super(new THREE.Vector3(...data.up).normalize());
     this.boxes = new THREE.Group();
-    for (const change of data.changes) if (data.tints[change.kind] !== undefined) this.boxes.add(boxOf(change));
+    for (const { kind, box } of data.changes)
+      if (data.tints[kind] !== undefined) this.boxes.add(boxEdges(box, data.tints[kind]));
     this.scene.add(this.boxes);
     this.ahead = new THREE.Vector3(...data.ahead);
     this.look(new THREE.Vector3(...data.middle), 0.8 * data.size);
-    new ResizeObserver(() => this.draw()).observe(this.renderer.domElement.parentElement);
   }
 
   look(target, distance) {
@@ -40,14 +24,6 @@ class View {
   flyTo(change) {
     const [low, high] = change.box.map((corner) => new THREE.Vector3(...corner));
     this.look(low.clone().add(high).multiplyScalar(0.5), 1.5 * low.distanceTo(high) + 0.3);
-  }
-
-  draw() {
-    const { clientWidth: width, clientHeight: height } = this.renderer.domElement.parentElement;
-    this.renderer.setSize(width, height, false);
-    this.camera.aspect = width / Math.max(height, 1);
-    this.camera.updateProjectionMatrix();
-    this.renderer.render(this.scene, this.camera);
   }
 }
 

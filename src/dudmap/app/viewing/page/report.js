@@ -15,14 +15,6 @@ function poseMatrix(pose) {
 
 // -- scene ------------------------------------------------------------------------------------------------------------
 
-// Colours are shown as they were recorded: without tone mapping or conversion of colour spaces.
-function makeRenderer() {
-  const renderer = new THREE.WebGLRenderer({ canvas: byId("canvas"), antialias: true, preserveDrawingBuffer: true });
-  renderer.outputColorSpace = "srgb-linear";
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-  return renderer;
-}
-
 function lines(points, color, loop = false) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(points.flat()), 3));
@@ -37,25 +29,20 @@ function frustum(camera, far) {
   return lines([o, a, o, b, o, c, o, d, a, b, b, c, c, d, d, a].map((point) => [...point]), 0xff8a3d);
 }
 
-function boxEdges([[x0, y0, z0], [x1, y1, z1]], color) {
-  const box = new THREE.BoxGeometry(x1 - x0, y1 - y0, z1 - z0);
-  const edges = new THREE.LineSegments(new THREE.EdgesGeometry(box), new THREE.LineBasicMaterial({ color }));
-  edges.position.set((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2);
-  return edges;
-}
-
 const MOVER_COLORS = [0xff4d6d, 0x4dabf7, 0xffd43b, 0x69db7c, 0xda77f2, 0x3bc9db];
 
-class View {
+// Mean of the upward directions (-y) of all cameras.
+function meanUp(poses) {
+  const up = new THREE.Vector3();
+  for (const pose of poses) up.sub(new THREE.Vector3().setFromMatrixColumn(pose, 1));
+  return up.lengthSq() > 1e-6 ? up.normalize() : new THREE.Vector3(0, -1, 0);
+}
+
+class View extends Stage {
   constructor() {
-    this.renderer = makeRenderer();
-    this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(55, 1, 0.02, 500);
-    this.poses = run.poses.map(poseMatrix);
-    this.up = this.meanUp();
-    this.camera.up.copy(this.up);
-    this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("change", () => this.draw());
+    const poses = run.poses.map(poseMatrix);
+    super(meanUp(poses));
+    this.poses = poses;
     this.movers = new THREE.Group();
     this.marks = new THREE.Group();
     this.body = frustum(run.camera, 0.25);
@@ -63,13 +50,6 @@ class View {
     this.path = lines(run.poses.map((pose) => pose.slice(0, 3)), 0x4dd0ff, true);
     this.sun = new THREE.DirectionalLight(0xffffff, 2.2);
     this.scene.add(new THREE.AmbientLight(0xffffff, 1.2), this.sun, this.movers, this.marks, this.body, this.path);
-  }
-
-  // Mean of the upward directions (-y) of all cameras.
-  meanUp() {
-    const up = new THREE.Vector3();
-    for (const pose of this.poses) up.sub(new THREE.Vector3().setFromMatrixColumn(pose, 1));
-    return up.lengthSq() > 1e-6 ? up.normalize() : new THREE.Vector3(0, -1, 0);
   }
 
   setMesh(geometry) {
@@ -153,15 +133,8 @@ class View {
   }
 
   draw() {
-    const { clientWidth: width, clientHeight: height } = this.renderer.domElement.parentElement;
-    if (width !== this.width || height !== this.height) {
-      [this.width, this.height] = [width, height];
-      this.renderer.setSize(width, height, false);
-    }
-    this.camera.aspect = width / Math.max(height, 1);
-    this.camera.updateProjectionMatrix();
     this.sun.position.copy(this.camera.position);
-    this.renderer.render(this.scene, this.camera);
+    super.draw();
   }
 }
 
@@ -246,7 +219,6 @@ function connectScene(view, time) {
     showFrame(view, Number(time.value));
   });
   connectPicking(view);
-  new ResizeObserver(() => view.draw()).observe(view.renderer.domElement.parentElement);
 }
 
 // A click, not a drag, picks a point; two picked points give their distance.
