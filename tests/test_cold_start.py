@@ -142,3 +142,30 @@ def test_two_processes_do_not_write_one_file_of_the_kernel_cache(tmp_path, monke
 
 def test_what_a_second_process_compiles_are_parts_of_the_system():
     assert {*warmup.BESIDE, *warmup.BESIDE_RUN} <= {name for name, _ in warmup.steps()}
+
+
+def test_the_first_demo_waits_for_the_first_of_two_processes_and_ends_both(tmp_path, monkeypatch):
+    calls = []
+
+    class Process:
+        def __init__(self, command, **_):
+            assert set(command[3:]) <= {name for name, _ in warmup.steps()}
+            self.first = "synthetic frames" in command
+
+        def wait(self):
+            calls.append(("wait", self.first))
+
+        def terminate(self):
+            calls.append(("terminate", self.first))
+
+    monkeypatch.setattr(warmup.subprocess, "Popen", Process)
+    monkeypatch.setattr(warmup, "num_threads", lambda: 2)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    with warmup.compiled_for_demo(quiet=True):
+        assert calls == [("wait", True)]
+    assert calls[1:] == [("terminate", False), ("wait", False), ("terminate", True), ("wait", True)]
+    calls.clear()
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "kernel.nbi").touch()
+    with warmup.compiled_for_demo(quiet=True):
+        assert calls == []

@@ -36,12 +36,13 @@ def demo(
     """
     from dudmap.app.pipeline.run import run
     from dudmap.lab.synthetic import sequence
+    from dudmap.lab.warmup import compiled_for_demo
 
     config = o.read_config(None, None, assignments)
     recording = sequence(scene="room", movers=("person",), frames=max_frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
-    with observers(watching) as watchers:
+    with observers(watching) as watchers, compiled_for_demo(quiet=quiet):
         done = run(
             recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watchers, keeper),
         )  # fmt: skip

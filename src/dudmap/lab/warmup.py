@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from dudmap.app.doctor import compiled_kernels
+from dudmap.app.doctor import COMPILING, compiled_kernels
+from dudmap.app.terminal import say
 from dudmap.config import Config
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
@@ -125,18 +126,31 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 
 @contextmanager
-def compiled_beside(parts: tuple[str, ...]) -> Iterator[Callable[[], object]]:
-    """A second process compiles ``parts`` while this lasts, where there is a core for it; the function waits for it."""
-    if not parts or num_threads() < 2:
-        yield lambda: None
+def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
+    """Processes compile their parts while this lasts, where there is a core for them; the function waits for the first
+    one."""
+    environment = os.environ | {"DUDMAP_THREADS": "1"}
+    commands = [[sys.executable, "-m", __name__, *parts] for parts in processes] if num_threads() > 1 else []
+    with ExitStack() as ends:
+        started = [subprocess.Popen(each, env=environment, stdin=subprocess.DEVNULL) for each in commands]
+        for process in started:
+            ends.callback(process.wait)
+            ends.callback(process.terminate)
+        yield started[0].wait if started else lambda: None
+
+
+@contextmanager
+def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
+    """Before the demo as the first run of all, wait until two other processes have compiled what it needs, since a
+    compiler takes as much memory again as the run."""
+    if compiled_kernels() or num_threads() < 2:
+        yield
         return
-    command, environment = [sys.executable, "-m", __name__, *parts], os.environ | {"DUDMAP_THREADS": "1"}
-    process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
-    try:
-        yield process.wait
-    finally:
-        process.terminate()
-        process.wait()
+    if not quiet:
+        say(COMPILING, err=True)
+    with compiled_beside(("tracking, labels and map", "synthetic frames"), BESIDE_RUN) as wait:
+        wait()
+        yield
 
 
 def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
@@ -145,7 +159,7 @@ def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]
     compiled = compiled_kernels()
     if live and compiled:
         dict(steps())["colour camera"]()
-    return compiled_beside(() if compiled else BESIDE_RUN)
+    return compiled_beside(*(() if compiled else (BESIDE_RUN,)))
 
 
 if __name__ == "__main__":
