@@ -41,6 +41,7 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
         free_count.append(part.free_count)
         entries.append(part.owners + np.int32(first))
         first += len(part.coords)
+        del part  # it holds a copy of the voxels, of which those that are written next make another one
     small = {
         "format": FORMAT,
         "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),

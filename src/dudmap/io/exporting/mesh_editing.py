@@ -13,6 +13,9 @@ from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
 from dudmap.io.exporting.run_content import SPECK, Box, ExportOptions
 
+PART = 65536
+"""Triangles whose corners are in memory at a time to find their surface."""
+
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
     """Mesh after all options that change it: crop, pieces, holes, triangles, in this order."""
@@ -106,7 +109,8 @@ def rotated(mesh: Mesh, R: NDArray[np.float64]) -> Mesh:
 
 def face_areas(mesh: Mesh) -> NDArray[np.float64]:
     """Surface (F,) of each triangle, square metres."""
-    return np.linalg.norm(face_vectors(mesh), axis=1)
+    parts = (mesh.faces[first : first + PART] for first in range(0, max(len(mesh.faces), 1), PART))
+    return np.concatenate([np.linalg.norm(face_vectors(replace(mesh, faces=part)), axis=1) for part in parts])
 
 
 def face_vectors(mesh: Mesh) -> NDArray[np.float64]:
