@@ -85,7 +85,7 @@ CALLS = {
 @pytest.mark.parametrize("words", CALLS)
 def test_json_is_one_object_on_stdout(slam, where, monkeypatch, words):
     monkeypatch.chdir(where)
-    monkeypatch.setattr("dudmap.cli.demo.MostDynamicFrame.save_picture", lambda *_: None)  # of a map that is faked
+    monkeypatch.setattr("dudmap.cli.demo.MostDynamicFrame.finish", lambda *_: None)  # with a map that is faked
     done = call(*CALLS[words], "--json")
     assert done.exit_code == 0, done.output
     assert len(done.stdout.strip().splitlines()) == 1

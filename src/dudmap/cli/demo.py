@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from dudmap.app.pipeline.frame_source import FrameRead
     from dudmap.core.frames.frame import Frame
-    from dudmap.core.geometry.camera import Camera
     from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
 
 
 def demo(
@@ -46,16 +46,20 @@ def demo(
         done = run(
             recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watchers, keeper),
         )  # fmt: skip
-        keeper.save_picture(out, recording.camera)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
 class MostDynamicFrame(RunObserver):
-    """Observer that keeps the tracked frame with the largest true dynamic mask."""
+    """Observer that keeps the tracked frame with the largest true dynamic mask, and writes demo.png at the end."""
 
     def __init__(self) -> None:
         self._coverage = -1.0
         self._kept: tuple[Frame, NDArray[np.bool_], FrameResult] | None = None
+        self._slam: Slam | None = None
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """Keep the system, of whose map a view is rendered."""
+        self._slam = slam
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Keep the frame if its dynamic share exceeds that of all earlier ones."""
@@ -65,15 +69,14 @@ class MostDynamicFrame(RunObserver):
         if mask.mean() > self._coverage:
             self._coverage, self._kept = float(mask.mean()), (frame, mask, result)
 
-    def save_picture(self, out: Path, camera: "Camera") -> None:
-        """Write demo.png into the run folder ``out``, from the map it holds."""
+    def finish(self, out: Path) -> None:
+        """Write demo.png into the run folder ``out``."""
         from dudmap.app.viewing.snapshot import save_sheet
-        from dudmap.core.map.volume import TsdfVolume
 
-        if self._kept is None:
+        if self._kept is None or self._slam is None:
             return
         frame, mask, result = self._kept
         assert result.T_world_camera is not None
-        view = TsdfVolume.load(out / "map.npz").raycast(result.T_world_camera, camera)
+        view = self._slam.volume.raycast(result.T_world_camera, self._slam.camera)
         path = out / "demo.png"
         save_sheet(path, frame, result.dynamic_mask, result.residuals, view, result.T_world_camera, mask)
