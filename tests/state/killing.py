@@ -16,6 +16,7 @@ import numpy as np
 from delayed_color import FAULTS
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.run_folder import LOCK
 from dudmap.app.pipeline.storing import Storing
 from dudmap.app.state.database import StateDatabase
 from dudmap.config import Config
@@ -77,10 +78,13 @@ def proceed(sequence, out):
 
 
 def results(out):
-    """Checksums of all files of a run but for times, and its metrics without them."""
+    """Checksums of all files of a run but for times, and its metrics without them.
+
+    The lock file is no result: a process killed between its last result and its end leaves one, which locks nothing.
+    """
     files = {str(path.relative_to(out)): path for path in sorted(out.rglob("*")) if path.is_file()}
     sums = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()
-            if name not in ("metrics.json", "timings.csv")}  # fmt: skip
+            if name not in ("metrics.json", "timings.csv", LOCK)}  # fmt: skip
     metrics = json.loads((out / "metrics.json").read_text())
     return sums | {key: value for key, value in metrics.items() if key not in TIMES}
 

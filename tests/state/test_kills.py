@@ -12,6 +12,7 @@ from killing import begin, in_child, killed, lost_and_found, proceed, results
 
 from delayed_color import DELAY, find_early
 from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.run_folder import LOCK
 from dudmap.app.state.database import StateDatabase
 from dudmap.errors import DudmapError
 
@@ -37,6 +38,7 @@ def whole(tmp_path_factory):
     assert found["corrected"] >= 1
     assert found["lost"] >= 3
     assert found["complete"]
+    assert not (out / LOCK).exists()
     assert f"delay = {DELAY}" in (out / "calibration.toml").read_text()
     yield sequence, found, duration, len(statements)
     patch.undo()
