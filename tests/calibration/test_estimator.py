@@ -172,8 +172,11 @@ def test_no_readout_is_longer_than_a_frame():
     assert collector.keyframes[0].interval == pytest.approx(1 / FPS)
 
 
-@pytest.mark.parametrize(("name", "vignetting"), zip(STEPS, (0.1, 0.5, 0.3, 0.3, 0.2, 0.4), strict=True))
-def test_vignetting_is_found_beside_all_other_faults(name, vignetting):
+FAULTS = ("place", 0.5), ("lens and timing", 0.1), ("shutter and timing", 0.4)
+
+
+@pytest.mark.parametrize(("name", "vignetting"), FAULTS)
+def test_vignetting_is_found_beside_other_faults(name, vignetting):
     v, u = np.indices(CAMERA.shape)
     away = (np.square(u - 79.5) + np.square(v - 59.5)) / (79.5**2 + 59.5**2)
     left = np.exp(-vignetting * away)[..., None]
