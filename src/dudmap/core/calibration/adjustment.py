@@ -249,10 +249,13 @@ class Adjustment:
         assert system is not None
         return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
-    def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
-        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n)."""
+    def with_poses(self, pairs: PairSet, start: Fit) -> tuple[Fit, NDArray[np.float32]]:
+        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n).
+
+        From coarse to fine: another delay moves what a turning camera sees by more than the finer images tell.
+        """
         fit, residuals = start, np.empty((2, 0), np.float32)
-        for level in levels or self.levels[-2:]:
+        for level in self.levels:
             for _ in range(FIT_ITERATIONS):
                 system = self._linearize(pairs, fit, level, COST_SCALES, known=True)
                 fit = fit.moved(pairs, system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system.parts, COST_SCALES)

@@ -204,10 +204,7 @@ class CalibrationEstimator:
         within = _halves(keyframes, PAIRS)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
-        fits = [
-            self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given), self.adjustment.levels)[0]
-            for pairs in halves
-        ]
+        fits = [self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given))[0] for pairs in halves]
         costs = [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)]
         start = _Trial(~everything, fits, costs, halves)
         proven, evidence = self._proven(halves, start)
