@@ -169,7 +169,7 @@ class Fit:
     ) -> "Fit":
         """After a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
         return Fit(
-            self.calibration.retract(step[:NUM_PARAMETERS]),
+            self.calibration.retract(step[:NUM_PARAMETERS]) if step[:NUM_PARAMETERS].any() else self.calibration,
             se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
             self.light - parts.light_step - _times(parts.light_slope, step[pairs.places]),
             scales,
