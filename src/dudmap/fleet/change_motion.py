@@ -1,11 +1,11 @@
 """Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
 
-For each turn about the vertical the shifts on which most pairs of like points agree (a Hough transform) are refined by
-the iterative closest point method, in both directions: to planes (Chen and Medioni 1992), by the intensities along the
-surface (Park et al. 2017), points near those of like colours (Johnson and Kang 1997). What stands before and after is
-tilted little. The motion is the one with the highest score of close surface with like colours, less what it would leave
-hanging in seen free space. Others that are not worse by more than chance make it ambiguous; what points and their noise
-leave open is its covariance.
+Motions that bring a point onto one of like colour and slope, turned about the vertical, are refined by the iterative
+closest point method, in both directions: to planes (Chen and Medioni 1992), by the intensities along the surface (Park
+et al. 2017), points near those of like colours (Johnson and Kang 1997). What stands before and after is tilted little.
+The motion is the one with the highest score of close surface with like colours, less what it would leave hanging in
+seen free space. Others that are not worse by more than chance make it ambiguous; what points and their noise leave open
+are its standard deviations.
 """
 
 from dataclasses import dataclass, replace
@@ -22,13 +22,11 @@ from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
-VOTERS, TURNS, PEAKS = 150, 36, 3
-"""Points of each surface that vote, turns for which they do, and shifts of each that are tried."""
-LIKE_NORMALS = 0.85
-"""Least cosine between the normals of points that vote for a shift."""
+PAIRS, STARTS = 20_000, 1000
+"""Pairs of points that are drawn, and those of a like colour and slope that give a motion."""
 RANKED, COARSE, FINE = 60, 300, 1500
 """Points of a surface when starts are ranked, in the first registration, and in the last one and when it is judged."""
-TRIED, REFINED, NEAR, NEAR_DEG = 16, 4, 0.05, 10.0
+TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
 """Starts that are registered and motions that are registered once more; those that differ less are one (m, degrees)."""
 ICP_ROUNDS, STOP = 20, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
@@ -40,11 +38,11 @@ bending of the map shift whole faces, metres."""
 PATCH, DEVIATIONS_APART = 0.05, 2.0
 """Edge of the patches whose scores are taken to be independent, metres, and standard errors by which their sum is
 worse by more than chance."""
-COLOR_LENGTH = 0.15
+COLOR_LENGTH = 0.3
 """Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
 Kang 1997), in sizes of the thing."""
 COLOR_GATE = 50.0
-"""Difference of colours at which points do not vote for a shift, grey levels."""
+"""Difference of colours at which points do not meet, grey levels."""
 COLOR_SCALE = 15.0
 """Difference of colours at which the Cauchy weight of two points that meet falls to a half, grey levels."""
 PULL = 0.05
@@ -59,7 +57,7 @@ LIGHT, DAMPING = 0.2, 0.02
 weight of its direction per point."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
-LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.1
+LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
 """Shares of the surface that must lie on the other's: of what would else hang in free space, and of the larger of both
 surfaces; and of the former that must be explained: what has other colours or another shape meets by chance."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
@@ -216,20 +214,23 @@ class _Meeting:
         self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
 
     def starts(self) -> list[Array]:
-        """Motions (4, 4) that bring many points onto others of like colours and normals: for each turn about the
-        vertical the shifts with the most votes; those first that bring most of some points near others."""
-        a, b = (source.sample(VOTERS) for source in self.sources)
-        like = np.abs(a.colors[:, None] - b.colors[None]).max(axis=2) < COLOR_GATE
-        edge, gate, out = max(0.1 * self.size, 2 * self.gate), max(0.1 * self.size, 3 * self.gate), list[Array]()
-        for turn in np.linspace(0, 2 * np.pi, TURNS, endpoint=False):
-            R = se3.exp_rotation(self.up * turn)
-            rows, columns = np.nonzero(like & (a.normals @ R.T @ b.normals.T > LIKE_NORMALS))
-            shifts = b.points[columns] - a.points[rows] @ R.T
-            cell, votes = np.unique(np.floor(shifts / edge), axis=0, return_inverse=True, return_counts=True)[1:]
-            for best in np.argsort(-votes, kind="stable")[:PEAKS]:
-                T = np.eye(4)
-                T[:3, :3], T[:3, 3] = R, shifts[cell.reshape(-1) == best].mean(axis=0)
-                out.append(T)
+        """Motions (4, 4) that bring a point of a onto one of b with a like colour: the turn about the vertical is that
+        between their normals, and any where these are vertical; those first that bring most points near others."""
+        (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()
+        gate = max(0.1 * self.size, 3 * self.gate)
+        rows, columns = rng.integers(len(a.points), size=PAIRS), rng.integers(len(b.points), size=PAIRS)
+        like = np.abs(a.colors[rows] - b.colors[columns]).max(axis=1) < COLOR_GATE
+        rises = a.normals[rows] @ up, b.normals[columns] @ up
+        use = np.flatnonzero(like & (np.abs(rises[0] - rises[1]) < 0.3))[:STARTS]
+        for row, column, rise in zip(rows[use], columns[use], rises[0][use], strict=True):
+            n, m = a.normals[row], b.normals[column]
+            turn = np.arctan2(up @ np.cross(n, m), n @ m - (up @ n) * (up @ m))
+            if abs(rise) > 0.9:
+                turn = rng.uniform(-np.pi, np.pi)
+            T = np.eye(4)
+            T[:3, :3] = se3.exp_rotation(up * turn)
+            T[:3, 3] = b.points[column] - T[:3, :3] @ a.points[row]
+            out.append(T)
         scores, Ts = np.zeros(len(out)), np.array(out).reshape(-1, 4, 4)
         for own, tree, T in zip(self.sources, self.trees, (Ts, np.linalg.inv(Ts)), strict=True):
             some = own.sample(RANKED)
