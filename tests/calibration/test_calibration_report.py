@@ -24,7 +24,7 @@ def test_what_was_not_tested_is_called_assumed():
 
 
 def test_what_was_tested_and_kept_has_its_uncertainty():
-    shutter, timing, _, geometry, vignetting = findings(estimate(0.025, -0.5))
+    shutter, timing, _, _, geometry, vignetting = findings(estimate(0.025, -0.5))
     assert "not proven (-0.5 standard errors, 3 are needed); rows are taken to be read out within 0.0 ms" in shutter
     for text in ("assumed as given; tested", "-0.5 standard errors", "delay 25 ms"):
         assert text in timing

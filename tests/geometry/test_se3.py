@@ -55,6 +55,9 @@ def test_rotation_vectors_up_to_half_a_turn(omega):
     R = Rotation.from_rotvec(omega).as_matrix()
     assert np.allclose(se3.log_rotation(R), omega, atol=1e-6)
     assert np.isclose(se3.rotation_angle(R), np.linalg.norm(omega), atol=1e-6)
+    T = np.eye(4)
+    T[:3, :3] = R
+    assert np.allclose(se3.log_all(T[None])[0, 3:], omega, atol=1e-6)
 
 
 @QUICK

@@ -14,19 +14,34 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import vectors
 from numba import njit
 from vectors import counts
 
-from dudmap.config import Config
-from dudmap.core.backends.cpu import evidence, filtering, fusion, integration, labeling, registration, sampling
+from dudmap.config import Config, SensorConfig
+from dudmap.core.backends.cpu import (
+    color_pairs,
+    evidence,
+    filtering,
+    fusion,
+    integration,
+    labeling,
+    registration,
+    sampling,
+)
+from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
+from dudmap.core.calibration.keyframes import KeyframeCollector
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.slam import Slam
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
+PAIRS = color_pairs, "linearize_pairs"
 FEWEST = {
     (registration, "linearize_rows"): {"loops": 2, "fma": 66, "packed": 180, "converted": 18},
+    PAIRS: {"loops": 1, "fma": 268, "packed": 480},
     (sampling, "sample_rows"): {"loops": 2, "fma": 8, "packed": 15, "converted": 10},
     (integration, "integrate_blocks"): {"loops": 4, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
@@ -60,8 +75,13 @@ def signatures():
     camera = DEFAULT_CAMERA.resized(160, 120)
     recording = sequence(frames=3, camera=camera)
     slam = Slam(camera, Config().override(["volume.voxel_size=0.04", "preprocess.depth_max=4"]))
+    given = Calibration.registered(camera)
+    collector, still = KeyframeCollector(given), np.zeros(camera.shape, bool)
     for index in range(3):
         slam.process(recording[index])
+        collector.add(slam.preprocess(recording[index]), np.eye(4), still)
+    pairs = PairSet([Pair(collector.keyframes[0], collector.keyframes[0])])
+    Adjustment(given, SensorConfig()).with_poses(pairs, Fit.tracked(pairs, given))
     for caller in CALLERS:  # one that comes from the cache does not say what it calls its own functions with
         njit(nogil=True, error_model="numpy")(caller.py_func).compile(caller.signatures[0])
     kernels = {name: getattr(module, name) for module, name in FEWEST}
@@ -106,7 +126,7 @@ def test_hot_loops_are_vectorised(signatures, processor):
 
 
 def test_kernels_without_vectorisation_are_caught(signatures, tmp_path):
-    shorter = {name: None for module, name in FEWEST if (module, name) not in LONGEST}
+    shorter = {name: None for module, name in FEWEST if (module, name) not in (*LONGEST, PAIRS)}
     # numba's cache tells processors apart, but not this setting
     caught = scalar_loops(compiled(signatures, shorter, NUMBA_LOOP_VECTORIZE="0", NUMBA_CACHE_DIR=str(tmp_path)))
     assert {sentence.split()[0] for sentence in caught} == shorter.keys()

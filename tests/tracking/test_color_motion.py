@@ -89,6 +89,18 @@ def test_a_first_frame_takes_its_colours_from_the_velocity_of_the_second():
     assert errors[1] < errors[0]
 
 
+def test_the_second_frame_is_remembered_with_the_colours_of_its_velocity():
+    """The third one, whose colours are registered, is compared with it."""
+    faulty, exact = recording(color_delay=0.03), recording()
+    slam, plain = (Slam(SMALL, calibration=given) for given in (truth_of(faulty), None))
+    for n in (0, 1):
+        slam.process(faulty[n])
+    inside, sharp = np.s_[10:-10, 10:-10], smooth(plain.prepare(exact[1]).pyramid.fine.intensity)
+    remembered, recorded = slam.predictor.ego_motion.last.pyramid, plain.prepare(faulty[1]).pyramid
+    after, before = (np.abs(smooth(images.fine.intensity) - sharp)[inside].mean() for images in (remembered, recorded))
+    assert after < 0.7 * before
+
+
 def test_frames_that_are_prepared_ahead_give_the_same_result():
     faulty = recording(color_delay=0.02, color_translation=(0.02, 0.0, 0.0))
     calibration = truth_of(faulty)

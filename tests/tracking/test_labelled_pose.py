@@ -10,6 +10,7 @@ import pytest
 from dudmap import Config, Slam
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.pose_prediction import PosePrediction
 from dudmap.lab import synthetic
 
@@ -30,7 +31,7 @@ def labelled(tracked, moving=None):
     """Share of the readings that are dynamic where a registration has ended ``DRAWN`` beside the pose."""
     slam, view, tracking = tracked
     T_drawn = se3.retract(tracking.T_world_camera, DRAWN)
-    prediction = PosePrediction(T_drawn, lambda: None, moving)
+    prediction = PosePrediction(T_drawn, lambda: None, lambda: None, moving)
     labels = slam.front_end._label(slam.reference, view, prediction, replace(tracking, T_world_camera=T_drawn))
     return np.count_nonzero(labels.dynamic) / np.count_nonzero(view.labelled.depth)
 
@@ -54,7 +55,7 @@ def test_what_moves_close_to_the_camera_does_not_take_the_labelled_pose_along(tr
     assert np.linalg.norm(se3.log(T_nearest @ se3.inverse(T))[:3]) > 0.008
     assert np.nanmean(np.abs(after)) < np.nanmean(np.abs(before))
     moved = SimpleNamespace(blind=False, known_dynamic=None, labelled=level)
-    prediction = PosePrediction(T, lambda: None, None)
+    prediction = PosePrediction(T, lambda: None, lambda: None, None)
     np.testing.assert_array_equal(slam.front_end._by_distances(slam.reference, moved, prediction, T), T)
 
 
@@ -65,3 +66,26 @@ def test_the_nearest_minimum_of_the_distances_is_at_the_true_pose_where_a_desk_d
     _, _, z, roll, pitch, _ = se3.log(T @ se3.inverse(tracking.T_world_camera))
     assert abs(z) < 0.004
     assert np.hypot(roll, pitch) < np.radians(0.3)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_what_two_images_show_to_move_is_left_out_where_a_registration_fits_badly(tracked, monkeypatch, known):
+    """Again from the same pose, unless the labels know all of it already."""
+    slam, view, tracking = tracked
+    moving = np.zeros(view.labelled.depth.shape, bool)
+    moving[:, 40:80] = view.labelled.depth[:, 40:80] > 0
+    labels = SimpleNamespace(dynamic=moving if known else np.zeros_like(moving))
+    asked = []
+
+    def register_from(volume, view, prediction, T_init):
+        asked.append(prediction.moving)
+        fits = prediction.moving is not None
+        return PoseEstimate(replace(tracking, color_residual=0.01 if fits else 0.03), labels, None, view)
+
+    monkeypatch.setattr(slam.front_end, "register_from", register_from)
+    monkeypatch.setattr(slam.monitor, "is_unusual", lambda found: found.color_residual > 0.02)
+    monkeypatch.setattr(slam.monitor, "relative_misfit", lambda found: (1.0, 100 * found.color_residual))
+    T, motion = tracking.T_world_camera, SimpleNamespace(moving_after=moving)
+    found = slam.front_end.register(slam.reference, view, PosePrediction(T, lambda: T, lambda: motion))
+    assert [left_out is not None for left_out in asked] == ([False] if known else [False, True])
+    assert found.tracking.color_residual == (0.03 if known else 0.01)

@@ -279,14 +279,13 @@ class Mapper:
             Ts.append(found.T_world_camera)
         before = np.stack([fused.T_world_camera for fused in window])
         after = before[0] @ se3.inverse(Ts[0]) @ np.stack(Ts)  # the first camera is the world
-        atlas.make_room()
-        new = atlas.make_volume()
+        volume.clear()
         for fused, T in zip(window, after, strict=True):
             frame = replace(fused.frame, color=exposed_color(fused.frame.color, fused.exposure))
-            new.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
+            volume.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
         stamps = np.array([fused.frame.timestamp for fused in window])
         corrections = after @ se3.inverse(before)
-        atlas.move(stamps, corrections, new)
+        atlas.move(stamps, corrections, volume)
         self._redundancy.apply_correction(corrections[-1])
         return corrections[-1]
 

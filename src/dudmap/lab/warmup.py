@@ -86,7 +86,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ends = slam.preprocess(frames[0]), slam.preprocess(frames[-1])
         first, second = (keyframe(image, registered, start, np.zeros(6), static) for image in ends)
         pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, config.sensor)
-        adjustment.with_poses(pairs, Fit.tracked(pairs, registered), adjustment.levels)
+        adjustment.with_poses(pairs, Fit.tracked(pairs, registered))
 
     def several_voxel_sizes() -> None:
         adaptive = Slam(CAMERA, config.override(["volume.adaptive=true", "volume.adaptive_bend=0.05"]))

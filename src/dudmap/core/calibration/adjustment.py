@@ -1,13 +1,14 @@
 """Adjustment of the calibration together with the poses of the keyframes (bundle adjustment over dense pairs)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
 from dudmap.core.backends.cpu.color_pairs import POSE, SHARED, UNKNOWNS, linearize_pairs
+from dudmap.core.backends.cpu.linear_systems import solved
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import SensorNoise, single
 from dudmap.core.calibration.keyframes import SAME_SURFACE, ColorKeyframe, color_levels
@@ -42,7 +43,8 @@ class PairSet:
         points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) where those of each begin.
         residual_starts: (P + 1,) where the residuals of each pair begin: one per point of its first frame.
         twists: (F, 6) float32 velocities; ``color_offsets``: (F,) float32.
-        places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames.
+        places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames;
+            ``products``: (P 625,) where their products do.
     """
 
     def __init__(self, pairs: Sequence[Pair], stride: int = 1) -> None:
@@ -65,6 +67,8 @@ class PairSet:
         own = np.broadcast_to(np.arange(NUM_PARAMETERS), (len(pairs), NUM_PARAMETERS))
         poses = NUM_PARAMETERS + POSE * self.numbers[:, :, None] + np.arange(POSE)
         self.places = np.concatenate([own, poses.reshape(len(pairs), -1)], axis=1)
+        size = NUM_PARAMETERS + POSE * len(frames)
+        self.products = (size * self.places[:, :, None] + self.places[:, None, :]).reshape(-1)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -160,14 +164,15 @@ class Fit:
         """The start: poses as tracked, equal light."""
         return cls(calibration, pairs.Ts_camera_world, np.tile([1.0, 0.0], (len(pairs), 1)))
 
-    def moved(self, pairs: PairSet, step: NDArray[np.float64], system: "_System") -> "Fit":
+    def moved(
+        self, pairs: PairSet, step: NDArray[np.float64], parts: "_PairSystems", scales: tuple[float, float]
+    ) -> "Fit":
         """After a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
-        parts = system.parts
         return Fit(
-            self.calibration.retract(step[:NUM_PARAMETERS]),
+            self.calibration.retract(step[:NUM_PARAMETERS]) if step[:NUM_PARAMETERS].any() else self.calibration,
             se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
             self.light - parts.light_step - _times(parts.light_slope, step[pairs.places]),
-            system.scales,
+            scales,
         )
 
 
@@ -191,18 +196,17 @@ class _PairSystems:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations (13 + 6 F) of all pairs with all priors, and the scales of both residuals."""
+    """Normal equations (13 + 6 F) of all pairs with all priors."""
 
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     parts: _PairSystems
-    scales: tuple[float, float]
 
     def step(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Gauss-Newton step in all poses and in the parameters that are free."""
         moves = np.concatenate([free, np.ones(len(self.b) - NUM_PARAMETERS, dtype=bool)])
         out = np.zeros(len(self.b))
-        out[moves] = -_solved(self.H[np.ix_(moves, moves)], self.b[moves])
+        out[moves] = -solved(self.H[np.ix_(moves, moves)], self.b[moves])
         return out
 
 
@@ -238,22 +242,25 @@ class Adjustment:
             for _ in range(ITERATIONS if level == levels[-1] else COARSE_ITERATIONS):
                 system = self._linearize(pairs, fit, level, fit.scales)
                 step = system.step(free)
-                fit = fit.moved(pairs, step, system)
+                fit = fit.moved(pairs, step, system.parts, new_scales(system.parts.residuals, fit.scales))
                 small = small + 1 if np.all(np.abs(step[:NUM_PARAMETERS]) < settled) else 0
                 if small == STEADY:
                     break
         assert system is not None
         return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
-    def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
-        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n)."""
-        fit, system = start, None
-        for level in levels or self.levels[-2:]:
+    def with_poses(self, pairs: PairSet, start: Fit) -> tuple[Fit, NDArray[np.float32]]:
+        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n).
+
+        From coarse to fine: another delay moves what a turning camera sees by more than the finer images tell.
+        """
+        fit, residuals = start, np.empty((2, 0), np.float32)
+        for level in self.levels:
             for _ in range(FIT_ITERATIONS):
                 system = self._linearize(pairs, fit, level, COST_SCALES, known=True)
-                fit = fit.moved(pairs, system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system)
-        assert system is not None
-        return fit, system.parts.residuals
+                fit = fit.moved(pairs, system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system.parts, COST_SCALES)
+                residuals = system.parts.residuals
+        return replace(fit, scales=new_scales(residuals, COST_SCALES)), residuals
 
     def costs(self, pairs: PairSet, start: Fit) -> NDArray[np.float64]:
         """Mean robust costs (2, P) of intensities and depths of pairs whose poses are fitted with the calibration of a
@@ -270,7 +277,7 @@ class Adjustment:
         """Sandwich (13, 13) with the scores of frames as its meat."""
         own, rest = slice(0, NUM_PARAMETERS), slice(NUM_PARAMETERS, None)
         # the poses follow the parameters: Schur complement, for the curvature and for every score
-        across = _solved(system.H[rest, rest], system.H[rest, own]).T
+        across = solved(system.H[rest, rest], system.H[rest, own]).T
         bread = np.linalg.inv(system.H[own, own] - across @ system.H[rest, own])
         scores = np.zeros((len(pairs.Ts_camera_world), NUM_PARAMETERS))
         of_pose = across.T.reshape(-1, POSE, NUM_PARAMETERS)[pairs.numbers]  # (P, 2, 6, 13)
@@ -289,14 +296,13 @@ class Adjustment:
         parts = self._linearize_pairs(pairs, fit, level, scales, known=known)
         tracked, places = pairs.Ts_camera_world, pairs.places
         size = NUM_PARAMETERS + POSE * len(tracked)
-        flat = size * places[:, :, None] + places[:, None, :]
-        H = np.asarray(np.bincount(flat.reshape(-1), parts.H.reshape(-1), size * size), np.float64)
-        H, b = H.reshape(size, size), np.asarray(np.bincount(places.reshape(-1), parts.b.reshape(-1), size), np.float64)
+        H = np.asarray(np.bincount(pairs.products, parts.H.reshape(-1), size * size), np.float64).reshape(size, size)
+        b = np.asarray(np.bincount(places.reshape(-1), parts.b.reshape(-1), size), np.float64)
         diagonal = np.concatenate([self.prior, np.tile(CORRELATED * POSE_SIGMA**-2, len(tracked))])
         away = se3.log_all(fit.Ts_camera_world @ se3.inverse(tracked))
         H[np.arange(size), np.arange(size)] += diagonal
         b += diagonal * np.concatenate([self.given.step_to(fit.calibration), away.reshape(-1)])
-        return _System(H, b, parts, new_scales(parts.residuals, scales))
+        return _System(H, b, parts)
 
     def _linearize_pairs(
         self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
@@ -342,17 +348,6 @@ def _without_light(
     return _PairSystems(
         M_transposed @ reduced @ M, _times(M_transposed, gradient), light_slope @ M, light_step, residuals
     )
-
-
-def _solved(H: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solution of ``H x = right`` by SciPy (SuperLU): most frames make no pair.
-
-    The threads of a dense solver would keep the cores that the tracking needs busy for 50 ms after every call.
-    """
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
-
-    return splu(csc_array(H)).solve(np.ascontiguousarray(right))
 
 
 def _times(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:

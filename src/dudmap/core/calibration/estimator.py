@@ -25,10 +25,12 @@ from dudmap.core.geometry.calibration import MAX_VIGNETTING, NUM_PARAMETERS, PAR
 GROUPS: dict[str, tuple[str, ...]] = {
     "timing": ("delay", "readout"),
     "lens": ("k1", "k2"),
+    "center": ("center_x", "center_y"),
     "geometry": (*PARAMETERS[:6], "log_focal", "center_x", "center_y"),
 }
 """Parameters that leave their given values together. A translation looks much like a rotation, but only both together
-explain the colours of the near and of the far half of a recording."""
+explain the colours of the near and of the far half of a recording. The principal point, which a crop displaces, is
+tested alone as well: a few seconds prove two parameters where they do not prove nine."""
 TESTED = GROUPS | {"vignetting": ("vignetting",)}
 """All that is tested and reported: the vignetting changes no place, and is found once the others are."""
 MIN_PAIRS = 14
@@ -41,7 +43,7 @@ STRIDE = 2
 """Every so many points of a frame decide what is estimated; all of them enter the result."""
 SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
 """Group of the readout of the depth, which is estimated before all others, and the name of its parameter."""
-MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.1, SHUTTER: 0.01}
+MATERIAL = {"timing": 0.01, "lens": 0.01, "center": 0.01, "geometry": 0.1, SHUTTER: 0.01}
 """Share by which it must decrease: less is not worth leaving the given values, however certain it is. A depth image
 bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
 recording with such a depth (TUM fr1_xyz) the geometry gained up to 7 % and its use made the poses worse; a colour
@@ -202,10 +204,7 @@ class CalibrationEstimator:
         within = _halves(keyframes, PAIRS)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
-        fits = [
-            self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given), self.adjustment.levels)[0]
-            for pairs in halves
-        ]
+        fits = [self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given))[0] for pairs in halves]
         costs = [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)]
         start = _Trial(~everything, fits, costs, halves)
         proven, evidence = self._proven(halves, start)
@@ -256,8 +255,8 @@ class CalibrationEstimator:
 
     def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
         """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
-        trial, evidence, rest = start, dict[str, float](), list(GROUPS)
-        while rest:
+        trial, evidence = start, dict[str, float]()
+        while rest := [name for name, members in GROUPS.items() if not trial.free[mask_of(members)].all()]:
             trials = {name: self._trial(halves, trial, [name]) for name in rest}
             evidence |= {name: other.improvement(trial)[0] for name, other in trials.items()}
             proven = [name for name in rest if trials[name].proves(trial, name)]
@@ -265,10 +264,13 @@ class CalibrationEstimator:
                 break
             best = max(proven, key=lambda name: evidence[name])
             trial = trials[best]
-            rest.remove(best)
+        if "geometry" in rest and "center" in rest:
+            rest.remove("center")  # which is a part of it
         if len(rest) > 1:
             trial, names = self._together(halves, trial, rest)
             evidence |= names
+        if trial.free[mask_of(GROUPS["geometry"])].all():
+            evidence["center"] = max(evidence["center"], evidence["geometry"])
         return trial, evidence
 
     def _together(

@@ -100,9 +100,10 @@ def log(T: Matrix) -> Matrix:
 
 def log_all(Ts: Matrix) -> Matrix:
     """Twists (n, 6) of rigid motions (n, 4, 4), each as by ``log``."""
-    from scipy.spatial.transform import Rotation
-
-    omega = Rotation.from_matrix(Ts[:, :3, :3]).as_rotvec() if len(Ts) else np.empty((0, 3))
+    omega, sine, cosine = _turns(Ts[:, :3, :3])
+    omega *= np.where(sine < 1e-12, 0.5, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None]
+    for n in np.flatnonzero(cosine < 0).tolist():  # at half a turn the sine says nothing
+        omega[n] = log_rotation(Ts[n, :3, :3])
     theta_squared = np.sum(omega * omega, axis=1)
     small = theta_squared < 1e-8
     square = np.where(small, 1.0, theta_squared)
@@ -143,9 +144,14 @@ def rotation_angle(T: Matrix) -> float:
 
 def rotation_angles(Ts: Matrix) -> Matrix:
     """Angles (n,) in radians, in [0, pi], of the rotations of ``Ts`` (n, 4, 4) or (n, 3, 3)."""
-    R = Ts[:, :3, :3]
-    twice_sine = np.linalg.norm(R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]], axis=1)
-    return np.arctan2(twice_sine, np.trace(R, axis1=1, axis2=2) - 1)
+    _, sine, cosine = _turns(Ts[:, :3, :3])
+    return np.arctan2(sine, cosine)
+
+
+def _turns(R: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+    """Axes (n, 3) of rotations times twice the sines of their angles, and twice the sines and cosines (n,)."""
+    axes = R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]
+    return axes, np.linalg.norm(axes, axis=1), np.trace(R, axis1=1, axis2=2) - 1
 
 
 def interpolate(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:

@@ -87,7 +87,7 @@ class VoxelBlocks(Stateful):
     _released: Remembered[NDArray[np.int32]]
     table_size: Remembered[int]
 
-    def __init__(self, slots: int = 1 << 14) -> None:
+    def __init__(self, slots: int = 1 << 16) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)

@@ -113,7 +113,10 @@ class ColorMotion(Stateful):
 
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
         """The frame with its colours registered, once its pose (4, 4) is known."""
-        return self._with_colors(view, self._velocity(view, T_world_camera))
+        velocity = self._velocity(view, T_world_camera)
+        if self._is_first:  # the next frames are compared with its intensities
+            view = self._with_levels(view, velocity)
+        return self._with_colors(view, velocity)
 
     def frame_with_colors(self, frame: Frame, camera: Camera, velocity: NDArray[np.float64]) -> Frame:
         """A frame with its recorded colour registered to the depth.

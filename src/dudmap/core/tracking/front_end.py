@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import reduced
 from dudmap.core.geometry.se3 import agree
@@ -67,17 +68,25 @@ class FrontEnd(Stateful):
         """Pose and labels of a frame, from its predicted pose on.
 
         A registration that fits unusually badly, or that did not settle and moved far from its prediction, is repeated
-        from the pose that the ego-motion between the last two images gives; the one that fits better is returned.
+        from the pose that the ego-motion between the last two images gives, without what does not follow it; the one
+        that fits better is returned. Somebody near who begins to walk has more shape than the floor, which fits the map
+        wherever the camera is: registered as static, he carries the camera along, and only the colours of the floor
+        contradict.
         """
         estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
         tracking = estimate.tracking
         arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
         if arrived and not self.monitor.is_unusual(tracking):
             return estimate
-        T_image = prediction.image_pose()
-        if T_image is None or agree(T_image, tracking.T_world_camera, *SAME_POSE):
+        T_image, motion = prediction.image_pose(), prediction.image_motion()
+        if T_image is None or motion is None:
             return estimate
-        other = self.register_from(volume, view, prediction, T_image)
+        moving = motion.moving_after if prediction.moving is None else prediction.moving | motion.moving_after
+        unseen = moving if estimate.labels is None else moving & ~estimate.labels.dynamic
+        same = agree(T_image, tracking.T_world_camera, *SAME_POSE)
+        if same and not exceeds_noise_share(unseen, view.labelled):
+            return estimate
+        other = self.register_from(volume, view, replace(prediction, moving=moving), T_image)
         misfit, other_misfit = (sum(self.monitor.relative_misfit(e.tracking)) for e in (estimate, other))
         better = other.tracking.converged and (not tracking.converged or other_misfit < CLEARLY_BETTER * misfit)
         return other if better else estimate

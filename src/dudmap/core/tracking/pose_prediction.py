@@ -1,8 +1,8 @@
 """Prediction of the camera pose, by constant velocity or by the ego-motion between two images."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,6 +145,7 @@ class PosePrediction:
     Attributes:
         T_world_camera: (4, 4).
         image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
+        image_motion: Computes this ego-motion and what does not follow it; None if unknown.
         moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
         slow: (h, w) bool, those of them that an older image shows to move; None where none was compared.
         moving_before: (h, w) bool, as ``moving``, of the first image of the map where it is compared with that; else
@@ -154,6 +155,7 @@ class PosePrediction:
 
     T_world_camera: NDArray[np.float64]
     image_pose: ImagePose
+    image_motion: Callable[[], DominantMotion | None]
     moving: NDArray[np.bool_] | None = None
     slow: NDArray[np.bool_] | None = None
     moving_before: NDArray[np.bool_] | None = None
@@ -229,7 +231,9 @@ class PosePredictor(Stateful):
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
         self.mostly_slow = False
-        by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
+        by_velocity = PosePrediction(
+            T_expected, lambda: self._image_pose(self._ego_motion(view)), lambda: self._ego_motion(view)
+        )
         if not self.ego_motion.active:
             return by_velocity
         with view.timer("parallax"):
@@ -260,7 +264,10 @@ class PosePredictor(Stateful):
             if not young:  # where the map is known, it labels better than two images
                 moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
         slowly = None if slow is None else slow.moving
-        return PosePrediction(T_image, by_velocity.image_pose, moving, slowly, moving_before, unverified)
+        return replace(
+            by_velocity, T_world_camera=T_image, moving=moving, slow=slowly, moving_before=moving_before,
+            unverified_mask=unverified,
+        )  # fmt: skip
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image that the next one is compared with: a frame whose pose is accepted."""

@@ -1,7 +1,12 @@
-"""Loop over points that two frames see: intensity and depth differences, and their derivatives."""
+"""Loops over points that two frames see: intensity and depth differences, and their derivatives.
+
+Points are worked through in stages like the rows of a registration: loads and the tests that leave points out are loops
+of their own, so that the arithmetic on what is left, which fills rows of numbers without gaps, is vectorised.
+"""
 
 import numpy as np
 
+from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import elements, rotate, sigma, transform
 
@@ -13,16 +18,9 @@ MARGIN = f32(8)
 """Border of the colour images that is not used, pixels: twice the wider Gaussian of their filter."""
 NEAREST = f32(0.05)
 """Depth in the colour camera below which a point is not seen, metres."""
-
-
-@scalar
-def _bilinear(image, u, v):
-    """Value and derivatives along u and v of an image at a place that has four neighbours."""
-    i, j = int(u), int(v)
-    a, b = u - f32(i), v - f32(j)
-    p, q, r, s = image[j, i], image[j, i + 1], image[j + 1, i], image[j + 1, i + 1]
-    upper, lower = p + (q - p) * a, r + (s - r) * a
-    return upper + (lower - upper) * b, (q - p) + ((s - r) - (q - p)) * b, lower - upper
+POINTS, PADDED = 1040, 16
+"""Points that are worked through together, whose rows of numbers begin at different places of a cache; and in what
+portions: what is left of a row beyond the points is no point."""
 
 
 @scalar
@@ -49,97 +47,212 @@ def _central(image, u, v):
 
 
 @scalar
-def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, z, D):
-    """Intensity that a colour image gives a point of its depth camera, and how the point moves in it.
+def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
+    """Where a colour image shows a point of its depth camera.
 
     Args:
-        image: (h, w) float32 at ``scale`` times the full size of the colour image.
-        place: (3, 4) float32 T_color_depth.
-        twist: (6,) float32 motion of the depth camera per second.
-        intrinsics: (4,) float32 at the size of ``image``.
-        lens: (5,) float32 k1, k2, p1, p2, k3.
-        scale: Size of ``image`` over the full size.
+        place: Elements of T_color_depth.
+        twist: (6) motion of the depth camera per second.
+        intrinsics: (4) at the size of the image.
+        lens: (5) k1, k2, p1, p2, k3.
         offset, readout: Seconds.
+        height: Of the image.
         x, y, z: The point.
-        D: (2, 16) float32 out, derivatives of the pixel u, v by the parameters and by the point.
 
     Returns:
-        Intensity, NaN outside the image, at its border or where ``image`` is; its derivatives along u and v.
+        Pixel u, v; then for ``_derivatives`` the point in the colour camera; the motion of its place per second of
+        delay; its coordinates at depth 1; the radial factor of the lens, its growth; the share of the readout.
     """
-    h, w = image.shape
-    p = elements(place)
     ax = twist[0] + twist[4] * z - twist[5] * y
     ay = twist[1] + twist[5] * x - twist[3] * z
     az = twist[2] + twist[3] * y - twist[4] * x
     bx = twist[4] * az - twist[5] * ay
     by = twist[5] * ax - twist[3] * az
     bz = twist[3] * ay - twist[4] * ax
-    x0, y0, z0 = transform(p, x, y, z)
-    x1, y1, z1 = rotate(p, ax, ay, az)
-    x2, y2, z2 = rotate(p, bx, by, bz)
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    half, tau, share, zero = f32(0.5), offset, f32(0), f32(0)
+    x0, y0, z0 = transform(place, x, y, z)
+    x1, y1, z1 = rotate(place, ax, ay, az)
+    x2, y2, z2 = rotate(place, bx, by, bz)
+    half, tau, share = f32(0.5), offset, f32(0)
     for _ in range(2):
         c = half * tau * tau
-        row = (y0 - tau * y1 + c * y2) / max(z0 - tau * z1 + c * z2, NEAREST) * fy + cy
-        share = (min(max(row, zero), f32(h)) + half) / f32(h) - half
+        row = (y0 - tau * y1 + c * y2) / max(z0 - tau * z1 + c * z2, NEAREST) * intrinsics[1] + intrinsics[3]
+        share = (min(max(row, f32(0)), height) + half) / height - half
         tau = offset + readout * share
     c = half * tau * tau
     qx, qy, qz = x0 - tau * x1 + c * x2, y0 - tau * y1 + c * y2, z0 - tau * z1 + c * z2
-    if qz < NEAREST:
-        return f32(np.nan), zero, zero
-    by_z = f32(1) / qz
-    a, d = qx * by_z, qy * by_z
-    k1, k2, p1, p2, k3 = lens[0], lens[1], lens[2], lens[3], lens[4]
+    a, d = qx / qz, qy / qz
     r2 = a * a + d * d
-    radial, growth = f32(1) + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (f32(2) * k2 + f32(3) * r2 * k3)
-    u = (a * radial + f32(2) * p1 * a * d + p2 * (r2 + f32(2) * a * a)) * fx + cx
-    v = (d * radial + p1 * (r2 + f32(2) * d * d) + f32(2) * p2 * a * d) * fy + cy
-    if not ((u >= MARGIN) & (v >= MARGIN) & (u < f32(w) - MARGIN) & (v < f32(h) - MARGIN)):
-        return f32(np.nan), zero, zero
-    across = f32(2) * (a * d * growth + p1 * a + p2 * d)
-    along_x = radial + f32(2) * (a * a * growth + p1 * d) + f32(6) * p2 * a
-    along_y = radial + f32(2) * (d * d * growth + p2 * a) + f32(6) * p1 * d
-    value, gu, gv = _central(image, u, v)
-    rx, ry, rz = qx - p[3], qy - p[7], qz - p[11]
-    mx, my, mz = tau * x2 - x1, tau * y2 - y1, tau * z2 - z1
-    for k in range(2):
-        # derivative of one pixel coordinate by the point in the colour camera
-        f = (fx if k == 0 else fy) * by_z
-        gx, gy = (f * along_x, f * across) if k == 0 else (f * across, f * along_y)
-        gz = -(gx * a + gy * d)
-        D[k, 0], D[k, 1], D[k, 2] = gx, gy, gz
-        D[k, 3], D[k, 4], D[k, 5] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
-        D[k, 6] = u - cx if k == 0 else v - cy
-        D[k, 7], D[k, 8] = (scale, zero) if k == 0 else (zero, scale)
-        D[k, 9] = fx * a * r2 if k == 0 else fy * d * r2
-        D[k, 10] = D[k, 9] * r2
-        D[k, 11] = gx * mx + gy * my + gz * mz
-        D[k, 12] = D[k, 11] * share
-        D[k, 13] = p[0] * gx + p[4] * gy + p[8] * gz
-        D[k, 14] = p[1] * gx + p[5] * gy + p[9] * gz
-        D[k, 15] = p[2] * gx + p[6] * gy + p[10] * gz
-    return value, gu, gv
+    radial = f32(1) + r2 * (lens[0] + r2 * (lens[1] + r2 * lens[4]))
+    growth = lens[0] + r2 * (f32(2) * lens[1] + f32(3) * r2 * lens[4])
+    u = (a * radial + f32(2) * lens[2] * a * d + lens[3] * (r2 + f32(2) * a * a)) * intrinsics[0] + intrinsics[2]
+    v = (d * radial + lens[2] * (r2 + f32(2) * d * d) + f32(2) * lens[3] * a * d) * intrinsics[1] + intrinsics[3]
+    u = u if qz >= NEAREST else f32(-1)
+    return u, v, qx, qy, qz, tau * x2 - x1, tau * y2 - y1, tau * z2 - z1, a, d, radial, growth, share
 
 
 @scalar
-def _across_surface(D, tangents, T):
-    """Derivatives (2 x 2, row by row) of a pixel by a step along two tangents of the surface, turned by ``T``."""
-    a, b, c = rotate(T, tangents[0], tangents[1], tangents[2])
-    d, e, f = rotate(T, tangents[3], tangents[4], tangents[5])
+def _by_point(seen, intrinsics, lens, su, sv):
+    """Derivatives of su u + sv v, of the pixel u, v at which a point is ``seen``, by the point in the colour camera."""
+    qz, a, d, radial, growth = seen[4], seen[8], seen[9], seen[10], seen[11]
+    across = f32(2) * (a * d * growth + lens[2] * a + lens[3] * d)
+    along_x = radial + f32(2) * (a * a * growth + lens[2] * d) + f32(6) * lens[3] * a
+    along_y = radial + f32(2) * (d * d * growth + lens[3] * a) + f32(6) * lens[2] * d
+    fu, fv = su * intrinsics[0] / qz, sv * intrinsics[1] / qz
+    gx, gy = fu * along_x + fv * across, fu * across + fv * along_y
+    return gx, gy, -(gx * a + gy * d)
+
+
+@scalar
+def _by_parameters(seen, place, intrinsics, scale, su, sv, g):
+    """Derivatives of su u + sv v by the 13 parameters, ``g`` those by the point in the colour camera."""
+    u, v, a, d, share = seen[0], seen[1], seen[8], seen[9], seen[12]
+    rx, ry, rz = seen[2] - place[3], seen[3] - place[7], seen[4] - place[11]
+    r2 = a * a + d * d
+    bent = (su * intrinsics[0] * a + sv * intrinsics[1] * d) * r2
+    delay = g[0] * seen[5] + g[1] * seen[6] + g[2] * seen[7]
     return (
-        D[0, 13] * a + D[0, 14] * b + D[0, 15] * c, D[0, 13] * d + D[0, 14] * e + D[0, 15] * f,
-        D[1, 13] * a + D[1, 14] * b + D[1, 15] * c, D[1, 13] * d + D[1, 14] * e + D[1, 15] * f,
+        g[0], g[1], g[2], ry * g[2] - rz * g[1], rz * g[0] - rx * g[2], rx * g[1] - ry * g[0],
+        su * (u - intrinsics[2]) + sv * (v - intrinsics[3]), su * scale, sv * scale, bent, bent * r2, delay,
+        delay * share,
     )  # fmt: skip
 
 
 @scalar
-def _product(a, b, count):
-    """Sum of the products of the first ``count`` elements."""
-    total = f32(0)
+def _back(place, g):
+    """Derivatives by a point in the depth camera, from those by the point in the colour camera."""
+    return (
+        place[0] * g[0] + place[4] * g[1] + place[8] * g[2],
+        place[1] * g[0] + place[5] * g[1] + place[9] * g[2],
+        place[2] * g[0] + place[6] * g[1] + place[10] * g[2],
+    )
+
+
+@scalar
+def _along(g, a, b, c, d, e, f):
+    """Derivatives along both tangents of the surface, from those by a point of it."""
+    return g[0] * a + g[1] * b + g[2] * c, g[0] * d + g[1] * e + g[2] * f
+
+
+@scalar
+def _padded(count):
+    """Length of rows of so many numbers that are worked through in whole portions."""
+    return (count + PADDED - 1) & -PADDED
+
+
+@scalar
+def _six(values):
+    """Six numbers as a tuple, like ``elements``."""
+    return values[0], values[1], values[2], values[3], values[4], values[5]
+
+
+@scalar
+def _add_products(rows, count, begin, place, H, b):
+    """Add the products of all rows, of which the last one holds the residuals, to the normal equations; unknowns from
+    ``begin`` on are wanted, the first of which is number ``place + begin`` of ``H``, ``b``."""
+    last, padded = len(rows) - 1, _padded(count)
+    for k in range(begin, last + 1):
+        for n in range(count, padded):
+            rows[k, n] = f32(0)
+    for k in range(begin, last + 1):
+        for m in range(begin, min(k, last - 1) + 1):
+            total = f32(0)
+            for n in range(padded):
+                total += rows[k, n] * rows[m, n]
+            if k == last:
+                b[place + m] += total
+            else:
+                H[place + k, place + m] += total
+
+
+@scalar
+def _measured_points(start, stop, points, T, depth, intrinsics, step, residuals, number, at):
+    """Points ``start`` to ``stop`` where the second depth image shows the same surface; returns how many there are.
+
+    ``number`` and the rows of ``at`` are filled: their places in both depth cameras, the depth difference, and the
+    slopes of the depth along u and v.
+    """
+    h, w = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    count, one = 0, f32(1)
+    for n in range(start, stop):
+        residuals[0, n] = residuals[1, n] = f32(np.nan)
+        X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
+        x, y, z = transform(T, X, Y, Z)
+        if z < NEAREST:
+            continue
+        u, v = x / z * fx + cx, y / z * fy + cy
+        if not ((u >= one) & (v >= one) & (u < f32(w - 2)) & (v < f32(h - 2))):
+            continue
+        i, j = int(u), int(v)
+        p, q, r, s = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
+        near, far = min(min(p, q), min(r, s)), max(max(p, q), max(r, s))
+        if near <= f32(0) or far - near > step * near:
+            continue
+        a, b = u - f32(i), v - f32(j)
+        upper, lower = p + (q - p) * a, r + (s - r) * a
+        difference = upper + (lower - upper) * b - z
+        if abs(difference) > step * near:
+            continue
+        number[count] = n
+        at[0, count], at[1, count], at[2, count] = X, Y, Z
+        at[3, count], at[4, count], at[5, count] = x, y, z
+        at[6, count], at[7, count], at[8, count] = difference, (q - p) + ((s - r) - (q - p)) * b, lower - upper
+        count += 1
+    return count
+
+
+@scalar
+def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
+    """Derivatives of the depth differences of ``_measured_points`` by the pose, and the differences themselves, times
+    the root of their weights, into ``rows``; the differences over ``noise`` into ``plain``."""
+    fx, fy = intrinsics[0], intrinsics[1]
+    for n in range(_padded(count)):
+        x, y, z, difference = at[3, n], at[4, n], at[5, n], at[6, n]
+        deviation = sigma(z, noise)
+        # the step along the ray is longer than the distance to a slanted surface
+        sx, sy = at[7, n] * fx / z, at[8, n] * fy / z
+        sz = -(sx * x + sy * y) / z - f32(1)
+        scaled = by_depth / deviation / np.sqrt(sx * sx + sy * sy + sz * sz)
+        root = np.sqrt(huber / max(abs(difference * scaled), huber)) * scaled
+        rows[0, n], rows[1, n], rows[2, n] = root * sx, root * sy, root * sz
+        rows[3, n], rows[4, n], rows[5, n] = (
+            root * (y * sz - z * sy), root * (z * sx - x * sz), root * (x * sy - y * sx)
+        )  # fmt: skip
+        rows[6, n] = root * difference
+        plain[n] = difference / deviation
+
+
+@scalar
+def _colored_points(count, tangents, first, second, number, at, pixels, shades):
+    """Of so many points those that both colour images show, at ``pixels``; returns how many there are.
+
+    They move to the front of ``number`` and ``at``, whose rows from 6 on receive their tangents. ``shades`` receives
+    the value and the slopes of either image.
+    """
+    height, width = f32(first.shape[0]) - MARGIN, f32(first.shape[1]) - MARGIN
+    left = 0
     for n in range(count):
-        total += a[n] * b[n]
-    return total
+        u, v, s, t = pixels[0, n], pixels[1, n], pixels[2, n], pixels[3, n]
+        if not ((u >= MARGIN) & (v >= MARGIN) & (u < width) & (v < height)):
+            continue
+        if not ((s >= MARGIN) & (t >= MARGIN) & (s < width) & (t < height)):
+            continue
+        before, fu, fv = _central(first, u, v)
+        after, gu, gv = _central(second, s, t)
+        slopes = fu + fv + gu + gv
+        # NaN beside what moves; of sums, the compiler may take isfinite() apart
+        if not (np.isfinite(before) & np.isfinite(after) & (slopes == slopes)):
+            continue
+        m = number[n]
+        number[left] = m
+        for k in range(6):
+            at[k, left] = at[k, n]
+        for k in range(6):
+            at[6 + k, left] = tangents[m, k]
+        shades[0, left], shades[1, left], shades[2, left] = before, fu, fv
+        shades[3, left], shades[4, left], shades[5, left] = after, gu, gv
+        left += 1
+    return left
 
 
 @scalar
@@ -161,10 +274,14 @@ def linearize_pair(
         T: (3, 4) float32, first to second depth camera.
         depth: (h, w) float32 of the second frame, metres, 0 = none.
         depth_intrinsics: (4,) float32.
-        first, second: (h, w) float32 colour intensities as recorded.
-        first_twist, second_twist: (6,) float32 per second.
+        first, second: (h, w) float32 colour intensities as recorded, NaN where they are not to be used.
+        first_twist, second_twist: (6,) float32, motion of the depth camera per second.
         first_offset, second_offset: Delay of the middle row of each colour image, s.
-        place, intrinsics, lens, scale, readout: As for ``_color``.
+        place: (3, 4) float32 T_color_depth.
+        intrinsics: (4,) float32 at the size of the colour images.
+        lens: (5,) float32 k1, k2, p1, p2, k3.
+        scale: Size of the colour images over their full size.
+        readout: Of the colour images, s.
         gain, bias: The second intensity is gain times the first plus bias.
         step: Depth differences beyond this share of the depth are another surface.
         noise: SensorNoise, of float32.
@@ -176,96 +293,76 @@ def linearize_pair(
         H: (UNKNOWNS, UNKNOWNS) float64 out.
         b: (UNKNOWNS,) float64 out, gradient.
     """
-    t = elements(T)
-    unturned = (f32(1), f32(0), f32(0), f32(0), f32(0), f32(1), f32(0), f32(0), f32(0), f32(0), f32(1), f32(0))
-    h, w = depth.shape
-    fx, fy, cx, cy = depth_intrinsics[0], depth_intrinsics[1], depth_intrinsics[2], depth_intrinsics[3]
-    J, one, two = np.zeros(UNKNOWNS, f32), np.zeros((2, 16), f32), np.zeros((2, 16), f32)
-    # derivatives and, last, residuals of all points times the root of their weights, unknown by unknown: sums of
-    # products over the points are vectorised, those over the unknowns of a point are not
-    of_color = np.empty((UNKNOWNS + 1, points.shape[0]), f32)
-    of_depth = np.empty((POSE + 1, points.shape[0]), f32)
-    colored, measured = 0, 0
-    nan, half = f32(np.nan), f32(0.5)
-    for n in range(points.shape[0]):
-        residuals[0, n], residuals[1, n] = nan, nan
-        X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
-        x, y, z = transform(t, X, Y, Z)
-        if z < NEAREST:
-            continue
-        u, v = x / z * fx + cx, y / z * fy + cy
-        if not ((u >= f32(1)) & (v >= f32(1)) & (u < f32(w - 2)) & (v < f32(h - 2))):
-            continue
-        i, j = int(u), int(v)
-        near = min(min(depth[j, i], depth[j, i + 1]), min(depth[j + 1, i], depth[j + 1, i + 1]))
-        far = max(max(depth[j, i], depth[j, i + 1]), max(depth[j + 1, i], depth[j + 1, i + 1]))
-        if near <= f32(0) or far - near > step * near:
-            continue
-        surface, du, dv = _bilinear(depth, u, v)
-        difference = surface - z
-        if abs(difference) > step * near:
-            continue
-        deviation = sigma(z, noise)
-        residuals[1, n] = difference / deviation
-        # the step along the ray is longer than the distance to a slanted surface
-        sx, sy = du * fx / z, dv * fy / z
-        sz = -(sx * x + sy * y) / z - f32(1)
-        scaled = by_depth / deviation / np.sqrt(sx * sx + sy * sy + sz * sz)
-        r = difference * scaled
-        weight = huber / max(abs(r), huber)
-        J[13], J[14], J[15] = sx, sy, sz
-        J[16], J[17], J[18] = y * sz - z * sy, z * sx - x * sz, x * sy - y * sx
-        root = np.sqrt(weight)
-        for k in range(POSE):
-            of_depth[k, measured] = root * scaled * J[SHARED + k]
-        of_depth[POSE, measured] = root * r
-        measured += 1
-        before, fu, fv = _color(first, place, first_twist, intrinsics, lens, scale, first_offset, readout, X, Y, Z, one)
-        after, gu, gv = _color(
-            second, place, second_twist, intrinsics, lens, scale, second_offset, readout, x, y, z, two
-        )
-        slopes = fu + fv + gu + gv
-        # NaN beside what moves; of sums, the compiler may take isfinite() apart
-        if not (np.isfinite(before) & np.isfinite(after) & (slopes == slopes)):
-            continue
-        p0, p1, p2, p3 = _across_surface(one, tangents[n], unturned)
-        q0, q1, q2, q3 = _across_surface(two, tangents[n], t)
-        det, turned = p0 * p3 - p1 * p2, q0 * q3 - q1 * q2
-        if det * turned <= f32(0):
-            continue
-        a0, a1 = (q0 * p3 - q1 * p2) / det, (q1 * p0 - q0 * p1) / det
-        a2, a3 = (q2 * p3 - q3 * p2) / det, (q3 * p0 - q2 * p1) / det
-        area = a0 * a3 - a1 * a2
-        if not ((area > f32(0.25)) & (area < f32(4))):  # seen too differently to look alike
-            continue
-        # mean derivative of the texture in the second image: A^-T takes that of the first there
-        gu = half * (gu + gain * (a3 * fu - a2 * fv) / area)
-        gv = half * (gv + gain * (a0 * fv - a1 * fu) / area)
-        difference = after - gain * before - bias
-        residuals[0, n] = difference
-        r = difference * by_color
-        root = np.sqrt(huber / max(abs(r), huber)) * by_color
-        for k in range(begin, SHARED):
-            J[k] = gu * (two[0, k] - a0 * one[0, k] - a1 * one[1, k]) + gv * (
-                two[1, k] - a2 * one[0, k] - a3 * one[1, k]
-            )
-        for k in range(SHARED, SHARED + 3):
-            J[k] = gu * two[0, k] + gv * two[1, k]
-        J[16], J[17], J[18] = y * J[15] - z * J[14], z * J[13] - x * J[15], x * J[14] - y * J[13]
-        J[19], J[20] = -before, f32(-1)
-        for k in range(begin, UNKNOWNS):
-            of_color[k, colored] = root * J[k]
-        of_color[UNKNOWNS, colored] = root * difference
-        colored += 1
+    wide_vectors()
+    T, place, own, other = elements(T), elements(place), _six(first_twist), _six(second_twist)
+    intrinsics = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    lens = lens[0], lens[1], lens[2], lens[3], lens[4]
+    height, half, zero = f32(first.shape[0]), f32(0.5), f32(0)
+    number, at, plain = np.empty(POINTS, np.int64), np.empty((12, POINTS), f32), np.empty(POINTS, f32)
+    pixels, shades = np.empty((4, POINTS), f32), np.empty((6, POINTS), f32)
+    # derivatives and, last, residuals times the root of their weights, unknown by unknown
+    distance, color = np.empty((POSE + 1, POINTS), f32), np.empty((UNKNOWNS + 1, POINTS), f32)
     H[:], b[:] = 0.0, 0.0
-    for k in range(begin, UNKNOWNS):
-        b[k] = _product(of_color[k], of_color[UNKNOWNS], colored)
-        for m in range(begin, k + 1):
-            H[k, m] = _product(of_color[k], of_color[m], colored)
-    for k in range(POSE):
-        b[SHARED + k] += _product(of_depth[k], of_depth[POSE], measured)
-        for m in range(k + 1):
-            H[SHARED + k, SHARED + m] += _product(of_depth[k], of_depth[m], measured)
+    for start in range(0, points.shape[0], POINTS):
+        stop = min(start + POINTS, points.shape[0])
+        count = _measured_points(start, stop, points, T, depth, depth_intrinsics, step, residuals, number, at)
+        _depth_terms(count, at, depth_intrinsics, noise, by_depth, huber, distance, plain)
+        _add_products(distance, count, 0, SHARED, H, b)
+        for n in range(count):
+            residuals[1, number[n]] = plain[n]
+        for n in range(_padded(count)):
+            seen = _seen(place, own, intrinsics, lens, first_offset, readout, height, at[0, n], at[1, n], at[2, n])
+            pixels[0, n], pixels[1, n] = seen[0], seen[1]
+            seen = _seen(place, other, intrinsics, lens, second_offset, readout, height, at[3, n], at[4, n], at[5, n])
+            pixels[2, n], pixels[3, n] = seen[0], seen[1]
+        count = _colored_points(count, tangents, first, second, number, at, pixels, shades)
+        for n in range(_padded(count)):
+            X, Y, Z, x, y, z = at[0, n], at[1, n], at[2, n], at[3, n], at[4, n], at[5, n]
+            before, fu, fv = shades[0, n], shades[1, n], shades[2, n]
+            after, gu, gv = shades[3, n], shades[4, n], shades[5, n]
+            seen = _seen(place, own, intrinsics, lens, first_offset, readout, height, X, Y, Z)
+            seen_after = _seen(place, other, intrinsics, lens, second_offset, readout, height, x, y, z)
+            # derivatives of the pixels along the tangents, in the first image and, with these turned, in the second
+            a, c, d = at[6, n], at[7, n], at[8, n]
+            e, f, g = at[9, n], at[10, n], at[11, n]
+            p0, p1 = _along(_back(place, _by_point(seen, intrinsics, lens, f32(1), zero)), a, c, d, e, f, g)
+            p2, p3 = _along(_back(place, _by_point(seen, intrinsics, lens, zero, f32(1))), a, c, d, e, f, g)
+            a, c, d = rotate(T, a, c, d)
+            e, f, g = rotate(T, e, f, g)
+            q0, q1 = _along(_back(place, _by_point(seen_after, intrinsics, lens, f32(1), zero)), a, c, d, e, f, g)
+            q2, q3 = _along(_back(place, _by_point(seen_after, intrinsics, lens, zero, f32(1))), a, c, d, e, f, g)
+            det, turned = p0 * p3 - p1 * p2, q0 * q3 - q1 * q2
+            alike = det * turned > zero
+            by_det = f32(1) / (det if alike else f32(1))
+            a0, a1 = (q0 * p3 - q1 * p2) * by_det, (q1 * p0 - q0 * p1) * by_det
+            a2, a3 = (q2 * p3 - q3 * p2) * by_det, (q3 * p0 - q2 * p1) * by_det
+            area = a0 * a3 - a1 * a2
+            alike &= (area > f32(0.25)) & (area < f32(4))  # else seen too differently to look alike
+            by_area = f32(1) / (area if alike else f32(1))
+            # mean derivative of the texture in the second image: A^-T takes that of the first there
+            gu = half * (gu + gain * (a3 * fu - a2 * fv) * by_area)
+            gv = half * (gv + gain * (a0 * fv - a1 * fu) * by_area)
+            difference = after - gain * before - bias
+            root = np.sqrt(huber / max(abs(difference * by_color), huber)) * by_color
+            root = root if alike else zero
+            plain[n] = difference if alike else f32(np.nan)
+            gu, gv = root * gu, root * gv
+            su, sv = -(gu * a0 + gv * a2), -(gu * a1 + gv * a3)
+            by_point = _by_point(seen_after, intrinsics, lens, gu, gv)
+            jx, jy, jz = _back(place, by_point)
+            one = _by_parameters(seen, place, intrinsics, scale, su, sv, _by_point(seen, intrinsics, lens, su, sv))
+            two = _by_parameters(seen_after, place, intrinsics, scale, gu, gv, by_point)
+            color[0, n], color[1, n], color[2, n] = one[0] + two[0], one[1] + two[1], one[2] + two[2]
+            color[3, n], color[4, n], color[5, n] = one[3] + two[3], one[4] + two[4], one[5] + two[5]
+            color[6, n], color[7, n], color[8, n] = one[6] + two[6], one[7] + two[7], one[8] + two[8]
+            color[9, n], color[10, n], color[11, n] = one[9] + two[9], one[10] + two[10], one[11] + two[11]
+            color[12, n], color[13, n], color[14, n], color[15, n] = one[12] + two[12], jx, jy, jz
+            color[16, n], color[17, n], color[18, n] = y * jz - z * jy, z * jx - x * jz, x * jy - y * jx
+            color[19, n], color[20, n] = -root * before, -root
+            color[21, n] = root * difference
+        for n in range(count):
+            residuals[0, number[n]] = plain[n]
+        _add_products(color, count, begin, 0, H, b)
     for k in range(UNKNOWNS):
         for m in range(k):
             H[m, k] = H[k, m]
@@ -283,14 +380,12 @@ def linearize_pairs(
         starts: (F + 1,) int64, where the points of each frame begin in ``points`` and ``tangents``.
         points, tangents: (n, 3) and (n, 6) float32 of all F frames.
         Ts: (P, 3, 4) float32.
-        depths: (F, h, w) float32.
-        images: (F, h, w) float32.
+        depths, images: (F, h, w) float32.
         twists, offsets: (F, 6) and (F,) float32, motion and delay of the middle row of the colour image of each frame.
         lights: (P, 2) float32, gain and bias.
         residual_starts: (P + 1,) int64, where the residuals of each pair begin.
         residuals: (2, r) float32 out.
-        Hs: (P, UNKNOWNS, UNKNOWNS) float64 out.
-        bs: (P, UNKNOWNS) float64 out.
+        Hs, bs: (P, UNKNOWNS, UNKNOWNS) and (P, UNKNOWNS) float64 out.
 
     The others are as for ``linearize_pair``.
     """
