@@ -133,11 +133,13 @@ def score_pair(
         false += [c.kind for c in mine[1:]]
         if mine:
             row |= {"found": mine[0].kind, "iou": _iou(surface(mine[0]), surface(true))}
-            if mine[0].T_after_before is not None and not np.array_equal(true.T_after_before, np.eye(4)):
-                error = _motion_error(true, T_scene_before @ mine[0].T_after_before @ se3.inverse(T_scene_before))
+            motion = mine[0].motion
+            if motion is not None and not np.array_equal(true.T_after_before, np.eye(4)):
+                error = _motion_error(true, T_scene_before @ motion.T_after_before @ se3.inverse(T_scene_before))
+                error |= {"sigma_cm": 100 * motion.sigma[0], "sigma_deg": float(np.degrees(motion.sigma[1]))}
                 if error["motion_cm"] < SAME_MOTION_CM:  # seen by both visits, though one saw little
                     row["kind"] = "moved"
-                row |= {"ambiguous": True} if mine[0].ambiguous else error
+                row |= {"ambiguous": True} if motion.ambiguous else error
         things.append(row)
     false += [c.kind for c, owner in zip(found, owners, strict=True) if owner is None]
     return {"things": things, "false": false}
@@ -262,6 +264,11 @@ def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     hits = [thing for thing in things if thing["found"]]
     false = sum(len(row["false"]) for row in rows)
 
+    motions = [thing for thing in hits if "motion_cm" in thing]
+
+    def is_within(thing: dict[str, Any], cm: float, deg: float) -> bool:
+        return thing["motion_cm"] <= cm and thing["motion_deg"] <= deg
+
     def share(part: float, whole: float) -> float | None:
         return round(part / whole, 4) if whole else None
 
@@ -277,9 +284,9 @@ def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
         "recall_15cm": recall(large), "recall_small": recall(small), "precision": share(len(hits), len(hits) + false),
         "kind_right": share(sum(thing["found"] == thing["kind"] for thing in hits), len(hits)),
         "voxel_iou": median("iou"), "motion_cm": median("motion_cm"), "motion_deg": median("motion_deg"),
-        "motion_within_1cm_1deg": share(
-            sum(thing["motion_cm"] <= 1 and thing["motion_deg"] <= 1 for thing in hits if "motion_cm" in thing),
-            sum("motion_cm" in thing for thing in hits),
+        "motion_within_1cm_1deg": share(sum(is_within(thing, 1, 1) for thing in motions), len(motions)),
+        "motion_within_3_sigma": share(
+            sum(is_within(thing, 3 * thing["sigma_cm"], 3 * thing["sigma_deg"]) for thing in motions), len(motions)
         ),
         "motion_ambiguous": sum("ambiguous" in thing for thing in hits),
         "unchanged_pairs": sum(not row["things"] for row in rows),

@@ -1,9 +1,11 @@
 """Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
 
 Motions that bring a point onto one of like colour and slope, turned about the vertical, are refined by the iterative
-closest point method in both directions (to planes, Chen and Medioni 1992; by colours, Johnson and Kang 1997; at last on
-the intensities along the surface, Park et al. 2017). The best is the motion if each surface lies on the other, has its
-colours, and nothing of it would hang in seen free space. If others are as good, the smallest turn is taken, and said.
+closest point method, in both directions: to planes (Chen and Medioni 1992), by the intensities along the surface (Park
+et al. 2017), points near those of like colours (Johnson and Kang 1997). What stands before and after is tilted little.
+The motion is the one with the highest score of close surface with like colours, less what it would leave hanging in
+seen free space. Others that are not worse by more than chance make it ambiguous; what points and their noise leave open
+are its standard deviations.
 """
 
 from dataclasses import dataclass, replace
@@ -20,18 +22,27 @@ from dudmap.fleet.change_objects import Piece
 from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
-PAIRS, STARTS, TRIED = 20_000, 400, 12
-"""Pairs of points that are drawn, those of a like colour and slope that give a motion, and the best motions that are
-registered."""
-RANKED, COARSE, FINE, REFINED = 60, 300, 1500, 4
-"""Points of a surface in the first step and when a pose is judged, and poses that are refined."""
-ICP_ROUNDS, STOP = 12, 1e-3
+PAIRS, STARTS = 20_000, 1000
+"""Pairs of points that are drawn, and those of a like colour and slope that give a motion."""
+RANKED, COARSE, FINE = 60, 300, 1500
+"""Points of a surface when starts are ranked, in the first registration, and in the last one and when it is judged."""
+TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
+"""Starts that are registered and motions that are registered once more; those that differ less are one (m, degrees)."""
+ICP_ROUNDS, STOP = 20, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
+TILT = np.radians(0.3)
+"""Standard deviation of the tilt of what stands before and after: of level surfaces in a map, and of its bending."""
+FACE = 0.1
+"""Edge of the patches whose points count as one when a motion is estimated: calibration, views from one side and the
+bending of the map shift whole faces, metres."""
+PATCH, DEVIATIONS_APART = 0.05, 2.0
+"""Edge of the patches whose scores are taken to be independent, metres, and standard errors by which their sum is
+worse by more than chance."""
 COLOR_LENGTH = 0.3
 """Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
 Kang 1997), in sizes of the thing."""
 COLOR_GATE = 50.0
-"""Difference of colours at which points do not meet in the first step, grey levels."""
+"""Difference of colours at which points do not meet, grey levels."""
 COLOR_SCALE = 15.0
 """Difference of colours at which the Cauchy weight of two points that meet falls to a half, grey levels."""
 PULL = 0.05
@@ -46,18 +57,18 @@ LIGHT, DAMPING = 0.2, 0.02
 weight of its direction per point."""
 MIN_POINTS = 60
 """Points on the other's surface below which the motion is not determined."""
-LEAST_FIT, LEAST_SEEN = 0.8, 0.25
+LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
 """Shares of the surface that must lie on the other's: of what would else hang in free space, and of the larger of both
-surfaces."""
+surfaces; and of the former that must be explained: what has other colours or another shape meets by chance."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
 """Largest median difference in one light of the colours of a thing without texture, grey levels, and of the shares of
 red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
 """Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
 two that are one: things of one make have the same texture, any others have about none."""
-AS_GOOD, FLAT = 0.9, 0.05
-"""Share of the best mean agreement from which on another motion is as good, and the mean square of the normals of what
-meets across its two main directions, or of a flat face, from which on it is not known to be the same face."""
+FLAT = 0.05
+"""Mean square of the normals of what meets across its two main directions, or of a flat face, from which on it is not
+known to be the same face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,60 +143,135 @@ class Motion:
         T_after_before: (4, 4), common frame.
         fit: Share of the surface that fits, of what must.
         explained: Vertices of both surfaces that the motion explains, less those that it leaves in free space.
-        agreement: The same per vertex.
+        scores: (n,) the same of patches of the surfaces.
+        is_likely: Whether both surfaces can be those of one thing.
         ambiguous: Why another motion is as likely, None if there is none.
+        sigma: Standard deviations of where it brings the middle of the thing (m), and of the turn (rad).
     """
 
     T_after_before: Array
     fit: float
     explained: float
-    agreement: float
+    scores: Array
+    is_likely: bool
     ambiguous: str | None = None
+    sigma: tuple[float, float] = (np.inf, np.inf)
+
+    def is_worse(self, best: "Motion") -> bool:
+        """Whether it explains less than the best motion by more than chance (a paired t-test of the patches)."""
+        less = best.scores - self.scores
+        return bool(less.sum() > DEVIATIONS_APART * np.sqrt(len(less)) * less.std())
 
 
 def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
     """The motion that brings the missing surface to the new one, None if they are not one thing.
 
-    ``up`` (3,) is the direction about which things turn most.
+    ``up`` (3,) is the direction about which things turn that stand before and after.
     """
-    coarse, fine = _Meeting(missing, new, COARSE), _Meeting(missing, new, FINE, colored=False)
-    starts = coarse.ranked(_starts(coarse.sources[0], coarse.sources[1], up))
-    centre = np.eye(4)
-    centre[:3, 3] = coarse.sources[0].points.mean(axis=0)
-    tried = _different(starts, centre, 0.3 * coarse.size, 20.0)[:TRIED]
-    rated = [(coarse.share(T), T) for T in (coarse.registered(T, 0.3 * coarse.size) for T in tried)]
-    rated = sorted((row for row in rated if row[0] > LEAST_SEEN / 2), key=lambda row: -row[0])
-    first = _different([T for _, T in rated], centre, 0.05, 10.0)[:REFINED]
-    judged = [_judged(before, after, missing, new, fine.registered(T, 3 * fine.gate, lit=True)) for T in first]
-    motions = sorted((one for one in judged if one is not None), key=lambda one: -one.explained)
-    alike = [one for one in motions if one.agreement > AS_GOOD * motions[0].agreement]
-    others = len(_different([one.T_after_before for one in alike], centre, 0.3 * coarse.size, 20.0))
+    coarse, fine = (_Meeting((after, before), (missing, new), up, count) for count in (COARSE, FINE))
+
+    def judged(meeting: _Meeting, starts: list[Array], gate: float) -> list[Motion]:
+        found = [meeting.judged(meeting.registered(T, gate)) for T in starts]
+        return sorted((one for one in found if one is not None), key=lambda one: -one.explained)
+
+    tried = coarse.different(coarse.starts(), 0.2 * coarse.size, 2 * NEAR_DEG)[:TRIED]
+    rated = [one.T_after_before for one in judged(coarse, tried, 0.3 * coarse.size) if one.explained > 0]
+    found = judged(fine, coarse.different(rated, 0.2 * coarse.size, NEAR_DEG)[:REFINED], 3 * fine.gate)
+    likely = [one for one in found if one.is_likely]
+    if not likely:
+        return None
+    alike = [likely[0], *(one for one in found if not one.is_worse(likely[0]))]
+    others = len(coarse.different([one.T_after_before for one in alike], NEAR, NEAR_DEG))
+    best, ambiguous = likely[0], likely[0].ambiguous
     if others > 1:
-        smallest = min(alike, key=lambda one: se3.rotation_angle(one.T_after_before))
-        return replace(smallest, ambiguous=f"it looks the same after {others} motions; this is the smallest turn")
-    return motions[0] if motions else None
+        best = min((one for one in alike if one.is_likely), key=lambda one: se3.rotation_angle(one.T_after_before))
+        ambiguous = f"it looks the same after {others} motions; this is the smallest turn"
+    return replace(best, ambiguous=ambiguous, sigma=fine.sigma(best.T_after_before))
 
 
 class _Meeting:
     """Points of two bodies that lie on each other after a motion from the first to the second.
 
     Args:
-        a, b: The bodies.
+        there: The visits to which the motion, and its inverse, bring the surfaces.
+        bodies: The bodies.
+        up: (3,) direction about which things turn.
         count: Points of the denied surface of each that are looked for on the other, at most.
-        colored: Whether like colours are near each other.
     """
 
-    def __init__(self, a: Body, b: Body, count: int, colored: bool = True) -> None:
-        self.sources = [body.chosen(body.denied).sample(count) for body in (a, b)]
+    def __init__(self, there: tuple[Visit, Visit], bodies: tuple[Body, Body], up: Array, count: int) -> None:
+        self.there, self.others, self.up = there, bodies[::-1], up
+        denied = [body.chosen(body.denied) for body in bodies]
+        self.sources = [body.sample(count) for body in denied]
+        self.most = max(len(body.points) for body in denied)
+        self.weights = np.concatenate(
+            [np.full(len(b.points), len(a.points) / len(b.points)) for a, b in zip(denied, self.sources, strict=True)]
+        )
+        cells = [np.insert(np.floor(body.points / PATCH), 0, n, axis=1) for n, body in enumerate(self.sources)]
+        self.patches = np.unique(np.concatenate(cells), axis=0, return_inverse=True)[1].reshape(-1)
         self.size = max(float(np.linalg.norm(np.ptp(source.points, axis=0))) for source in self.sources)
-        self.gate, self.shade = max(a.tolerance, b.tolerance), colored * COLOR_LENGTH * self.size / 255
-        self.others = b, a
+        self.gate, self.shade = max(body.tolerance for body in bodies), COLOR_LENGTH * self.size / 255
         self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
 
-    def pairs(self, T: Array, gate: float) -> tuple["_Pairs", Array]:
-        """What meets within a gate (m) after a motion (4, 4), and the shares of both sources whose points meet any of a
-        like colour."""
-        rows, shares = [], []
+    def starts(self) -> list[Array]:
+        """Motions (4, 4) that bring a point of a onto one of b with a like colour: the turn about the vertical is that
+        between their normals, and any where these are vertical; those first that bring most points near others."""
+        (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()
+        gate = max(0.1 * self.size, 3 * self.gate)
+        rows, columns = rng.integers(len(a.points), size=PAIRS), rng.integers(len(b.points), size=PAIRS)
+        like = np.abs(a.colors[rows] - b.colors[columns]).max(axis=1) < COLOR_GATE
+        rises = a.normals[rows] @ up, b.normals[columns] @ up
+        use = np.flatnonzero(like & (np.abs(rises[0] - rises[1]) < 0.3))[:STARTS]
+        for row, column, rise in zip(rows[use], columns[use], rises[0][use], strict=True):
+            n, m = a.normals[row], b.normals[column]
+            turn = np.arctan2(up @ np.cross(n, m), n @ m - (up @ n) * (up @ m))
+            if abs(rise) > 0.9:
+                turn = rng.uniform(-np.pi, np.pi)
+            T = np.eye(4)
+            T[:3, :3] = se3.exp_rotation(up * turn)
+            T[:3, 3] = b.points[column] - T[:3, :3] @ a.points[row]
+            out.append(T)
+        scores, Ts = np.zeros(len(out)), np.array(out).reshape(-1, 4, 4)
+        for own, tree, T in zip(self.sources, self.trees, (Ts, np.linalg.inv(Ts)), strict=True):
+            some = own.sample(RANKED)
+            points = np.einsum("kij,nj->kni", T[:, :3, :3], some.points) + T[:, None, :3, 3]
+            colors = np.broadcast_to(self.shade * some.colors, points.shape)
+            gap = tree.query(np.concatenate([points, colors], axis=2).reshape(-1, 6), distance_upper_bound=gate)[0]
+            scores += np.isfinite(gap).reshape(len(out), len(some.points)).mean(axis=1)
+        return [out[n] for n in np.argsort(-scores, kind="stable")]
+
+    def different(self, poses: list[Array], distance: float, angle_deg: float) -> list[Array]:
+        """The first of all motions (4, 4) that bring the middle of the thing to about the same place."""
+        centre, kept = np.eye(4), list[Array]()
+        centre[:3, 3] = self.sources[0].points.mean(axis=0)
+        for T in poses:
+            if not any(agree(T @ centre, other @ centre, distance, angle_deg) for other in kept):
+                kept.append(T)
+        return kept
+
+    def registered(self, T: Array, gate: float) -> Array:
+        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks."""
+        for _ in range(ICP_ROUNDS):
+            pairs = self._pairs(T, max(gate, self.gate))
+            if len(pairs.moved) < 10:
+                break
+            H, g = self._normal_equations(pairs, T)
+            step = np.asarray(-np.linalg.solve(H, g), np.float64)
+            T, gate = se3.exp(step) @ T, 0.7 * gate
+            if np.linalg.norm(step) < STOP:
+                break
+        return T
+
+    def sigma(self, T: Array) -> tuple[float, float]:
+        """Standard deviations of a motion (4, 4): of the middle of what meets (m), and of the turn (rad)."""
+        pairs, about = self._pairs(T, self.gate), np.eye(6)
+        about[:3, 3:] = se3.hat(pairs.moved.mean(axis=0))
+        variances = np.diag(np.linalg.inv(about.T @ self._normal_equations(pairs, T)[0] @ about))
+        return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
+
+    def _pairs(self, T: Array, gate: float) -> "_Pairs":
+        """What meets within a gate (m) after a motion (4, 4)."""
+        rows = []
         for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
             far = np.hypot(gate, self.shade * COLOR_GATE * np.sqrt(3))
@@ -194,40 +280,46 @@ class _Meeting:
             near = np.where(known, near, 0)
             use = known & (np.linalg.norm(points - other.points[near], axis=1) < gate)
             use &= (normals * other.normals[near]).sum(axis=1) > 0.5
-            shares.append((use & (np.abs(own.colors - other.colors[near]).max(axis=1) < COLOR_GATE)).mean())
             ends = (own, np.flatnonzero(use)), (other, near[use])
             (a, i), (b, j) = ends[::-1] if rows else ends
             rows.append((transformed(T, a.points[i]), a.shades[i], b.points[j], b.normals[j], b.shades[j], b.slopes[j]))
-        return _Pairs(*(np.concatenate(part) for part in zip(*rows, strict=True))), np.array(shares)
+        return _Pairs(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
-    def ranked(self, starts: list[Array]) -> list[Array]:
-        """Motions (4, 4), those first that bring most of some points of both surfaces near the other's."""
-        scores, Ts = np.zeros(len(starts)), np.array(starts).reshape(-1, 4, 4)
-        gate = max(0.1 * self.size, 3 * self.gate)
-        for own, tree, T in zip(self.sources, self.trees, (Ts, np.linalg.inv(Ts)), strict=True):
-            some = own.sample(RANKED)
-            points = np.einsum("kij,nj->kni", T[:, :3, :3], some.points) + T[:, None, :3, 3]
-            colors = np.broadcast_to(self.shade * some.colors, points.shape)
-            gap = tree.query(np.concatenate([points, colors], axis=2).reshape(-1, 6), distance_upper_bound=gate)[0]
-            scores += np.isfinite(gap).reshape(len(starts), len(some.points)).mean(axis=1)
-        return [starts[n] for n in np.argsort(-scores, kind="stable")]
+    def _normal_equations(self, pairs: "_Pairs", T: Array) -> tuple[Array, Array]:
+        """Those of a left twist of a motion (4, 4): of what meets, and of its tilt, unless it is large."""
+        H, g = pairs.normal_equations()
+        tilt, level = np.cross(self.up, T[:3, :3] @ self.up), np.eye(3) - np.outer(self.up, self.up)
+        weight = np.square(1 / TILT / (1 + np.square(np.linalg.norm(tilt) / (DEVIATIONS[0] * TILT))))
+        H[3:, 3:] += weight * level
+        g[3:] += weight * tilt
+        return H, g
 
-    def share(self, T: Array) -> float:
-        """Mean share of both surfaces that meet the other."""
-        return float(self.pairs(T, self.gate)[1].mean())
-
-    def registered(self, T: Array, gate: float, *, lit: bool = False) -> Array:
-        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks; at last by the intensities
-        as well."""
-        for _ in range(ICP_ROUNDS):
-            pairs = self.pairs(T, max(gate, self.gate))[0]
-            if len(pairs.moved) < 10:
-                break
-            step = pairs.lit_step() if lit else pairs.step()
-            T, gate = se3.exp(step) @ T, 0.7 * gate
-            if np.linalg.norm(step) < STOP:
-                break
-        return T
+    def judged(self, T: Array) -> Motion | None:
+        """The motion ``T`` (4, 4) with what it explains, None if nothing meets."""
+        rows = []
+        for own, other, there, T_own in zip(self.sources, self.others, self.there, (T, se3.inverse(T)), strict=True):
+            points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
+            gap, near = (np.asarray(found) for found in other.tree.query(points))
+            meets = (gap < self.gate) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
+            hangs = ~meets & there.sample(points).is_free(self.gate)
+            off = ((points - other.points[near]) * other.normals[near]).sum(axis=1)
+            after = own.normals if rows else normals
+            rows.append((meets, hangs, off, own.colors, other.colors[near], after))
+        meets, hangs, off, mine, theirs, normals = (np.concatenate(part) for part in zip(*rows, strict=True))
+        if meets.sum() < 10:
+            return None
+        mine, theirs, normals = mine[meets], theirs[meets], normals[meets]
+        lit = _gains(mine.mean(axis=1), theirs.mean(axis=1), normals)[:, None] * mine
+        agreement = 1 / (1 + np.square(np.abs(lit - theirs).max(axis=1) / COLOR_SCALE))
+        scores = -self.weights * hangs
+        scores[meets] = self.weights[meets] * agreement / (1 + np.square(2 * off[meets] / self.gate))
+        on, free, explained = float(self.weights @ meets), float(self.weights @ hangs), float(scores.sum())
+        is_likely = on > max(LEAST_FIT * (on + free), LEAST_SEEN * self.most, MIN_POINTS)
+        is_likely &= explained > LEAST_EXPLAINED * (on + free) and _alike(lit, theirs, self.patches[meets])
+        patches = np.asarray(np.bincount(self.patches, scores), np.float64)
+        flat = np.linalg.eigvalsh(normals.T @ normals / len(normals))[1] < FLAT
+        ambiguous = "one flat face of it was seen; another may look the same" if flat else None
+        return Motion(T, on / (on + free), explained, patches, is_likely, ambiguous)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,77 +334,24 @@ class _Pairs:
     shades: Array
     slopes: Array
 
-    def step(self) -> Array:
-        """Twist (6,) that brings the points to the planes through the others, and a little to them."""
-        p, off = self.moved, self.moved - self.points
-        J, r = np.hstack([self.normals, np.cross(p, self.normals)]), (off * self.normals).sum(axis=1)
-        turned = np.cross(np.eye(3)[None], p[:, None])  # a turn by omega moves a point by omega x p
-        pull = PULL * np.concatenate([np.eye(3)[None].repeat(len(p), 0), np.swapaxes(turned, 1, 2)], axis=2)
-        H = J.T @ J + np.einsum("nij,nik->jk", pull, pull)
-        return -np.linalg.solve(H + 1e-9 * np.eye(6), J.T @ r + np.einsum("nij,ni->j", pull, PULL * off))
-
-    def lit_step(self) -> Array:
-        """Twist (6,) that brings the points to the planes through the others and to their intensities, both with
-        Geman-McClure weights and by their noise."""
+    def normal_equations(self) -> tuple[Array, Array]:
+        """Matrix (6, 6) and gradient (6,) for the twist that brings the points to the planes through the others, to
+        their intensities, both with Geman-McClure weights and by their noise, and a little to the points."""
         off, H, g = self.moved - self.points, 1e-9 * np.eye(6), np.zeros(6)
+        share = len(np.unique(np.floor(self.moved / FACE), axis=0)) / len(self.moved)
         shade = self.shades + (off * self.slopes).sum(axis=1) - _gains(self.mine, self.shades, self.normals) * self.mine
         rows = (self.normals, (off * self.normals).sum(axis=1)), (self.slopes, shade)
+        terms = []
         for (slope, r), deviations, least in zip(rows, DEVIATIONS, LEAST_NOISE, strict=True):
             sigma = max(1.4826 * float(np.median(np.abs(r))), least)
+            terms.append((slope, r, np.square(1 / sigma / (1 + np.square(r / (deviations * sigma))))))
+        pull = np.square(PULL) / max(float(np.mean(np.square(off))), LEAST_NOISE[0] ** 2)
+        terms += [(np.tile(axis, (len(off), 1)), off @ axis, np.full(len(off), pull)) for axis in np.eye(3)]
+        for slope, r, weights in terms:
             J = np.hstack([slope, np.cross(self.moved, slope)])
-            weighted = J * np.square(1 / sigma / (1 + np.square(r / (deviations * sigma))))[:, None]
+            weighted = J * (share * weights)[:, None]
             H, g = H + weighted.T @ J, g + weighted.T @ r
-        return np.asarray(-np.linalg.solve(H, g), np.float64)
-
-
-def _starts(a: Body, b: Body, up: Array) -> list[Array]:
-    """Motions (4, 4) that bring a point of a onto one of b with a like colour: the turn about the vertical is that
-    between their normals, and any where these are vertical."""
-    rng = np.random.default_rng(1)
-    rows, columns = rng.integers(len(a.points), size=PAIRS), rng.integers(len(b.points), size=PAIRS)
-    like = np.abs(a.colors[rows] - b.colors[columns]).max(axis=1) < COLOR_GATE
-    rises = a.normals[rows] @ up, b.normals[columns] @ up
-    use = np.flatnonzero(like & (np.abs(rises[0] - rises[1]) < 0.3))[:STARTS]
-    out = []
-    for row, column, rise in zip(rows[use], columns[use], rises[0][use], strict=True):
-        n, m = a.normals[row], b.normals[column]
-        turn = np.arctan2(up @ np.cross(n, m), n @ m - (up @ n) * (up @ m))
-        if abs(rise) > 0.9:
-            turn = rng.uniform(-np.pi, np.pi)
-        T = np.eye(4)
-        T[:3, :3] = se3.exp_rotation(up * turn)
-        T[:3, 3] = b.points[column] - T[:3, :3] @ a.points[row]
-        out.append(T)
-    return out
-
-
-def _different(poses: list[Array], centre: Array, distance: float, angle_deg: float) -> list[Array]:
-    """The first of all poses (4, 4) that bring a centre (4, 4) to about the same place."""
-    kept: list[Array] = []
-    for T in poses:
-        if not any(agree(T @ centre, other @ centre, distance, angle_deg) for other in kept):
-            kept.append(T)
-    return kept
-
-
-def _judged(before: Visit, after: Visit, missing: Body, new: Body, T: Array) -> Motion | None:
-    """The motion ``T`` (4, 4) if both surfaces are those of one thing after it, else None."""
-    count, mine, theirs, normals = _landed(after, missing, new, T)
-    count_back, theirs_back, mine_back, normals_back = _landed(before, new, missing, se3.inverse(T))
-    meets, hangs = count + count_back
-    most = max(missing.denied.sum(), new.denied.sum())
-    if meets < max(LEAST_FIT * (meets + hangs), LEAST_SEEN * most, MIN_POINTS):
-        return None
-    mine, theirs = np.concatenate([mine, mine_back]), np.concatenate([theirs, theirs_back])
-    normals = np.concatenate([normals, normals_back @ T[:3, :3].T])
-    lit = _gains(mine.mean(axis=1), theirs.mean(axis=1), normals)[:, None] * mine
-    if not _alike(lit, theirs):
-        return None
-    agree = np.mean(1 / (1 + np.square(np.abs(lit - theirs).max(axis=1) / COLOR_SCALE)))
-    explained = float(agree * meets - hangs)
-    flat = np.linalg.eigvalsh(normals.T @ normals / len(normals))[1] < FLAT
-    ambiguous = "one flat face of it was seen; another may look the same" if flat else None
-    return Motion(T, float(meets / (meets + hangs)), explained, explained / (meets + hangs), ambiguous)
+        return H, g
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
@@ -326,25 +365,17 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
     return np.exp(np.clip(A @ x, -0.7, 0.7))
 
 
-def _landed(there: Visit, own: Body, other: Body, T: Array) -> tuple[Array, Array, Array, Array]:
-    """Numbers (2,) of the denied vertices of a thing that lie on the other's surface after a motion, and that hang in
-    free space; colours (n, 3) of some that lie on it and of the other's points, and their normals after it."""
-    moved = own.chosen(own.denied).sample(FINE)
-    points, normals = transformed(T, moved.points), moved.normals @ T[:3, :3].T
-    gap, near = (np.asarray(found) for found in other.tree.query(points))
-    limit = max(own.tolerance, other.tolerance)
-    meets = (gap < limit) & ((normals * other.normals[near]).sum(axis=1) > 0.5)
-    hangs = ~meets & there.sample(points).is_free(limit)
-    count = np.array([meets.sum(), hangs.sum()]) * own.denied.sum() / len(points)
-    return count, moved.colors[meets], other.colors[near[meets]], normals[meets]
-
-
-def _alike(mine: Array, theirs: Array) -> bool:
-    """Whether colours (n, 3) of two surfaces in one light are those of one thing."""
+def _alike(mine: Array, theirs: Array, patches: NDArray[np.intp]) -> bool:
+    """Whether colours (n, 3) of two surfaces in one light are those of one thing, in the mean of patches (n,): finer
+    texture is lost far off."""
+    patches, counts = np.unique(patches, return_inverse=True, return_counts=True)[1:]
+    mine, theirs = (
+        np.stack([np.bincount(patches, x) for x in colors.T], axis=1) / counts[:, None] for colors in (mine, theirs)
+    )
     shares = [np.median((colors + 8) / (colors + 8).sum(axis=1, keepdims=True), axis=0) for colors in (mine, theirs)]
     if np.abs(shares[0] - shares[1]).max() > MAX_CHROMA:
         return False
     grey = mine.mean(axis=1), theirs.mean(axis=1)
-    if min(grey[0].std(), grey[1].std()) < TEXTURE:
-        return bool(np.median(np.abs(mine - theirs)) < PLAIN)
-    return bool(np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION)
+    spread = min(grey[0].std(), grey[1].std())
+    is_plain = spread < TEXTURE and np.median(np.abs(mine - theirs)) < PLAIN
+    return bool(is_plain or (spread > 0 and np.corrcoef(*grey)[0, 1] > LEAST_CORRELATION))

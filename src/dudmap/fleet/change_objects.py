@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import Delaunay, KDTree
 
 from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
 
@@ -12,6 +12,8 @@ LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 REACH = 0.5
 """The same where no free space was seen between them, in lengths of the larger piece."""
+SLIM, OUTLINE = 0.5, 1.1
+"""Largest width of a leg in its heights, and the factor by which the outline of what was seen of a thing is widened."""
 LEAST_FACE = 0.3
 """Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
 LEAST_FACING = 0.1
@@ -56,13 +58,13 @@ def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[P
     return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
-def assembled(pieces: list[Piece], own: Visit) -> list[Piece]:
-    """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space: something
-    stood before the middle of one thing."""
+def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[Piece]:
+    """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space (something
+    stood before the middle of one thing), and with their legs: these are seen as thin as a pixel."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
         for n in reversed(range(len(out))):
-            if is_part(piece, out[n], own):
+            if is_part(piece, out[n], own) or carries(piece, out[n], up):
                 piece = joined([out.pop(n), piece])
         out.append(piece)
     return sorted(out, key=lambda one: -one.area)
@@ -71,6 +73,18 @@ def assembled(pieces: list[Piece], own: Visit) -> list[Piece]:
 def is_part(piece: Piece, thing: Piece, own: Visit) -> bool:
     """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
     return gap_between(thing, piece) < REACH * thing.length and is_hidden_between(thing, piece, own)
+
+
+def carries(piece: Piece, thing: Piece, up: NDArray[np.float64]) -> bool:
+    """Whether a piece is a leg of a thing: a slim column that stands within its outline, seen along ``up`` (3,)."""
+    across = np.linalg.svd(up[None])[2][1:].T
+    leg, outline = piece.points @ across, thing.points[:: max(1, len(thing.points) // 2000)] @ across
+    height = np.ptp(np.percentile(piece.points @ up, [2, 98]))
+    if np.ptp(np.percentile(leg, [2, 98], axis=0), axis=0).max() > SLIM * height:
+        return False
+    middle = outline.mean(axis=0)
+    inside = Delaunay(OUTLINE * (outline - middle)).find_simplex(leg - middle) >= 0
+    return bool(inside.mean() > 0.5)
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:

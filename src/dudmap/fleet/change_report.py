@@ -75,7 +75,11 @@ def change_page(
 
 def motion_and_confidence(row: dict[str, Any]) -> str:
     """Text on how far a thing moved, if it did, and the confidence."""
-    moved = f", moved by {100 * row['distance']:.1f} cm and {row['turn_deg']:.1f} degrees" if "distance" in row else ""
+    moved = ""
+    if "distance" in row:
+        moved = f", moved by {100 * row['distance']:.1f} ± {100 * row['distance_sigma']:.1f} cm"
+        moved += f" and {row['turn_deg']:.1f} ± {row['turn_sigma_deg']:.1f} degrees"
+        moved += " (ambiguous)" if "ambiguous" in row else ""
     return f"{moved}, confidence {row['confidence']:.2f}"
 
 

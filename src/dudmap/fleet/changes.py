@@ -24,7 +24,7 @@ from dudmap.fleet.change_objects import (
     joined,
 )
 from dudmap.fleet.map_samples import transformed
-from dudmap.io.exporting.gravity import level_normal
+from dudmap.io.exporting.gravity import Floor, fitted, floor_height, level_normal
 
 Array = NDArray[np.float64]
 ON_SURFACE = 0.02
@@ -41,16 +41,14 @@ class Change:
         kind: appeared, disappeared, moved, recoloured, or unknown: surface that only one visit saw.
         before, after: Its surface in either visit, None if it is not there.
         confidence: 0..1, share of its surface that agrees with its kind.
-        T_after_before: (4, 4), of what moved.
-        ambiguous: Why another motion is as likely, None if there is none.
+        motion: Of what moved.
     """
 
     kind: str
     before: Piece | None
     after: Piece | None
     confidence: float
-    T_after_before: Array | None = None
-    ambiguous: str | None = None
+    motion: Motion | None = None
 
     @property
     def points(self) -> Array:
@@ -74,13 +72,16 @@ class Change:
         }  # fmt: skip
         if self.before is not None and self.after is not None:
             out["box_before"] = self.before.box.round(4).tolist()
-        if self.T_after_before is not None:
-            T = self.T_after_before
+        if self.motion is not None:
+            T, sigma = self.motion.T_after_before, self.motion.sigma
             centre = self.before.box.mean(axis=0) if self.before is not None else np.zeros(3)
             distance = float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
             turn = float(np.degrees(se3.rotation_angle(T)))
-            out |= {"T_after_before": T.tolist(), "distance": round(distance, 4), "turn_deg": round(turn, 2)}
-            out |= {} if self.ambiguous is None else {"ambiguous": self.ambiguous}
+            out |= {
+                "T_after_before": T.tolist(), "distance": round(distance, 4), "distance_sigma": round(sigma[0], 4),
+                "turn_deg": round(turn, 2), "turn_sigma_deg": round(float(np.degrees(sigma[1])), 2),
+            }  # fmt: skip
+            out |= {} if self.motion.ambiguous is None else {"ambiguous": self.motion.ambiguous}
         return out
 
 
@@ -89,9 +90,10 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
     missing, new = (denied_pieces(one, voxel, min_size) for one in found)
-    out = _moved((before, after), found, (missing, new), min_size) if missing and new else []
+    up = vertical(before)
+    out = _moved((before, after), found, (missing, new), min_size, up) if missing and new else []
     for kind, pieces, one, own in (("disappeared", missing, found[0], before), ("appeared", new, found[1], after)):
-        for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own):
+        for piece in assembled([p for p in pieces if is_certain(p, one, min_size)], own, up):
             sides = (piece, None) if kind == "disappeared" else (None, piece)
             out.append(Change(kind, *sides, _confidence(piece, one)))
     painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
@@ -108,13 +110,17 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
 
 
 def _moved(
-    visits: tuple[Visit, Visit], found: tuple[Evidence, Evidence], pieces: tuple[list[Piece], list[Piece]], size: float
+    visits: tuple[Visit, Visit],
+    found: tuple[Evidence, Evidence],
+    pieces: tuple[list[Piece], list[Piece]],
+    size: float,
+    up: Array,
 ) -> list[Change]:
     """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists."""
     offered = [
         [(p, Body.of(one, p), is_certain(p, one, size)) for p in side] for side, one in zip(pieces, found, strict=True)
     ]
-    up, motions = vertical(visits[0]), list[tuple[Motion, Piece, Piece]]()
+    motions = list[tuple[Motion, Piece, Piece]]()
     for old, missing, old_certain in offered[0]:
         for now, new, now_certain in offered[1]:
             near = gap_between(old, now) < max(old.length, now.length)  # a fragment may be of any thing farther off
@@ -144,7 +150,7 @@ def _moved(
             things.append(joined([first, *parts]))
             taken[side][things[-1].vertices] = True
             pieces[side][:] = [p for p in left if p not in parts]
-        out.append(Change("moved", things[0], things[1], motion.fit, T, motion.ambiguous))
+        out.append(Change("moved", things[0], things[1], motion.fit, motion))
     return out
 
 
@@ -153,8 +159,10 @@ def vertical(visit: Visit) -> Array:
     held = -visit.keyframes[:, :3, 1].mean(axis=0)
     held /= np.linalg.norm(held)
     some = visit.mesh.faces[:: max(1, len(visit.mesh.faces) // 20_000)]
-    level = level_normal(replace(visit.mesh, faces=some), held)
-    return held if level is None else level
+    mesh = replace(visit.mesh, faces=some)
+    level = level_normal(mesh, held)
+    height = None if level is None else floor_height(mesh, level)
+    return held if level is None or height is None else fitted(mesh, Floor(level, height)).up
 
 
 def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
