@@ -285,7 +285,7 @@ class Mapper:
             volume.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
         stamps = np.array([fused.frame.timestamp for fused in window])
         corrections = after @ se3.inverse(before)
-        atlas.move(stamps, corrections, volume)
+        atlas.move(stamps, corrections)
         self._redundancy.apply_correction(corrections[-1])
         return corrections[-1]
 

@@ -289,7 +289,8 @@ class Atlas(Stateful):
         frames = [self.history.frames[n] for n in nodes]
         stamps = np.array([frame.timestamp for frame in frames])
         corrections = np.stack([T @ se3.inverse(frame.T_world_camera) for frame, T in zip(frames, Ts_new, strict=True)])
-        self.move(stamps, corrections, volume)
+        self.move(stamps, corrections)
+        self.volume.take_over(volume)
         for frame, T in zip(frames, Ts_new, strict=True):
             frame.T_world_camera = T  # without the rounding of a correction
         self.rebuildings.pop(self.current, None)  # of an earlier correction
@@ -303,14 +304,13 @@ class Atlas(Stateful):
         frames = [] if self.history is None else self.history.frames
         return [place for place in (*self.poses, *self.keyframes.keyframes, *frames) if place.submap == submap]
 
-    def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64], volume: TsdfVolume) -> None:
-        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,), and use
-        a map that was built from the moved ones."""
-        self.repainting = None  # the new map has the new colours
+    def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64]) -> None:
+        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); its map
+        is built anew from the moved ones, with the colours of now."""
+        self.repainting = None
         for place in self._places(self.current):
             correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
             place.T_world_camera = correction @ place.T_world_camera
-        self.volume.take_over(volume)
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
