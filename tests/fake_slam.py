@@ -89,8 +89,12 @@ class FakeSlam:
         self.device = "cpu"
 
     @property
-    def trajectory(self):
+    def image_poses(self):
         return Trajectory.from_poses(self.poses)
+
+    @property
+    def trajectory(self):
+        return self.image_poses.after(self.calibration.depth_late)
 
     @property
     def maps(self):

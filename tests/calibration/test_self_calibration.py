@@ -1,5 +1,6 @@
 """Calibration while the camera moves: when a result is used, and what it changes in the map."""
 
+from dataclasses import replace
 from threading import Event
 
 import cv2
@@ -134,6 +135,16 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator, ahe
     assert slam.calibration is estimator.result
     assert all(result.state == "tracked" for result in results)
     assert color_error(slam, exact[8], T) < 0.7 * before
+
+
+def test_only_frames_since_it_is_known_that_stamps_are_late_have_poses_at_other_times_than_their_images(estimator):
+    estimator.may.set()
+    estimator.result = replace(Calibration.registered(SMALL), depth_late=0.02, estimated=("delay",))
+    slam, frames = Slam(SMALL), recording()
+    for index in range(FIRST + LATER + 3):
+        slam.process(frames[index])
+    images, stamps = slam.image_poses.Ts_world_camera, slam.trajectory.Ts_world_camera
+    assert (images != stamps).any(axis=(1, 2)).tolist() == [n > FIRST + LATER for n in range(FIRST + LATER + 3)]
 
 
 def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estimator):

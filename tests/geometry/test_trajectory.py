@@ -61,5 +61,8 @@ def test_poses_after_those_of_the_stamps_lie_on_the_way_of_a_steady_camera():
         wanted = se3.exp_all((stamps + seconds)[:, None] * twist)
         np.testing.assert_allclose(trajectory.after(seconds).Ts_world_camera, wanted, atol=1e-12)
     np.testing.assert_array_equal(trajectory.after(0.0).Ts_world_camera, trajectory.Ts_world_camera)
+    each = np.array([0.0, 0.018, -0.018, 0.018, -0.018, 0.0])
+    wanted = se3.exp_all((stamps + each)[:, None] * twist)
+    np.testing.assert_allclose(trajectory.after(each).Ts_world_camera, wanted, atol=1e-12)
     alone = Trajectory(np.array([0.0, 1.0]), trajectory.Ts_world_camera[:2])
     np.testing.assert_array_equal(alone.after(0.02).Ts_world_camera, alone.Ts_world_camera)

@@ -158,8 +158,14 @@ class SlamResults:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames tracked so far in the submap with the most frames, after all corrections."""
+        """Poses, at the time stamps of all frames tracked so far in the submap with the most frames, after all
+        corrections."""
         return self.atlas.trajectory(self.atlas.by_size()[0])
+
+    @property
+    def image_poses(self) -> Trajectory:
+        """The same at the times when the depth images were taken, where a calibration finds their stamps late."""
+        return self.atlas.image_poses(self.atlas.by_size()[0])
 
     @property
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:

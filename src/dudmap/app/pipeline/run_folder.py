@@ -192,7 +192,7 @@ def write_run_folder(
     """
     foreseen = Exception if defect else (OSError, MapError)
     calibration, maps = slam.calibration, slam.maps
-    (trajectory, volume), *others = [(poses.after(calibration.depth_late), volume) for poses, volume in maps]
+    (trajectory, volume), *others = maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
     metrics |= record.metrics() | {
@@ -227,7 +227,7 @@ def write_run_folder(
         lambda: record.save_movers(out / "movers.jsonl"),
     ]
     if calibration.depth_late:
-        steps.append(lambda: maps[0][0].save(out / "image_poses.txt"))
+        steps.append(lambda: slam.image_poses.save(out / "image_poses.txt"))
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))

@@ -146,6 +146,7 @@ class ColorCalibration(Stateful):
         self._atlas = atlas
         self._color_motion = color_motion
         self._estimation = None
+        atlas.depth_late = self._start.depth_late
         if atlas.history is None:  # nothing to repaint with
             return
         atlas.history.registered = self._registered
@@ -182,6 +183,7 @@ class ColorCalibration(Stateful):
             if found is None:
                 return False
             self._color_motion.use(found, view.timestamp)
+            self._atlas.depth_late = found.depth_late
             self._atlas.recolor(gradually=self._live)
             return True
 

@@ -65,21 +65,23 @@ class Trajectory:
             raise DatasetError(f"no pose at time {timestamp:.6f}: it lies outside the trajectory")
         return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
 
-    def after(self, seconds: float) -> "Trajectory":
-        """Poses so many seconds after those of the same time stamps, or before them where negative.
+    def after(self, seconds: float | NDArray[np.float64]) -> "Trajectory":
+        """Poses so many seconds, one number or (N,), after those of the same time stamps, or before where negative.
 
         They lie on the screw to the next pose, or the one before; beside a gap longer than ``LARGEST_STEP`` and at the
         ends on that through the two on the other side, if these are near enough.
         """
-        if seconds == 0 or len(self) < 2:
+        seconds = np.broadcast_to(seconds, len(self))[:, None]
+        if not seconds.any() or len(self) < 2:
             return self
         gaps, forwards = np.diff(self.timestamps), seconds > 0
         near = np.append(gaps <= LARGEST_STEP, False)
         motions = se3.log_all(se3.inverse(self.Ts_world_camera[:-1]) @ self.Ts_world_camera[1:]) / gaps[:, None]
         to_next = np.where(near[:, None], np.vstack([motions, np.zeros(6)]), 0.0)
         from_last, has_last = np.roll(to_next, 1, axis=0), np.roll(near, 1)
-        first, other = (to_next, from_last) if forwards else (from_last, to_next)
-        twists = np.where((near if forwards else has_last)[:, None], first, other)
+        near, has_last = near[:, None], has_last[:, None]
+        ahead, behind = np.where(near, to_next, from_last), np.where(has_last, from_last, to_next)
+        twists = np.where(forwards, ahead, behind)
         return Trajectory(self.timestamps, self.Ts_world_camera @ se3.exp_all(seconds * twists))
 
     def save(self, path: str | Path) -> None:

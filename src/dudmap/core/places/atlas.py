@@ -32,13 +32,15 @@ class TimedPose:
     """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
 
     ``repeats`` is empty for a tracked frame, ``depth`` for one whose pose is predicted, since its depth image repeats,
-    and ``frame`` for one with the pose of the frame that it repeats, or interpolated between tracked frames.
+    and ``frame`` for one with the pose of the frame that it repeats, or interpolated between tracked frames. The depth
+    image was taken ``late`` seconds before its time stamp, as far as that was known when the frame was tracked.
     """
 
     timestamp: float
     T_world_camera: NDArray[np.float64]
     submap: int
     repeats: Repeats = ""
+    late: float = 0.0
 
 
 class Atlas(Stateful):
@@ -51,6 +53,7 @@ class Atlas(Stateful):
         rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
         current: Number of the submap that is tracked.
         poses: Poses of all tracked frames, in order of time.
+        depth_late: Of the calibration in use, seconds.
         saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
             submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
     """
@@ -62,6 +65,7 @@ class Atlas(Stateful):
     repainting: Remembered[MapRebuilding | None] = None
     current: Remembered[int]
     poses: Remembered[list[TimedPose]]
+    depth_late: Remembered[float] = 0.0
     saved: Remembered[int | None] = None
 
     def __init__(
@@ -183,7 +187,7 @@ class Atlas(Stateful):
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
         """Append the pose (4, 4) of a frame in the current submap; poses that were predicted since the last tracked
         frame are interpolated between that and this one."""
-        new = TimedPose(timestamp, T_world_camera, self.current, repeats)
+        new = TimedPose(timestamp, T_world_camera, self.current, repeats, self.depth_late)
         first = len(self.poses)
         while repeats != "depth" and first and self.poses[first - 1].repeats == "depth":
             first -= 1
@@ -256,11 +260,15 @@ class Atlas(Stateful):
         sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
         return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
 
-    def trajectory(self, submap: int) -> Trajectory:
-        """Trajectory of the frames tracked in a submap."""
+    def image_poses(self, submap: int) -> Trajectory:
+        """Poses at which the depth images of the frames tracked in a submap were taken."""
         return Trajectory.from_poses(
             (pose.timestamp, pose.T_world_camera) for pose in self.poses if pose.submap == submap
         )
+
+    def trajectory(self, submap: int) -> Trajectory:
+        """Poses in a submap at the time stamps of its frames, which may be late."""
+        return self.image_poses(submap).after(np.array([pose.late for pose in self.poses if pose.submap == submap]))
 
     def nodes(self, submap: int) -> list[int]:
         """Numbers of the stored frames of a submap, see ``FrameStore.in_submap``."""
