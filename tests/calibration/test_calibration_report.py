@@ -50,6 +50,8 @@ def test_what_was_estimated_has_its_uncertainty():
 
 def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
     class Short:
+        calibration = Calibration.registered(CAMERA)
+
         def __len__(self):
             return 5
 

@@ -341,3 +341,14 @@ def test_colours_of_another_time_are_left_to_those_who_know_the_motion():
     seen = Preprocessor(camera, calibration=small)(Frame(1.0, depth, color[::2, ::2].copy()))
     assert seen.rgb.shape == (120, 160, 3)
     assert seen.recorded_rgb.shape == (60, 80, 3)
+
+
+def test_readings_outside_the_view_of_the_colour_camera_are_left_out():
+    narrow = Calibration(replace(CAMERA, fx=120.0, fy=120.0))
+    depth = np.full((48, 64), 2.0, np.float32)
+    seen = Preprocessor(CAMERA, PreprocessConfig(filter="none"), narrow)(frame(depth)).depth > 0
+    assert seen[13:35, 17:47].all()
+    assert not seen[[10, 37]].any()
+    assert not seen[:, [14, 49]].any()
+    beside = replace(narrow, camera=replace(CAMERA, cx=CAMERA.cx - 1))  # nearer than the continued border
+    assert (Preprocessor(CAMERA, PreprocessConfig(filter="none"), beside)(frame(depth)).depth > 0).all()

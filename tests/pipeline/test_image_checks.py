@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.app.pipeline.image_checks import image_warnings
+from dudmap.app.pipeline.calibration import calibrate_start
+from dudmap.app.pipeline.image_checks import color_magnification, image_warnings
 from dudmap.app.pipeline.inspection import inspect
 from dudmap.cli import app
+from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.io.sequences import open_sequence
 from dudmap.lab import synthetic
+from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 from spoilt import LARGE, RIGHT, SPOILT, SpoiltSequence
 
@@ -79,3 +82,22 @@ def test_warnings_are_in_the_metrics_and_the_report(tmp_path):
     assert "the depth scale looks wrong" in warning
     assert f"warning: {warning}" in done.stderr
     assert f"warning: {warning}" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(("ratio", "seed"), [(1.6, 1), (1.3, 0), (0.65, 2)])
+def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(ratio, seed):
+    faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.015, 0.0, 0.0))
+    recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=seed)
+    said = []
+    assert color_magnification(recorded) == pytest.approx(ratio, rel=0.1)
+    start = calibrate_start(recorded, Config(), 24, said.append, lambda done, total: None)
+    assert start.camera.fx / recorded.camera.fx == color_magnification(recorded)
+    assert start.estimated == ("log_focal",)
+    assert "not registered to depth" in said[0]
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.0, 1.1])
+def test_colours_that_a_calibration_finds_by_itself_are_not_called_unregistered(ratio):
+    faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.03, 0.0, 0.0))
+    recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=3)
+    assert color_magnification(recorded) is None

@@ -31,13 +31,12 @@ def calibrate(
     Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
     the images do not prove stays as the files give it.
     """
-    from dudmap.app.pipeline.calibration import calibrate_sequence
+    from dudmap.app.pipeline.calibration import calibrate_sequence, known_calibration
     from dudmap.app.terminal import counted, plain_console
     from dudmap.core.geometry.calibration import Calibration
 
-    recording = reading.open(sequence)
-    given = recording.calibration if calibration is None else Calibration.load(calibration)
-    given = given or Calibration.registered(recording.camera)
+    recording, notices = reading.open(sequence), list[str]()
+    given = known_calibration(recording, notices.append) if calibration is None else Calibration.load(calibration)
     with counted("calibrating", quiet=as_json) as progress:
         estimate = calibrate_sequence(recording, parameters.read(), given, max_frames, progress=progress)
     if out is not None:
@@ -48,7 +47,7 @@ def calibrate(
         return
     console = plain_console()
     console.print(table(given, estimate))
-    for line in remarks(estimate):
+    for line in [*notices, *remarks(estimate)]:
         console.print(line, soft_wrap=True)
     if out is not None:
         console.print(f"written to {out}", soft_wrap=True)

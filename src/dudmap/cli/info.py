@@ -31,6 +31,7 @@ def info(
 
     from rich.table import Table
 
+    from dudmap.app.pipeline.image_checks import color_magnification, unregistered
     from dudmap.app.pipeline.inspection import inspect, repeats, sample
     from dudmap.app.terminal import plain_console
     from dudmap.app.viewing.snapshot import save_overview
@@ -39,6 +40,9 @@ def info(
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     found.repeats = repeats(recording)
+    if recording.calibration is None and (magnification := color_magnification(recording)) is not None:
+        said = f"the colours are {unregistered(magnification)}"
+        found.warnings.append(f"{said}; dudmap run calibrates them, where --camera is the camera of the depth")
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:

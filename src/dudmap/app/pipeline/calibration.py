@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from dudmap.app.pipeline.frame_source import read_ahead
+from dudmap.app.pipeline.image_checks import color_magnification, unregistered
 from dudmap.config import Config
 from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.backends.threads import num_threads
@@ -24,7 +25,7 @@ from dudmap.core.calibration.estimator import (
 from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import HALVING_BAND
-from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import is_timed
@@ -137,12 +138,14 @@ def calibrate_start(
     sentences on what is done and found, ``progress`` the numbers of frames tracked and of all.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
-    if config.preset == "thesis" or count < MIN_FRAMES:
-        thesis, short = "preset thesis takes the images as they are", f"that takes {MIN_FRAMES} frames"
-        notice(f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else short}")
+    if config.preset == "thesis":
+        notice(f"colour camera: {ASSUMED}: preset thesis takes the images as they are")
         return None
+    given = known_calibration(sequence, notice)
+    if count < MIN_FRAMES:
+        notice(f"colour camera: {ASSUMED}: that takes {MIN_FRAMES} frames")
+        return given if given.estimated else None
     notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
-    given = sequence.calibration or Calibration.registered(sequence.camera)
     try:
         estimate = calibrate_sequence(sequence, config, given, count, notice, progress)
     except DatasetError as error:
@@ -151,6 +154,20 @@ def calibrate_start(
     for finding in findings(estimate):
         notice(finding)
     return estimate.calibration
+
+
+def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
+    """The calibration that a recording gives, else that of registered colours; where these cannot be registered, with
+    the focal length at which their edges agree with those of the depth, which ``notice`` is told."""
+    if sequence.calibration is not None:
+        return sequence.calibration
+    registered, magnification = Calibration.registered(sequence.camera), color_magnification(sequence)
+    if magnification is None:
+        return registered
+    notice(f"colour camera: {unregistered(magnification)}; the calibration begins there")
+    focal = PARAMETERS.index("log_focal")
+    start = registered.retract(np.log(magnification) * (np.arange(NUM_PARAMETERS) == focal))
+    return replace(start, estimated=("log_focal",))
 
 
 def calibrate_sequence(
@@ -197,7 +214,9 @@ def calibrate_sequence(
         raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
     notice(f"calibration: comparing {len(keyframes)} of them with each other")
     estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(keyframes)
-    return replace(estimate, calibration=_enlarged(estimate.calibration, given.camera, halvings))
+    found = _enlarged(estimate.calibration, given.camera, halvings)
+    before = tuple(name for name in given.estimated if name not in found.estimated)
+    return replace(estimate, calibration=replace(found, estimated=(*before, *found.estimated)))
 
 
 def _quick(config: Config, halvings: int) -> Config:

@@ -47,6 +47,18 @@ GAIN, SIGNIFICANT = 0.04, 4.0
 over the frames it must exceed zero by."""
 FEWEST = 4
 """Frames that a judgement needs."""
+MAGNIFICATIONS = np.exp(np.arange(-12, 13) / 20)
+"""Focal lengths of the colours over that of the depth at which their edges are compared: modules with a narrow colour
+camera beside a wide depth camera have up to 1.7."""
+REGISTERED = np.abs(np.log(MAGNIFICATIONS)) < 0.16
+"""Those that a calibration finds by itself."""
+SHIFT = 3
+"""Largest shift of the colours, from the distance between both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
+LOOKS = 12, 48
+"""Frames in which another magnification is looked for, and in which it must be proven."""
+MAGNIFIED_GAIN = 0.01
+"""Smallest gain in that correlation by which another magnification is believed: those of registered images are below
+-0.02."""
 FLAT = 0.01
 """Largest deviation from one plane, standard deviation as a share of the depth, of a depth image without relief."""
 STILL = 0.2
@@ -114,7 +126,7 @@ def image_warnings(frames: "list[Frame]") -> list[str]:
         plane = "" if _planes(frames) is None else ", which show one plane and not how the camera moves along it"
         what = "the colour images have no texture (black or of one colour)"
         return [f"{what}: the camera is tracked by distances alone{plane}"]
-    return [*_plane_warnings(frames, grays), *_turn_warnings(frames, grays)]
+    return [*_plane_warnings(frames, grays), *_turn_warnings(frames)]
 
 
 def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -124,14 +136,12 @@ def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(small, np.float32) / np.float32(255)
 
 
-def _turn_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
+def _turn_warnings(frames: "list[Frame]") -> list[str]:
     """Whether the edges of depth lie on those of colour only after one of the images is turned."""
     gains = []
-    for frame, gray in zip(frames, grays, strict=True):
+    for frame in frames:
         if frame.depth.shape == frame.color.shape[:2]:
-            gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
-            edges = np.minimum(gradient / (gradient.mean() + 1e-5), STEEPEST)
-            steps = _depth_edges(frame.depth, gray.shape)
+            edges, steps = _edges(frame)
             given = _correlation(steps, edges)
             gains.append([_correlation(steps[::rows, ::columns], edges) - given for rows, columns in TURNED.values()])
     if len(gains) < FEWEST:
@@ -145,6 +155,82 @@ def _turn_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> l
         f"one of colour and depth seems to be {list(TURNED)[best]} against the other: then their edges agree better "
         f"(correlation higher by {mean[best]:.2f}) than as they are; turn the images of one of them"
     ]
+
+
+def color_magnification(sequence: "Sequence") -> float | None:
+    """Focal length of the colours over that of the depth at which the edges of both agree, where that is so far from 1
+    that the images cannot be registered and no calibration would find it; None elsewhere."""
+    agreement: dict[int, NDArray[np.float32]] = {}
+    found = None
+    for count in LOOKS:
+        for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)).tolist():
+            try:
+                if index not in agreement:
+                    agreement[index] = _magnified_agreement(sequence[index])
+            except FrameError:
+                continue
+        found = _best_magnification(np.stack(list(agreement.values()))) if len(agreement) >= FEWEST else None
+        if found is None:
+            return None
+    return found[0] if found is not None and found[1] >= SIGNIFICANT else None
+
+
+def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] | None:
+    """The magnification with the highest mean of ``agreement`` (frames, magnifications, shifts), and by how many
+    standard errors it is above that of registered images; None where one of these is as good."""
+    mean = agreement.mean(axis=0)
+    best, shift = (int(n) for n in np.unravel_index(np.argmax(mean), mean.shape))
+    near = np.unravel_index(np.argmax(np.where(REGISTERED[:, None], mean, -1)), mean.shape)
+    gains = agreement[:, best, shift] - agreement[:, near[0], near[1]]
+    if gains.mean() < MAGNIFIED_GAIN or not 0 < best < len(MAGNIFICATIONS) - 1:
+        return None
+    before, here, after = mean[best - 1 : best + 2, shift].tolist()
+    step = (before - after) / (2 * (before - 2 * here + after))  # to the maximum of the parabola
+    ratio = MAGNIFICATIONS[best] ** (1 - step) * MAGNIFICATIONS[best + 1] ** step
+    return float(ratio), float(gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains))))
+
+
+def unregistered(magnification: float) -> str:
+    """What a magnification of the colours shows."""
+    edges = f"their edges agree where the focal length of the colours is {magnification:.2f} times that of the depth"
+    return f"not registered to depth: {edges}"
+
+
+def _magnified_agreement(frame: "Frame") -> NDArray[np.float32]:
+    """Correlations of the edges of depth and colours (magnifications, shifts) for each magnification of the colours."""
+    edges, steps = _edges(frame)
+    (height, width), border = steps.shape, (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
+    steps, out = _flattened(steps, np.ones_like(steps)), []
+    for magnification in MAGNIFICATIONS.tolist():
+        middle = (1 - magnification) * np.array([(width - 1) / 2, (height - 1) / 2])
+        M = np.column_stack([magnification * np.eye(2), middle])
+        sampled, inside = (
+            np.asarray(cv2.warpAffine(image, M, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+            for image in (edges, np.ones_like(edges))
+        )
+        seen = (inside > 0.999).astype(np.float32)
+        sampled = _flattened(sampled.astype(np.float32), seen)
+        products, squares = (
+            cv2.matchTemplate(cv2.copyMakeBorder(image, *border), templ, cv2.TM_CCORR).reshape(-1)
+            for image, templ in ((sampled, steps), (seen, steps * steps))
+        )
+        out.append(products / np.sqrt(np.maximum(squares * np.square(sampled).sum(), np.float32(1e-9))))
+    return np.stack(out)
+
+
+def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    """An image without the mean of the neighbourhood, 0 where it is not ``seen``."""
+    size = NEIGHBOURHOOD, NEIGHBOURHOOD
+    share = np.maximum(cv2.blur(seen, size), np.float32(1e-3))
+    return np.asarray((image - cv2.blur(image * seen, size) / share) * seen, np.float32)
+
+
+def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Images (h, WIDTH) of the edges of the colours and of the depth of a frame."""
+    gray = _gray(frame.color)
+    gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+    edges = np.minimum(gradient / (gradient.mean() + np.float32(1e-5)), np.float32(STEEPEST))
+    return edges.astype(np.float32), _depth_edges(frame.depth, gray.shape)
 
 
 def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

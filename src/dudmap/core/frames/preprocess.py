@@ -19,6 +19,10 @@ HOLE_NOISE = 0.01
 """Readings around a small hole may always differ by this much, metres."""
 STEEPEST = 9.5
 """Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+BORDER = 0.02
+"""Share of its width by which the colour image is continued at its borders; readings beyond have no colour."""
+TYPICAL_DEPTH = 2.0
+"""Distance at which it is decided what the colour camera sees, metres."""
 DEPTH_MIN = 1e-3
 """Smallest lower limit of the depth, metres: 0 means no reading."""
 
@@ -32,7 +36,8 @@ class Preprocessor:
     against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
 
     The camera is that of the depth images, and of the colour images without a ``calibration``. Colours that were not
-    taken together with the depth are left as they were recorded, scaled to the size of the depth image.
+    taken together with the depth are left as they were recorded, scaled to the size of the depth image. Readings that
+    the colour camera does not see are left out: a map is registered by both.
     """
 
     def __init__(
@@ -46,6 +51,7 @@ class Preprocessor:
         self.camera = replace(camera, distortion=())
         self._maps = _undistortion(camera) if any(camera.distortion) else None
         self._inverse_map = _distortion(camera) if any(camera.distortion) else None
+        self._unseen = None if calibration is None else _unseen(self.camera, calibration)
         self._parameters = FilterParameters(
             depth_min=max(self.config.depth_min, DEPTH_MIN),
             depth_max=self.config.depth_max,
@@ -70,6 +76,8 @@ class Preprocessor:
         rgb = np.ascontiguousarray(frame.color)
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
+        if self._unseen is not None:
+            depth = np.where(self._unseen, np.float32(0), depth)
         depth = filter_depth(depth, self._parameters)
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
@@ -161,6 +169,18 @@ class Preprocessor:
             return np.asarray(straight, dtype=np.float32), rgb
         color = cv2.remap(rgb, *between, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
+
+
+def _unseen(camera: Camera, calibration: Calibration) -> NDArray[np.bool_] | None:
+    """Pixels (H, W) of the depth image whose surface the colour camera does not see; None if it sees all."""
+    import cv2
+
+    points = camera.backproject(np.full(camera.shape, TYPICAL_DEPTH, np.float32)).reshape(-1, 3).astype(np.float64)
+    T, color = calibration.T_color_depth, calibration.camera
+    pixels, _ = cv2.projectPoints(points, T[:3, :3], T[:3, 3], color.K, np.array(calibration.lens))
+    beyond, size = BORDER * color.width, np.array([color.width, color.height]) - 1
+    unseen = np.any((pixels[:, 0] < -beyond) | (pixels[:, 0] > size + beyond), axis=1).reshape(camera.shape)
+    return unseen if unseen.any() else None
 
 
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
