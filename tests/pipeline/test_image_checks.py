@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -93,7 +94,7 @@ def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(rat
     start = calibrate_start(recorded, Config(), 24, said.append, lambda done, total: None)
     assert start.camera.fx / recorded.camera.fx == color_magnification(recorded)
     assert start.estimated == ("log_focal",)
-    assert "not registered to depth" in said[0]
+    assert "the edges of both images agree where its focal length is" in said[0]
 
 
 @pytest.mark.parametrize("ratio", [0.9, 1.0, 1.1])
@@ -101,3 +102,20 @@ def test_colours_that_a_calibration_finds_by_itself_are_not_called_unregistered(
     faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.03, 0.0, 0.0))
     recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=3)
     assert color_magnification(recorded) is None
+
+
+def test_colours_of_another_size_are_calibrated_from_the_view_of_the_depth(tmp_path):
+    faults = SensorFaults(color_focal_ratio=1.5, color_translation=(0.015, 0.0, 0.0))
+    recorded = synthetic.sequence(movers=(), frames=16, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=4)
+    for kind in ("color", "depth"):
+        (tmp_path / kind).mkdir()
+    for number in range(len(recorded)):
+        frame = recorded[number]
+        wide = cv2.resize(frame.color, (480, 360))[45:315, :, ::-1]  # 16:9
+        cv2.imwrite(str(tmp_path / f"color/{number}.png"), wide)
+        cv2.imwrite(str(tmp_path / f"depth/{number}.png"), (1000 * frame.depth).astype(np.uint16))
+    folder = open_sequence(tmp_path, camera=recorded.camera)
+    assert folder.calibration.camera.shape == (270, 480)
+    assert folder.sources["colour camera"].startswith("the depth camera, assumed")
+    start = calibrate_start(folder, Config(), 16, lambda text: None, lambda done, total: None)
+    assert start.camera.fx / (1.5 * 1.5 * recorded.camera.fx) == pytest.approx(1, rel=0.1)

@@ -40,9 +40,9 @@ def info(
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     found.repeats = repeats(recording)
-    if recording.calibration is None and (magnification := color_magnification(recording)) is not None:
-        said = f"the colours are {unregistered(magnification)}"
-        found.warnings.append(f"{said}; dudmap run calibrates them, where --camera is the camera of the depth")
+    if (magnification := color_magnification(recording)) is not None:
+        said = f"the colour camera is not that given, or colours are not registered: {unregistered(magnification)}"
+        found.warnings.append(f"{said}; dudmap run calibrates it, where --camera is the camera of the depth")
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:

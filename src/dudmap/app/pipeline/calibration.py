@@ -157,17 +157,17 @@ def calibrate_start(
 
 
 def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
-    """The calibration that a recording gives, else that of registered colours; where these cannot be registered, with
-    the focal length at which their edges agree with those of the depth, which ``notice`` is told."""
-    if sequence.calibration is not None:
-        return sequence.calibration
-    registered, magnification = Calibration.registered(sequence.camera), color_magnification(sequence)
+    """The calibration that a recording gives, else that of registered colours; where the edges of both images
+    contradict its focal length by far, which ``notice`` is told, with that at which they agree."""
+    given, magnification = (
+        sequence.calibration or Calibration.registered(sequence.camera),
+        color_magnification(sequence),
+    )
     if magnification is None:
-        return registered
+        return given
     notice(f"colour camera: {unregistered(magnification)}; the calibration begins there")
-    focal = PARAMETERS.index("log_focal")
-    start = registered.retract(np.log(magnification) * (np.arange(NUM_PARAMETERS) == focal))
-    return replace(start, estimated=("log_focal",))
+    found = given.retract(np.log(magnification) * (np.arange(NUM_PARAMETERS) == PARAMETERS.index("log_focal")))
+    return replace(found, estimated=(*given.estimated, "log_focal"))
 
 
 def calibrate_sequence(

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.tracking.frame_view import TEXTURELESS
 from dudmap.errors import FrameError
@@ -48,8 +49,8 @@ over the frames it must exceed zero by."""
 FEWEST = 4
 """Frames that a judgement needs."""
 MAGNIFICATIONS = np.exp(np.arange(-12, 13) / 20)
-"""Focal lengths of the colours over that of the depth at which their edges are compared: modules with a narrow colour
-camera beside a wide depth camera have up to 1.7."""
+"""Focal lengths of the colour camera over those given at which its edges are compared with those of the depth: where
+the camera of the depth is given, colour cameras beside it have up to 1.7 times its focal length."""
 REGISTERED = np.abs(np.log(MAGNIFICATIONS)) < 0.16
 """Those that a calibration finds by itself."""
 SHIFT = 3
@@ -158,15 +159,16 @@ def _turn_warnings(frames: "list[Frame]") -> list[str]:
 
 
 def color_magnification(sequence: "Sequence") -> float | None:
-    """Focal length of the colours over that of the depth at which the edges of both agree, where that is so far from 1
-    that the images cannot be registered and no calibration would find it; None elsewhere."""
+    """Focal length of the colour camera over that given (or that of the depth) at which the edges of both images agree,
+    where that is so far from 1 that no calibration would find it; None elsewhere."""
+    given = sequence.calibration or Calibration.registered(sequence.camera)
     agreement: dict[int, NDArray[np.float32]] = {}
     found = None
     for count in LOOKS:
         for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)).tolist():
             try:
                 if index not in agreement:
-                    agreement[index] = _magnified_agreement(sequence[index])
+                    agreement[index] = _magnified_agreement(sequence[index], sequence.camera, given)
             except FrameError:
                 continue
         found = _best_magnification(np.stack(list(agreement.values()))) if len(agreement) >= FEWEST else None
@@ -192,20 +194,22 @@ def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] |
 
 def unregistered(magnification: float) -> str:
     """What a magnification of the colours shows."""
-    edges = f"their edges agree where the focal length of the colours is {magnification:.2f} times that of the depth"
-    return f"not registered to depth: {edges}"
+    return f"the edges of both images agree where its focal length is {magnification:.2f} times that given or assumed"
 
 
-def _magnified_agreement(frame: "Frame") -> NDArray[np.float32]:
+def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
     """Correlations of the edges of depth and colours (magnifications, shifts) for each magnification of the colours."""
     edges, steps = _edges(frame)
-    (height, width), border = steps.shape, (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
-    steps, out = _flattened(steps, np.ones_like(steps)), []
+    steps, border, out = _flattened(steps, np.ones_like(steps)), (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT), []
+    size, small = (
+        steps.shape[::-1],
+        [one.resized(WIDTH, len(image)) for one, image in ((given.camera, edges), (camera, steps))],
+    )
     for magnification in MAGNIFICATIONS.tolist():
-        middle = (1 - magnification) * np.array([(width - 1) / 2, (height - 1) / 2])
-        M = np.column_stack([magnification * np.eye(2), middle])
+        K = small[0].K @ np.diag([magnification, magnification, 1])
+        to_color = K @ given.T_color_depth[:3, :3] @ np.linalg.inv(small[1].K)  # of what is far away
         sampled, inside = (
-            np.asarray(cv2.warpAffine(image, M, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+            np.asarray(cv2.warpPerspective(image, to_color, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
             for image in (edges, np.ones_like(edges))
         )
         seen = (inside > 0.999).astype(np.float32)
@@ -227,10 +231,10 @@ def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray
 
 def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Images (h, WIDTH) of the edges of the colours and of the depth of a frame."""
-    gray = _gray(frame.color)
+    gray, (height, width) = _gray(frame.color), frame.depth.shape
     gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     edges = np.minimum(gradient / (gradient.mean() + np.float32(1e-5)), np.float32(STEEPEST))
-    return edges.astype(np.float32), _depth_edges(frame.depth, gray.shape)
+    return edges.astype(np.float32), _depth_edges(frame.depth, (round(WIDTH * height / width), WIDTH))
 
 
 def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile, associate
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
@@ -21,6 +22,9 @@ from dudmap.io.sequences import Recording, camera_files, images, intrinsics
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""
+OFF_CENTER = 0.08
+"""Distance of the principal point from the middle, as a share of the image, from which intrinsics seem to be those of
+other images."""
 FRAME_RATE = 30.0
 """Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
 
@@ -78,12 +82,22 @@ class ImageFolder(Recording):
 
     def _frame(self, index: int, name: str) -> Frame:
         frame = self._read(index, self.camera.depth_scale)
+        if self.calibration is None and frame.color.shape[:2] != frame.depth.shape:
+            raise FrameError(self._unequal(index, frame))
         if frame.depth.shape != self.camera.shape:
             raise FrameError(
                 f"frame {index}: {self._pairs[index][1].path} is {size(frame.depth)} pixels, but the recording's "
                 f"camera is {self.camera.width}x{self.camera.height}"
             )
         return frame
+
+    def _unequal(self, index: int, frame: Frame) -> str:
+        color_file, depth_file = self._pairs[index]
+        return (
+            f"frame {index}: the colour image {color_file.path} is {size(frame.color)} pixels but the depth image "
+            f"{depth_file.path} is {size(frame.depth)}; both must have one size, with depth registered to "
+            "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
+        )
 
     def set_rate(self, fps: float) -> None:
         """Replace the assumed rate of numbered frames: as many of the usual steps of their numbers make a second.
@@ -219,16 +233,11 @@ class ImageFolder(Recording):
                 f"frame {index}: the colour image {color_file.path} is {size(color)} pixels, but the recording's "
                 f"colour camera is {expected.width}x{expected.height}"
             )
-        if self.calibration is None and color.shape[:2] != depth.shape:
-            raise FrameError(
-                f"frame {index}: the colour image {color_file.path} is {size(color)} pixels but the depth image "
-                f"{depth_file.path} is {size(depth)}; both must have one size, with depth registered to "
-                "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
-            )
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame."""
+        """Camera with the size of the first valid frame; an unknown colour camera of another size is taken to have its
+        field of view."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -237,9 +246,28 @@ class ImageFolder(Recording):
                 problem = problem or str(error)
                 continue
             if frame.depth.any():
-                return known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
+                camera = known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
+                if self.calibration is None and frame.color.shape[:2] != camera.shape:
+                    if not _is_centered(camera):  # then the intrinsics may be those of the colour images
+                        problem = problem or self._unequal(int(index), frame)
+                        continue
+                    self.calibration = Calibration(_same_view(camera, *frame.color.shape[:2]))
+                    self.sources["colour camera"] = "the depth camera, assumed to have its field of view and position"
+                return camera
             problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"
         raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+
+def _is_centered(camera: Camera) -> bool:
+    """Whether the principal point is near to the middle of the image."""
+    middle, size = np.array([camera.cx, camera.cy]) + 0.5, np.array([camera.width, camera.height])
+    return bool(np.all(np.abs(middle / size - 0.5) < OFF_CENTER))
+
+
+def _same_view(camera: Camera, height: int, width: int) -> Camera:
+    """A camera with the horizontal field of view of another one, for images of another size."""
+    factor = width / camera.width
+    return Camera(factor * camera.fx, factor * camera.fy, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def _counted(how: str, colors: Sized, depths: Sized) -> str:
