@@ -72,6 +72,16 @@ def test_a_static_room_is_followed(recording, followed):
     assert np.median(np.abs(view.depth - frames[-1].depth)[both]) < 0.03
 
 
+def test_a_map_is_exposed_as_usual_though_the_camera_begins_in_the_dark(recording, followed):
+    (sequence, frames), (_, usual, _) = recording, followed
+    slam, dark = Slam(sequence.camera), replace(frames[0], color=(0.12 * frames[0].color).astype(np.uint8))
+    results = [slam.process(frame) for frame in (dark, *frames[1:4])]
+    gains = [result.tracking.exposure[0] for result in results[1:]]
+    assert 0.5 < min(gains) <= max(gains) < 2  # a map of the dark frame would have 0.12
+    for result, other in zip(results[1:], usual[1:], strict=False):
+        assert np.linalg.norm((result.T_world_camera - other.T_world_camera)[:3, 3]) < 0.005
+
+
 @pytest.mark.parametrize(
     "assignments",
     [

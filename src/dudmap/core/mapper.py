@@ -104,9 +104,8 @@ class Bootstrap(Stateful):
         enough = np.count_nonzero(depth[~dynamic_mask]) >= MIN_READINGS * depth.size
         return "" if enough else "the depth image holds hardly any readings"
 
-    def start(self, view: FrameView, dynamic_mask: NDArray[np.bool_]) -> None:
+    def start(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember the frame that a map was made of."""
-        estimate = PoseEstimate.at_origin()
         self._frames, self._num_fused = [StartFrame(view, estimate, dynamic_mask, fused=True)], 1
         self._window = [FusedFrame.of(view, estimate, dynamic_mask)] if self._refines else []
 

@@ -274,7 +274,7 @@ class Slam(SlamResults, Stateful):
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
-        estimate = PoseEstimate.at_origin()
+        estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0)
         mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
         if reason := self.bootstrap.rejection_reason(view, mask):
@@ -283,7 +283,7 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.mapper.extend(view, estimate, mask, fuse=True)
-        self.bootstrap.start(view, mask)
+        self.bootstrap.start(view, estimate, mask)
         self.color_motion.start(view)
         if self.config.dynamics.method == "em":
             self.predictor.start(view)

@@ -58,6 +58,8 @@ class StageTimer:
 
 TEXTURELESS = 0.01
 """Standard deviation of the intensities (0..1) below which an image carries no information: black or saturated."""
+EXPOSED, USUAL_INTENSITY = (0.2, 0.75), 0.4
+"""Mean intensities of images that are exposed as usual, and the one that others begin a map with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +105,13 @@ class FrameView:
         return TrackedImage(self.timestamp, T_world_camera, self.pyramid, self.segmentation(), **attributes)
 
     @property
+    def first_gain(self) -> float:
+        """Gain with which the frame begins a map: cameras often start before their exposure has settled, and the
+        colours of a map, whose exposure later frames get, are stored in steps of 1 / 255."""
+        mean = float(self.observation.intensity.mean())
+        return 1.0 if self.textureless or EXPOSED[0] <= mean <= EXPOSED[1] else USUAL_INTENSITY / mean
+
+    @property
     def textureless(self) -> bool:
         """Whether the intensities carry no information."""
         import cv2
@@ -133,9 +142,9 @@ class PoseEstimate:
     view: FrameView | None = None
 
     @classmethod
-    def at_origin(cls) -> "PoseEstimate":
-        """Estimate of the frame that defines the world frame."""
-        return cls(TrackingResult(np.eye(4), (1.0, 0.0), True, "", 1.0, 0.0, 1.0, 0))
+    def at_origin(cls, gain: float = 1.0) -> "PoseEstimate":
+        """Estimate of the frame that defines the world frame, whose colours times a gain are those of its map."""
+        return cls(TrackingResult(np.eye(4), (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0))
 
     @property
     def T_world_camera(self) -> NDArray[np.float64]:
