@@ -43,7 +43,7 @@ FEWEST = {
     (registration, "linearize_rows"): {"loops": 2, "fma": 66, "packed": 180, "converted": 18},
     PAIRS: {"loops": 1, "fma": 268, "packed": 480},
     (sampling, "sample_rows"): {"loops": 2, "fma": 8, "packed": 15, "converted": 10},
-    (integration, "integrate_blocks"): {"loops": 4, "fma": 9, "packed": 48, "converted": 16},
+    (integration, "integrate_blocks"): {"loops": 5, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
     (labeling, "mean_field"): {"loops": 1},
@@ -56,7 +56,10 @@ FEWEST = {
     (filtering, "halve_depth"): {"loops": 1, "fma": 3, "packed": 6},
 }
 """Least number of vectorised loops and of packed instructions on eight or more floats, per kernel."""
-CALLERS = registration.descend, fusion.fuse, sampling.sample, evidence.moving_pixels, labeling.upsample
+CALLERS = (
+    registration.descend, fusion.fuse, sampling.sample, evidence.moving_pixels, labeling.upsample,
+    filtering.filter_rows,
+)  # fmt: skip
 """Kernels that some of these are inlined into."""
 LONGEST = [(registration, "linearize_rows"), (integration, "integrate_blocks")]
 """Kernels of which one scalar loop is enough to be caught; they take half of the compiler's time."""
