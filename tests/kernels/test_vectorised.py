@@ -56,10 +56,7 @@ FEWEST = {
     (filtering, "halve_depth"): {"loops": 1, "fma": 3, "packed": 6},
 }
 """Least number of vectorised loops and of packed instructions on eight or more floats, per kernel."""
-CALLERS = (
-    registration.descend, fusion.fuse, sampling.sample, evidence.moving_pixels, labeling.upsample,
-    filtering.filter_rows,
-)  # fmt: skip
+CALLERS = registration.descend, fusion.fuse, sampling.sample, evidence.moving_pixels, labeling.upsample
 """Kernels that some of these are inlined into."""
 LONGEST = [(registration, "linearize_rows"), (integration, "integrate_blocks")]
 """Kernels of which one scalar loop is enough to be caught; they take half of the compiler's time."""

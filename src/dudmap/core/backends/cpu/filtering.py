@@ -24,14 +24,13 @@ FILTER_ROWS = 120
 """Image rows of one band of the filter."""
 
 
-@scalar
-def limit_depth(row_start, row_stop, depth, low, high, out):
-    """Readings of some rows of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
-    for v in range(row_start, row_stop):
-        source, target = depth[v], out[v - row_start]
-        for u in range(source.size):
-            z = source[u]
-            target[u] = z if (z >= low) & (z <= high) else np.float32(0)
+@kernel
+def limit_depth(depth, low, high, out):
+    """Readings of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
+    source, target = depth.reshape(-1), out.reshape(-1)
+    for n in range(source.size):
+        z = source[n]
+        target[n] = z if (z >= low) & (z <= high) else np.float32(0)
 
 
 @scalar
@@ -97,23 +96,7 @@ def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
     return (near > zero) & short & (abs(a - b) <= max(noise_floor, slope * near * near))
 
 
-@scalar
-def mean_around(v, u, depth, slope, noise_floor):
-    """Mean of the 5x5 neighbours of a small hole, 0 where they are too few or differ; see ``fill_holes``."""
-    h, w = depth.shape
-    total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
-    for y in range(max(v - 2, 0), min(v + 3, h)):
-        for x in range(max(u - 2, 0), min(u + 3, w)):
-            q = depth[y, x]
-            if q > 0:
-                total += q
-                low, high = min(low, q), max(high, q)
-                count += 1
-    same = count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low)
-    return total / np.float32(count) if same else np.float32(0)
-
-
-@scalar
+@kernel
 def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
 
@@ -123,12 +106,13 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     differ by more, are not bridged, and large holes, whose runs are longer in both directions, keep their border.
 
     Args:
-        row_start, row_stop: Rows that are filled.
+        row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
         slope: Largest spread over squared depth, 1/m.
         noise_floor: Largest spread near the lens, metres.
         out: (H, W) float32 out.
     """
+    wide_vectors()
     h, w = depth.shape
     line = np.zeros(w + 2 * LONGEST_RUN, np.float32)
     holes = np.zeros((w + 7) // 8 * 8, np.uint8)
@@ -156,9 +140,18 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
             if eights[np.uintp(n)] == 0:
                 continue
             for u in range(8 * n, 8 * n + 8):
-                if holes[u] != 0:
-                    mean = mean_around(v, u, depth, slope, noise_floor)
-                    out[v, u] = mean if mean > zero else out[v, u]
+                if holes[u] == 0:
+                    continue
+                total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
+                for y in range(max(v - 2, 0), min(v + 3, h)):
+                    for x in range(max(u - 2, 0), min(u + 3, w)):
+                        q = depth[y, x]
+                        if q > 0:
+                            total += q
+                            low, high = min(low, q), max(high, q)
+                            count += 1
+                if count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low):
+                    out[v, u] = total / np.float32(count)
 
 
 @scalar
@@ -200,16 +193,15 @@ def _start(middle, alpha, inverse, numerator, denominator):
         denominator[u] = np.float32(1)
 
 
-@scalar
+@kernel
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
 
     Unlike in the thesis, taps whose opposite lies outside the image are left out (``_accumulate``).
 
     Args:
-        row_start, row_stop: Rows that are filtered.
-        padded: (row_stop - row_start + 2r, W + 2r) float32, these rows with those around them, metres, ABSENT where
-            there is no reading, OUTSIDE beyond the image.
+        row_start, row_stop: Rows of the band.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading, OUTSIDE in the border of r pixels.
         alpha: sigma_c over squared depth, 1/m.
         spatial: (r + 1,) float32 weights by pixel distance.
         out: (H, W) float32 out; 0 where there is no reading.
@@ -220,7 +212,7 @@ def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     numerator = np.empty(w + 2 * r, np.float32)
     denominator = np.empty(w + 2 * r, np.float32)
     inverse = np.empty(w + 2 * r, np.float32)
-    for v in range(row_stop - row_start):
+    for v in range(row_start, row_stop):
         middle = padded[v + r]
         _start(middle, alpha, inverse, numerator, denominator)
         for k in range(1, r + 1):
@@ -233,58 +225,21 @@ def bilateral(row_start, row_stop, padded, alpha, spatial, out):
         for k in range(1, r + 1):
             before, after = column[r - k : r - k + w], column[r + k : r + k + w]
             _accumulate(middle, before, after, inverse, spatial[k], numerator, denominator)
-        row = out[row_start + v]
+        row = out[v]
         for u in range(w):
             z = middle[u]
             row[u] = z + numerator[u] / denominator[u] if z > np.float32(0) else np.float32(0)
 
 
-@scalar
-def pad(row_start, row_stop, depth, first, margin, out):
-    """Copy rows of ``depth`` (H, W) to the rows from ``first`` on of ``out`` (h, W + 2 margin), between its margins,
-    ABSENT for no reading."""
+@kernel
+def pad(row_start, row_stop, depth, margin, out):
+    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for no reading."""
     w = depth.shape[1]
     for v in range(row_start, row_stop):
-        source, target = depth[v], out[first + v - row_start][margin : margin + w]
+        source, target = depth[v], out[v + margin][margin : margin + w]
         for u in range(w):
             z = source[u]
             target[u] = z if z > np.float32(0) else ABSENT
-
-
-@kernel
-def filter_rows(row_start, row_stop, depth, low, high, fills, hole_noise, smooths, alpha, spatial, out):
-    """Limit rows of a depth image, fill their small holes, and smooth them.
-
-    What is between these steps are copies of the rows and of those around them, which stay in the caches.
-
-    Args:
-        row_start, row_stop: Rows of the band.
-        depth: (H, W) float32, metres; anything outside the limits is no reading.
-        low, high: Limits of the readings, metres.
-        fills, smooths: Whether to fill holes, and whether to smooth.
-        hole_noise: Metres; ``alpha``, 1/m, is the slope, too: as for ``fill_holes``.
-        alpha, spatial: As for ``bilateral``.
-        out: (H, W) float32 out.
-    """
-    wide_vectors()
-    (h, w), r = depth.shape, spatial.size - 1 if smooths else 0
-    first, last = max(row_start - r, 0), min(row_stop + r, h)
-    above, below = max(first - LONGEST_RUN, 0), min(last + LONGEST_RUN, h)
-    limited = np.empty((below - above, w), np.float32)
-    limit_depth(above, below, depth, low, high, limited)
-    filled = limited
-    if fills:
-        filled = np.empty((below - above, w), np.float32)
-        fill_holes(first - above, last - above, limited, alpha, hole_noise, filled)
-    if smooths:
-        padded = np.full((row_stop - row_start + 2 * r, w + 2 * r), OUTSIDE)
-        pad(first - above, last - above, filled, first - row_start + r, r, padded)
-        bilateral(row_start, row_stop, padded, alpha, spatial, out)
-        return
-    for v in range(row_start, row_stop):
-        source, target = filled[v - above], out[v]
-        for u in range(w):
-            target[u] = source[u]
 
 
 @kernel
@@ -345,24 +300,20 @@ def filter_depth(depth: NDArray[np.float32], parameters: FilterParameters) -> ND
         depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
         parameters: Limits and filter.
     """
-    p, out, ranges = parameters, np.empty_like(depth), bands(depth.shape[0], FILTER_ROWS)
-    low, high, alpha = np.float32(p.depth_min), np.float32(p.depth_max), np.float32(p.alpha)
-    hole_noise, weights = np.float32(p.hole_noise), p.spatial_weights
-
-    def apply(fills: bool, smooths: bool, source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
-        run_bands(
-            lambda start, stop: filter_rows(
-                start, stop, source, low, high, fills, hole_noise, smooths, alpha, weights, target
-            ),
-            ranges,
-        )
-
+    p, (height, width), ranges = parameters, depth.shape, bands(depth.shape[0], FILTER_ROWS)
+    alpha, hole_noise, steepest = np.float32(p.alpha), np.float32(p.hole_noise), np.float32(p.steepest)
+    out = np.empty_like(depth)
+    limit_depth(depth, np.float32(p.depth_min), np.float32(p.depth_max), out)
     if p.drop_mixed:
-        limited, unmixed, steepest = np.empty_like(depth), np.empty_like(depth), np.float32(p.steepest)
-        apply(False, False, depth, limited)
-        run_bands(lambda start, stop: drop_mixed(start, stop, limited, alpha, hole_noise, steepest, unmixed), ranges)
-        depth = unmixed
-    apply(p.fill_holes, p.smooth, depth, out)
+        limited, out = out, np.empty_like(depth)
+        run_bands(lambda start, stop: drop_mixed(start, stop, limited, alpha, hole_noise, steepest, out), ranges)
+    if p.fill_holes:
+        holed, out = out, np.empty_like(depth)
+        run_bands(lambda start, stop: fill_holes(start, stop, holed, alpha, hole_noise, out), ranges)
+    if p.smooth:
+        padded, weights = np.full((height + 2 * p.radius, width + 2 * p.radius), OUTSIDE), p.spatial_weights
+        pad(0, height, out, p.radius, padded)
+        run_bands(lambda start, stop: bilateral(start, stop, padded, alpha, weights, out), ranges)
     return out
 
 
