@@ -144,6 +144,22 @@ def test_what_a_second_process_compiles_are_parts_of_the_system():
     assert {*warmup.BESIDE, *warmup.BESIDE_RUN} <= {name for name, _ in warmup.steps()}
 
 
+def test_the_second_process_compiles_what_a_run_needs_after_its_first_poses():
+    """In a process of its own, since others may have loaded these kernels."""
+    program = """
+from dudmap.core.backends.cpu import color_pairs, consensus, labeling, linear_systems, rectification, segment_motion
+from dudmap.lab import warmup
+later = color_pairs.linearize_pairs, linear_systems.solve, rectification.rectify, labeling.fit_mixture._alone
+later += segment_motion.stand_still, consensus.count_votes, labeling.upsample
+assert not any(kernel.signatures for kernel in later)
+parts = dict(warmup.steps())
+for name in warmup.BESIDE_RUN:
+    parts[name]()
+assert all(kernel.signatures for kernel in later), later
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 def test_the_first_demo_waits_for_the_first_of_two_processes_and_ends_both(tmp_path, monkeypatch):
     calls = []
 

@@ -344,10 +344,16 @@ def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
     given = Calibration.registered(CAMERA)
     adjustment, pairs = Adjustment(given, SensorConfig()), PairSet([Pair(*collector.keyframes[:2])])
     fit, level = Fit.tracked(pairs, given), adjustment.levels[-1]
-    parts = [adjustment._linearize_pairs(pairs, fit, level, (0.01, 1.0), known=known) for known in (False, True)]
-    np.testing.assert_allclose(parts[1].H[0, 13:, 13:], parts[0].H[0, 13:, 13:], rtol=1e-6)
-    np.testing.assert_allclose(parts[1].b[0, 13:], parts[0].b[0, 13:], rtol=1e-6)
-    assert not parts[1].H[0, :13].any()
+    parts = [adjustment._linearize_pairs(pairs, fit, level, (0.01, 1.0), begin) for begin in (0, 13)]
+    np.testing.assert_allclose(parts[1].H[0], parts[0].H[0, 13:, 13:], rtol=1e-6)
+    np.testing.assert_allclose(parts[1].b[0], parts[0].b[0, 13:], rtol=1e-6)
+    systems = [adjustment._linearize(pairs, fit, level, (0.01, 1.0), known=known) for known in (False, True)]
+    steps = [system.step(np.zeros(13, bool)) for system in systems]
+    np.testing.assert_allclose(steps[1], steps[0], rtol=1e-6)
+    assert steps[1][13:].all()
+    assert not steps[1][:13].any()
+    moved = [fit.moved(pairs, step, system.parts, (0.01, 1.0)) for step, system in zip(steps, systems, strict=True)]
+    np.testing.assert_allclose(moved[1].light, moved[0].light, rtol=1e-6)
     few = PairSet([Pair(*collector.keyframes[:2])], stride=2)
     assert len(few.points) == sum(-(-len(frame.points) // 2) for frame in collector.keyframes[:2])
 
@@ -365,7 +371,7 @@ def test_relative_poses_follow_the_poses_of_both_frames():
     def cost_and_gradient(steps):
         fit = Fit.tracked(pair, given)
         fit = replace(fit, Ts_camera_world=se3.exp_all(np.array(steps)) @ fit.Ts_camera_world)
-        part = adjustment._linearize_pairs(pair, fit, level, scales)
+        part = adjustment._linearize_pairs(pair, fit, level, scales, 0)
         return part.b[0, 13:], part.H[0, 13:, 13:]
 
     start = [rng.normal(0, 2e-3, 6), rng.normal(0, 2e-3, 6)]

@@ -43,7 +43,7 @@ FEWEST = {
     (registration, "linearize_rows"): {"loops": 2, "fma": 66, "packed": 180, "converted": 18},
     PAIRS: {"loops": 1, "fma": 268, "packed": 480},
     (sampling, "sample_rows"): {"loops": 2, "fma": 8, "packed": 15, "converted": 10},
-    (integration, "integrate_blocks"): {"loops": 4, "fma": 9, "packed": 48, "converted": 16},
+    (integration, "integrate_blocks"): {"loops": 5, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
     (labeling, "mean_field"): {"loops": 1},

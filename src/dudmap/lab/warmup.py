@@ -18,12 +18,16 @@ import numpy as np
 from dudmap.app.doctor import COMPILING, compiled_kernels
 from dudmap.app.terminal import say
 from dudmap.config import Config
+from dudmap.core.backends.cpu.evidence import BINS, EDGES
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
+from dudmap.core.calibration.depth_readout import rectified_keyframe
 from dudmap.core.calibration.keyframes import keyframe
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.dominant_motion import reproject, rigid_motion
+from dudmap.core.dynamics.dominant_motion import neighbour_votes, reproject, rigid_motion
+from dudmap.core.dynamics.masks import fit_mixture, full_size
 from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
@@ -33,7 +37,7 @@ SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_tra
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 BESIDE = "labels", "several voxel sizes"
 """Parts of all that a second process compiles, which take about as long as the others."""
-BESIDE_RUN = "motion between images", "labels", "mesh"
+BESIDE_RUN = "motion between images", "labels", "calibration", "mesh"
 """Parts that it compiles while a run begins, in the order in which the frames need them."""
 
 
@@ -70,6 +74,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     def image_motion() -> None:
         points = np.random.default_rng(0).uniform(1, 2, (60, 3))
         rigid_motion(points, reproject(start, points, CAMERA), CAMERA, start)
+        neighbour_votes(points, np.zeros(60, np.int32), points, np.zeros(60, np.int32), np.ones(60, bool), 5)
 
     def labels() -> None:
         slam, detector = Slam(CAMERA, config), DynamicDetector(config.dynamics, config.sensor)
@@ -79,14 +84,23 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
                 detector.start(view.timestamp, view.labelled, start)
             found = detector.detect(slam.reference, view.labelled, start, view.timestamp, view.segmentation)
             detector.update(view.timestamp, view.labelled, start, (1.0, 0.0), found)
+            moving, segments, sigma = view.labelled.depth > 0, view.segmentation(), view.labelled.depth
+            detector.memory.update(number, view.labelled, start, moving, segments)
+            detector.memory.settled(number, view.labelled, start, segments, sigma, moving)
+            full_size(moving, view.labelled.depth, view.observation.depth)
+        fit_mixture(np.ones(BINS, np.int64), EDGES)  # as of a whole run
 
-    def color_camera() -> None:
-        slam = process(calibration=replace(registered, delay=0.01))
-        static = np.zeros(CAMERA.shape, bool)
-        ends = slam.preprocess(frames[0]), slam.preprocess(frames[-1])
-        first, second = (keyframe(image, registered, start, np.zeros(6), static) for image in ends)
+    def calibration() -> None:
+        preprocess, static = Preprocessor(CAMERA, config.preprocess), np.zeros(CAMERA.shape, bool)
+        ends = preprocess(frames[0]), preprocess(frames[-1])
+        taken = (keyframe(image, registered, start, np.full(6, 0.1), static) for image in ends)
+        first, second = (rectified_keyframe(one, 0.01) for one in taken)
         pairs, adjustment = PairSet([Pair(first, second)], 1), Adjustment(registered, config.sensor)
         adjustment.with_poses(pairs, Fit.tracked(pairs, registered))
+
+    def color_camera() -> None:
+        process(calibration=replace(registered, delay=0.01, depth_readout=0.01))
+        calibration()
 
     def several_voxel_sizes() -> None:
         adaptive = Slam(CAMERA, config.override(["volume.adaptive=true", "volume.adaptive_bend=0.05"]))
@@ -121,6 +135,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("synthetic frames", synthetic_frames),
         ("motion between images", image_motion),
         ("labels", labels),
+        ("calibration", calibration),
         ("several voxel sizes", several_voxel_sizes),
     ]
 

@@ -44,7 +44,7 @@ class PairSet:
         residual_starts: (P + 1,) where the residuals of each pair begin: one per point of its first frame.
         twists: (F, 6) float32 velocities; ``color_offsets``: (F,) float32.
         places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames;
-            ``products``: (P 625,) where their products do.
+            ``products``: (P n n,) where their products do, by the first of the n unknowns that are wanted.
     """
 
     def __init__(self, pairs: Sequence[Pair], stride: int = 1) -> None:
@@ -67,8 +67,10 @@ class PairSet:
         own = np.broadcast_to(np.arange(NUM_PARAMETERS), (len(pairs), NUM_PARAMETERS))
         poses = NUM_PARAMETERS + POSE * self.numbers[:, :, None] + np.arange(POSE)
         self.places = np.concatenate([own, poses.reshape(len(pairs), -1)], axis=1)
-        size = NUM_PARAMETERS + POSE * len(frames)
-        self.products = (size * self.places[:, :, None] + self.places[:, None, :]).reshape(-1)
+        self.products = {
+            begin: ((NUM_PARAMETERS - begin + POSE * len(frames)) * wanted[:, :, None] + wanted[:, None, :]).reshape(-1)
+            for begin, wanted in ((begin, self.places[:, begin:] - begin) for begin in (0, SHARED))
+        }
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -171,7 +173,7 @@ class Fit:
         return Fit(
             self.calibration.retract(step[:NUM_PARAMETERS]) if step[:NUM_PARAMETERS].any() else self.calibration,
             se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
-            self.light - parts.light_step - _times(parts.light_slope, step[pairs.places]),
+            self.light - parts.light_step - _times(parts.light_slope, step[pairs.places[:, parts.begin :]]),
             scales,
         )
 
@@ -181,8 +183,9 @@ class _PairSystems:
     """Normal equations of all pairs, each with its gain and offset eliminated.
 
     Attributes:
-        H, b: (P, 25, 25) and (P, 25) in the parameters and the poses of the first and the second frame.
-        light_slope, light_step: (P, 2, 25) and (P, 2), minus the step of gain and offset is light_step + light_slope
+        H, b: (P, n, n) and (P, n) in the parameters and the poses of the first and the second frame, n = 25, or in the
+            poses of a known calibration alone, n = 12.
+        light_slope, light_step: (P, 2, n) and (P, 2), minus the step of gain and offset is light_step + light_slope
             step.
         residuals: (2, n) of all pairs, see ``linearize_pair``.
     """
@@ -193,20 +196,26 @@ class _PairSystems:
     light_step: NDArray[np.float64]
     residuals: NDArray[np.float32]
 
+    @property
+    def begin(self) -> int:
+        """Number of the first unknown."""
+        return SHARED + 2 * POSE - self.b.shape[1]
+
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations (13 + 6 F) of all pairs with all priors."""
+    """Normal equations (13 + 6 F), or of the poses (6 F), of all pairs with all priors."""
 
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     parts: _PairSystems
 
     def step(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Gauss-Newton step in all poses and in the parameters that are free."""
-        moves = np.concatenate([free, np.ones(len(self.b) - NUM_PARAMETERS, dtype=bool)])
-        out = np.zeros(len(self.b))
-        out[moves] = -solved(self.H[np.ix_(moves, moves)], self.b[moves])
+        """Gauss-Newton step (13 + 6 F,) in all poses and in the parameters that are free."""
+        begin, out = self.parts.begin, np.zeros(len(self.b) + self.parts.begin)
+        moves = np.concatenate([free, np.ones(len(out) - NUM_PARAMETERS, dtype=bool)])
+        known = moves[begin:]
+        out[moves] = -solved(self.H[np.ix_(known, known)], self.b[known])
         return out
 
 
@@ -249,23 +258,24 @@ class Adjustment:
         assert system is not None
         return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
-    def with_poses(self, pairs: PairSet, start: Fit) -> tuple[Fit, NDArray[np.float32]]:
+    def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
         """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n).
 
-        From coarse to fine: another delay moves what a turning camera sees by more than the finer images tell.
+        From coarse to fine, unless the poses were fitted to nearly this calibration: another delay moves what a turning
+        camera sees by more than the finer images tell.
         """
         fit, residuals = start, np.empty((2, 0), np.float32)
-        for level in self.levels:
+        for level in levels or self.levels:
             for _ in range(FIT_ITERATIONS):
                 system = self._linearize(pairs, fit, level, COST_SCALES, known=True)
                 fit = fit.moved(pairs, system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system.parts, COST_SCALES)
                 residuals = system.parts.residuals
         return replace(fit, scales=new_scales(residuals, COST_SCALES)), residuals
 
-    def costs(self, pairs: PairSet, start: Fit) -> NDArray[np.float64]:
+    def costs(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> NDArray[np.float64]:
         """Mean robust costs (2, P) of intensities and depths of pairs whose poses are fitted with the calibration of a
-        fit."""
-        _, residuals = self.with_poses(pairs, start)
+        fit; arguments as of ``with_poses``."""
+        _, residuals = self.with_poses(pairs, start, levels)
         scaled = np.abs(residuals) / np.array(COST_SCALES, np.float32)[:, None]
         robust = np.where(scaled < HUBER, scaled * scaled, HUBER * (2 * scaled - HUBER))
         seen = np.isfinite(robust)
@@ -293,19 +303,20 @@ class Adjustment:
         self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
     ) -> _System:
         """Normal equations at an image size; those of a ``known`` calibration are only of the poses."""
-        parts = self._linearize_pairs(pairs, fit, level, scales, known=known)
-        tracked, places = pairs.Ts_camera_world, pairs.places
-        size = NUM_PARAMETERS + POSE * len(tracked)
-        H = np.asarray(np.bincount(pairs.products, parts.H.reshape(-1), size * size), np.float64).reshape(size, size)
+        begin, tracked = SHARED if known else 0, pairs.Ts_camera_world
+        parts = self._linearize_pairs(pairs, fit, level, scales, begin)
+        places, size = pairs.places[:, begin:] - begin, NUM_PARAMETERS - begin + POSE * len(tracked)
+        products = np.bincount(pairs.products[begin], parts.H.reshape(-1), size * size)
+        H = np.asarray(products, np.float64).reshape(size, size)
         b = np.asarray(np.bincount(places.reshape(-1), parts.b.reshape(-1), size), np.float64)
-        diagonal = np.concatenate([self.prior, np.tile(CORRELATED * POSE_SIGMA**-2, len(tracked))])
-        away = se3.log_all(fit.Ts_camera_world @ se3.inverse(tracked))
+        diagonal = np.concatenate([self.prior[begin:], np.tile(CORRELATED * POSE_SIGMA**-2, len(tracked))])
+        away = se3.log_all(fit.Ts_camera_world @ se3.inverse(tracked)).reshape(-1)
         H[np.arange(size), np.arange(size)] += diagonal
-        b += diagonal * np.concatenate([self.given.step_to(fit.calibration), away.reshape(-1)])
+        b += diagonal * (away if known else np.concatenate([self.given.step_to(fit.calibration), away]))
         return _System(H, b, parts)
 
     def _linearize_pairs(
-        self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
+        self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], begin: int
     ) -> _PairSystems:
         first, second = pairs.numbers.T
         Ts, calibration = fit.Ts_camera_world[second] @ se3.inverse(fit.Ts_camera_world[first]), fit.calibration
@@ -319,10 +330,10 @@ class Adjustment:
             calibration.lens.astype(np.float32), np.float32(1 / (1 << level)),
             np.float32(calibration.depth_readout + calibration.readout),
             fit.light.astype(np.float32), np.float32(SAME_SURFACE), self.noise, np.float32(1 / scales[0]),
-            np.float32(1 / scales[1]), np.float32(HUBER), SHARED if known else 0, pairs.residual_starts, residuals, H,
+            np.float32(1 / scales[1]), np.float32(HUBER), begin, pairs.residual_starts, residuals, H,
             b,
         )  # fmt: skip
-        return _without_light(H, b, fit.light, Ts, residuals)
+        return _without_light(H, b, fit.light, Ts, residuals, begin)
 
 
 def _without_light(
@@ -331,19 +342,22 @@ def _without_light(
     light: NDArray[np.float64],
     Ts: NDArray[np.float64],
     residuals: NDArray[np.float32],
+    begin: int,
 ) -> _PairSystems:
-    """Normal equations of all pairs in the parameters and the poses of the frames, from those (P, 21, 21), (P, 21) of
-    ``linearize_pair``, gains and offsets (P, 2), and the relative poses (P, 4, 4) of the first to the second camera."""
-    known, of_light, prior = slice(0, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), CORRELATED * LIGHT_SIGMA**-2
+    """Normal equations of all pairs in the parameters and the poses of the frames, of which the first ``begin`` are
+    known, from those (P, 21, 21), (P, 21) of ``linearize_pair``, gains and offsets (P, 2), and the relative poses (P,
+    4, 4) of the first to the second camera."""
+    known, of_light, own = slice(begin, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), SHARED - begin
+    prior = CORRELATED * LIGHT_SIGMA**-2
     inverse = np.asarray(np.linalg.inv(H[:, of_light, of_light] + np.diag(prior)), np.float64)
     light_step = _times(inverse, b[:, of_light] + prior * (light - [1.0, 0.0]))
     light_slope = inverse @ H[:, of_light, known]
     reduced = H[:, known, known] - H[:, known, of_light] @ light_slope
     gradient = b[:, known] - _times(H[:, known, of_light], light_step)
     # T exp(-d_first) = exp(-Ad(T) d_first) T: a twist of the first frame is one of the relative pose
-    M = np.zeros((len(Ts), SHARED + POSE, SHARED + 2 * POSE))
-    M[:, :SHARED, :SHARED], M[:, SHARED:, -POSE:] = np.eye(SHARED), np.eye(POSE)
-    M[:, SHARED:, SHARED : SHARED + POSE] = -se3.adjoint(Ts)
+    M = np.zeros((len(Ts), own + POSE, own + 2 * POSE))
+    M[:, :own, :own], M[:, own:, -POSE:] = np.eye(own), np.eye(POSE)
+    M[:, own:, own : own + POSE] = -se3.adjoint(Ts)
     M_transposed = np.swapaxes(M, 1, 2)
     return _PairSystems(
         M_transposed @ reduced @ M, _times(M_transposed, gradient), light_slope @ M, light_step, residuals

@@ -84,7 +84,7 @@ class ReadoutSearch:
         """Costs (2, P) of intensities and depths of every pair with a calibration, such as that of other pairs."""
         pairs = self._rectified(calibration.depth_readout)
         fit, _ = self._adjustment.with_poses(pairs, Fit.tracked(pairs, calibration))
-        return self._adjustment.costs(pairs, fit)
+        return self._adjustment.costs(pairs, fit, self._adjustment.levels[-1:])
 
     def _rectified(self, readout: float) -> PairSet:
         """The pairs of keyframes at the times of their middle rows."""

@@ -205,7 +205,7 @@ class CalibrationEstimator:
         halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
         fits = [self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given))[0] for pairs in halves]
-        costs = [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)]
+        costs = [self.adjustment.costs(halves[1 - n], fits[1 - n], self.adjustment.levels[-1:]) for n in (0, 1)]
         start = _Trial(~everything, fits, costs, halves)
         proven, evidence = self._proven(halves, start)
         pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], PAIRS // 2)])

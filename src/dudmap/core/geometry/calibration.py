@@ -70,9 +70,9 @@ class Calibration:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
         if T.shape != (4, 4) or not (
             np.isfinite(T).all()
-            and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+            and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() <= 1e-3
             and np.linalg.det(T[:3, :3]) > 0
-            and np.allclose(T[3], (0, 0, 0, 1))
+            and np.abs(T[3] - (0, 0, 0, 1)).max() <= 1e-8
         ):
             raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
         times = {"delay": self.delay, "readout": self.readout, "depth_readout": self.depth_readout}

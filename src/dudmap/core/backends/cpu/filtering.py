@@ -7,6 +7,7 @@ wrap-around test, and with it the vectorisation (measured: a factor 4).
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import FilterParameters
 from dudmap.core.backends.threads import bands, kernel, run_bands, scalar, written_out
 
@@ -111,9 +112,11 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
         noise_floor: Largest spread near the lens, metres.
         out: (H, W) float32 out.
     """
+    wide_vectors()
     h, w = depth.shape
     line = np.zeros(w + 2 * LONGEST_RUN, np.float32)
-    holes = np.empty(w, np.uint8)
+    holes = np.zeros((w + 7) // 8 * 8, np.uint8)
+    eights = holes.view(np.uint64)
     zero, one = np.float32(0), np.float32(1)
     for v in range(row_start, row_stop):
         row, target = depth[v], out[v]
@@ -133,19 +136,22 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
             b1, b2, b3 = j1 * below[k], j2 * below2[k], j3 * below3[k]
             in_column = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
             holes[k] = (line[np.uintp(u + 3)] <= zero) & (in_row | in_column)
-        for u in range(w):
-            if holes[u] == 0:
+        for n in range(eights.size):
+            if eights[np.uintp(n)] == 0:
                 continue
-            total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
-            for y in range(max(v - 2, 0), min(v + 3, h)):
-                for x in range(max(u - 2, 0), min(u + 3, w)):
-                    q = depth[y, x]
-                    if q > 0:
-                        total += q
-                        low, high = min(low, q), max(high, q)
-                        count += 1
-            if count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low):
-                out[v, u] = total / np.float32(count)
+            for u in range(8 * n, 8 * n + 8):
+                if holes[u] == 0:
+                    continue
+                total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
+                for y in range(max(v - 2, 0), min(v + 3, h)):
+                    for x in range(max(u - 2, 0), min(u + 3, w)):
+                        q = depth[y, x]
+                        if q > 0:
+                            total += q
+                            low, high = min(low, q), max(high, q)
+                            count += 1
+                if count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low):
+                    out[v, u] = total / np.float32(count)
 
 
 @scalar

@@ -112,6 +112,7 @@ def integrate_blocks(
     pixel = np.empty(512, np.int32)
     seen = np.empty(512, np.int64)
     words = seen.view(np.int32)  # reading and colour of the voxel's pixel, side by side
+    parts = np.empty((2, 512), np.int32)  # the same apart, without which half as many voxels are fused at a time
     known = np.empty((2, 512), np.float32)  # depth of the voxel; share in which it takes on the pixel's colour
     max_u, max_v = np.float32(width), np.float32(height)
 
@@ -139,7 +140,9 @@ def integrate_blocks(
             seen[n] = load_pair(pixels, np.uintp(2 * pixel[n]))
         largest = np.int32(0)
         for n in range(512):
-            largest = max(largest, (words[2 * n] >> 16) & 0xFFFF)
+            parts[0, n], parts[1, n] = words[np.uintp(2 * n)], words[np.uintp(2 * n + 1)]
+        for n in range(512):
+            largest = max(largest, (parts[0, n] >> 16) & 0xFFFF)
         farthest = np.float32(largest) * parameters.depth_unit
         prefetch_quarter(map_colors, following)
         first = np.int64(slot) * 512
@@ -157,9 +160,7 @@ def integrate_blocks(
             continue
         prefetch_quarter(map_colors, following + np.uintp(256))
         for n in range(512):
-            word, share = fuse_voxel(
-                geometry[n], words[2 * n], words[2 * n + 1], known[0, n], count, by_unit, parameters
-            )
+            word, share = fuse_voxel(geometry[n], parts[0, n], parts[1, n], known[0, n], count, by_unit, parameters)
             geometry[n] = word
             known[1, n] = share
             painted += zero if share == zero else one
@@ -169,7 +170,7 @@ def integrate_blocks(
             continue
         colors = map_colors[first : first + 512]
         for n in range(512):
-            colors[n] = fuse_color(colors[n], words[2 * n + 1], known[1, n])
+            colors[n] = fuse_color(colors[n], parts[1, n], known[1, n])
 
 
 @scalar
