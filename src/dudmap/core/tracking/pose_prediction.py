@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config, TrackerConfig
 from dudmap.core.dynamics.dominant_motion import AGREED, DominantMotion, exceeds_noise_share
 from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
-from dudmap.core.frames.observation import Level, is_majority_dynamic, reduced
+from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, SURFACE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
@@ -281,8 +281,6 @@ class PosePredictor(Stateful):
             return
         with view.timer("parallax"):
             dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-            if estimate.labels is None and view.known_dynamic is not None:  # of the first frame of a map
-                dynamic = reduced(view.known_dynamic, view.labelled)
             gain, _ = estimate.exposure
             image = view.tracked_at(estimate.T_world_camera, moving=dynamic, blind=view.blind, gain=gain)
             self.ego_motion.update(image)
