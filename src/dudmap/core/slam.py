@@ -184,12 +184,16 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.predicted(self._rectified(view))
         if self.reference.is_empty:
             return self._start_map(view)
-        view = replace(view, blind=True) if self._is_blind(view) else view
+        blind = view.textureless or self.stream.repeats == "color"  # the colours of the frame say nothing
+        view = replace(view, blind=blind and not self.bootstrap.textureless)
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
-            self._refine_first_poses()
+            if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
+                self.motion.apply_correction(correction)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_first_frame(view, prediction)
+        if prediction.crowd_in_map is not None and self.relocalizer.may_start_submaps:
+            return self._start_submap(view.with_dynamic(prediction.crowd_in_map))
         estimate = self.front_end.register(self.reference, view, prediction)
         verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
@@ -263,15 +267,6 @@ class Slam(SlamResults, Stateful):
             self.front_end.lose(view.timestamp)
         return view
 
-    def _refine_first_poses(self) -> None:
-        """Estimate the poses of the first moments of a map once more."""
-        if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
-            self.motion.apply_correction(correction)
-
-    def _is_blind(self, view: FrameView) -> bool:
-        """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
-        return (view.textureless or self.stream.repeats == "color") and not self.bootstrap.textureless
-
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0)
@@ -314,13 +309,17 @@ class Slam(SlamResults, Stateful):
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):
-            self.atlas.start_submap()
-            self.monitor.reset()
-            self.predictor.ego_motion.reset()
-            self.relocalizer.found()
-            self.redundancy.reset()
-            return self._start_map(replace(view, blind=False))
+            return self._start_submap(replace(view, blind=False))
         return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
+
+    def _start_submap(self, view: FrameView) -> FrameResult:
+        """Go on in a new map, which is made of this frame."""
+        self.color_calibration.interrupt()
+        self.atlas.start_submap()
+        for remembered in (self.monitor, self.detector, self.predictor.ego_motion, self.redundancy):
+            remembered.reset()
+        self.relocalizer.found()
+        return self._start_map(view)
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""

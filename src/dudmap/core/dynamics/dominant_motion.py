@@ -40,6 +40,7 @@ def rigid_motion(
     targets: NDArray[np.float64],
     camera: Camera,
     T_expected: NDArray[np.float64],
+    near_px: float = NEAR_PX,
 ) -> NDArray[np.float64]:
     """Motion T_after_before (4, 4) with the highest score among hypotheses from samples of three correspondences.
 
@@ -67,6 +68,7 @@ def rigid_motion(
         targets: (n, 2) their pixels in the second image.
         camera: Camera of both images.
         T_expected: (4, 4) predicted motion.
+        near_px: Scale of the prior, pixels; infinite for none.
     """
     areas, n = points[:, 2] ** 2, len(points)
     rng, draws = np.random.default_rng(0), np.empty((2 * HYPOTHESES, 3), np.int64)
@@ -77,7 +79,7 @@ def rigid_motion(
     found = consensus.Correspondences(
         points.T.copy(), targets.T.copy(), expected.T.copy(), areas, camera.intrinsics
     )  # fmt: skip
-    return consensus.best_motion(draws, found, _params(camera), T_expected)
+    return consensus.best_motion(draws, found, _params(camera, near_px), T_expected)
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
@@ -86,11 +88,11 @@ def pixels_at_width(distance: float, camera: Camera) -> float:
 
 
 @lru_cache(maxsize=8)
-def _params(camera: Camera) -> ConsensusParams:
+def _params(camera: Camera, near_px: float = NEAR_PX) -> ConsensusParams:
     levels = np.array(NOISE_LEVELS)
     gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
     limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
-    return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(NEAR_PX, camera))
+    return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(near_px, camera))
 
 
 def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
@@ -211,8 +213,8 @@ def dominant_motion(
         segmentations: Segments of both, at the resolution of the labels.
         moving: (h, w) bool at that resolution, pixels of the first image known to move; corners on them are left out of
             the estimate of the motion.
-        T_expected: (4, 4) predicted motion: the search for the corners starts there, and it is the prior of the
-            estimate. None: the identity.
+        T_expected: (4, 4) predicted motion: the search for the corners starts there, and between consecutive images it
+            is the prior of the estimate. None: the identity.
         intervals: Corners that are off by more than so many times the limit are dropped, and so are those whose depth
             changed by more than such a motion along the line of sight. Between images so many intervals apart, slower
             motion is hidden from image to image; what seems faster was confused with something else, such as the
@@ -234,7 +236,8 @@ def dominant_motion(
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
         return None
-    T = rigid_motion(points[candidate], targets[candidate], camera, T_expected)
+    near_px = NEAR_PX if np.isinf(intervals) else np.inf  # a pose that followed a crowd expects it to rest
+    T = rigid_motion(points[candidate], targets[candidate], camera, T_expected, near_px)
     predicted = reproject(T, points, camera)
     error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)

@@ -134,7 +134,7 @@ class EgoMotionSegmenter(Stateful):
         young = self.map_is_young(frame.timestamp)
         hidden = frame.moving is not None and is_majority_dynamic(frame.moving, frame.pyramid.labelled)
         self.active = young or (hidden and self.seconds > 0 and self.started)
-        if not young:
+        if not young and not (self.active and self._older):  # a crowd since the first second may be a slow one
             self._older.clear()
         elif not self._older or frame.timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
             self._older.append(replace(frame))
@@ -165,7 +165,7 @@ class EgoMotionSegmenter(Stateful):
         return self._compared[1]
 
     def slow_motion(self, now: TrackedImage) -> SlowMotion | None:
-        """Comparison with an older image; None once the map is not young, or where they follow no common motion.
+        """Comparison with an older image; None where there is none, or they follow no common motion.
 
         Where that shows something to move, the newest of the older images is compared, too: what came into view since
         the oldest one was taken moves in neither comparison otherwise.
@@ -174,19 +174,18 @@ class EgoMotionSegmenter(Stateful):
         while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
             self._older.popleft()
         older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
-        if not older or self.last is None or not self.map_is_young(timestamp):
+        if not older or self.last is None or not self.active:
             return None
-        oldest, newest = older[0], older[-1]
-        interval = timestamp - self.last.timestamp
-        ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
-        motion = oldest.motion_to(now, ages[0])
+        newest, interval = older[-1], timestamp - self.last.timestamp
+        found = ((image, image.motion_to(now, (timestamp - image.timestamp) / interval)) for image in older)
+        oldest, motion = next((pair for pair in found if pair[1] is not None), (newest, None))
         if motion is None:
             return None
         now = replace(now, T_world_camera=oldest.T_world_camera @ se3.inverse(motion.T_after_before))
         moving, static = propagate_to_segments(motion.after, whole_only=True), motion.static_after
         first = oldest.moving if oldest.timestamp == self._started else None
         if newest is not oldest and exceeds_noise_share(moving, now.pyramid.labelled):
-            motion = newest.motion_to(now, ages[1])
+            motion = newest.motion_to(now, (timestamp - newest.timestamp) / interval)
             if motion is not None:
                 moving = moving | propagate_to_segments(motion.after, whole_only=True)
                 static = static | motion.static_after

@@ -110,6 +110,11 @@ class Relocalizer(Stateful):
                 return Relocalization(estimate, submap)
         return None
 
+    @property
+    def may_start_submaps(self) -> bool:
+        """Whether a map may be given up for a new, empty one."""
+        return self.config.submaps.enabled and self.atlas.history is not None
+
     def wants_new_submap(self, view: FrameView) -> bool:
         """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
@@ -119,7 +124,7 @@ class Relocalizer(Stateful):
         since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
-        if not config.enabled or self.atlas.history is None or self._lost_since is None:
+        if not self.may_start_submaps or self._lost_since is None:
             return False
         while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
             self._recent.popleft()

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config, TrackerConfig
-from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
+from dudmap.core.dynamics.dominant_motion import AGREED, DominantMotion, exceeds_noise_share
 from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
 from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
-from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.core.map.volume import FREE, SURFACE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.tracker import Tracker
@@ -151,6 +151,8 @@ class PosePrediction:
         moving_before: (h, w) bool, as ``moving``, of the first image of the map where it is compared with that; else
             None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
+        crowd_in_map: (h, w) bool, as ``moving``, if that is most of the view and part of the map, which the camera has
+            followed then; else None.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -160,6 +162,7 @@ class PosePrediction:
     slow: NDArray[np.bool_] | None = None
     moving_before: NDArray[np.bool_] | None = None
     unverified_mask: NDArray[np.bool_] | None = None
+    crowd_in_map: NDArray[np.bool_] | None = None
 
 
 class PosePredictor(Stateful):
@@ -230,7 +233,7 @@ class PosePredictor(Stateful):
         if self._known_poses and not self.ego_motion.started:
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
-        self.mostly_slow = False
+        was_slow, self.mostly_slow = self.mostly_slow, False
         by_velocity = PosePrediction(
             T_expected, lambda: self._image_pose(self._ego_motion(view)), lambda: self._ego_motion(view)
         )
@@ -241,11 +244,11 @@ class PosePredictor(Stateful):
             T_image = self._image_pose(motion)
             if motion is None or T_image is None:
                 return by_velocity
-            slow = self._slow_motion(view, T_image, motion.moving_after)
+            slow = self._slow_motion(view, T_image, motion.moving_after, previously_dynamic if was_slow else None)
             if timestamp in self._known_poses:
                 T_image = T_expected
             elif slow is not None:
-                T_image = slow.T_world_camera
+                T_image = T_image if was_slow else slow.T_world_camera  # what is known to move misleads no corner
             elif not self._single_frame_map and self.fits_better(
                 volume, T_expected, T_image, pyramid.coarse, previously_dynamic
             ):
@@ -255,18 +258,21 @@ class PosePredictor(Stateful):
             moving = motion.moving_after
             if slow is not None:
                 moving, moving_before = moving | slow.moving, slow.moving_first
-            young = self.ego_motion.map_is_young(timestamp)
-            self._dynamic_start = self._dynamic_start and young and is_majority_dynamic(moving, view.labelled)
-            unverified = ~motion.static_after if self._dynamic_start else None
-            self.mostly_slow = slow is not None and is_majority_dynamic(moving, view.labelled)
-            if slow is not None and self.mostly_slow:
-                unverified = ~slow.static
+            young, mostly = self.ego_motion.map_is_young(timestamp), is_majority_dynamic(moving, view.labelled)
+            self._dynamic_start = self._dynamic_start and young and mostly
+            self.mostly_slow = slow is not None and mostly
+            rests = motion.static_after if slow is None else slow.static
+            unverified = ~rests if mostly and (young or slow is not None) else None
+            occupancy = None if unverified is None and young else _occupancy(volume, view.labelled, T_image)
+            mapped = unverified is not None and moving_before is None and timestamp not in self._known_poses
+            mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
+            crowd_in_map = moving if mapped else None
             if not young:  # where the map is known, it labels better than two images
-                moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
+                moving = moving & (occupancy == UNKNOWN)
         slowly = None if slow is None else slow.moving
         return replace(
             by_velocity, T_world_camera=T_image, moving=moving, slow=slowly, moving_before=moving_before,
-            unverified_mask=unverified,
+            unverified_mask=unverified, crowd_in_map=crowd_in_map,
         )  # fmt: skip
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
@@ -280,22 +286,36 @@ class PosePredictor(Stateful):
             self.ego_motion.update(image)
 
     def _slow_motion(
-        self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
+        self,
+        view: FrameView,
+        T_world_camera: NDArray[np.float64],
+        moving: NDArray[np.bool_],
+        crowd: NDArray[np.bool_] | None,
     ) -> SlowMotion | None:
         """Comparison with an older image, where that shows more to move than the last one does.
 
         Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
-        most of the view is seen to move anyway, few corners would be found again after a longer time.
+        most of the view is seen to move anyway, few corners would be found again after a longer time. A slow crowd is
+        taken to move on where an older image cannot tell.
 
         Args:
             view: The frame.
             T_world_camera: (4, 4) its pose by the last image.
             moving: (h, w) bool, what moves by the last image.
+            crowd: (h, w) bool, what moved in the last image if most of that moved slowly; else None.
         """
-        if is_majority_dynamic(moving, view.labelled):
+        if crowd is None and is_majority_dynamic(moving, view.labelled):
             return None
         slow = self.ego_motion.slow_motion(view.tracked_at(T_world_camera))
-        return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
+        if crowd is None:
+            return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
+        if slow is not None:
+            return slow
+        segments = view.segmentation()
+        moves = segments.share(crowd) >= AGREED
+        moves[0] = False
+        moves = moves[segments.labels]
+        return SlowMotion(T_world_camera, moves, ~moves, moving_first=None)
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
         """Motion of the static world from the previous image to this one."""
