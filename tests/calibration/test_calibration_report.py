@@ -7,6 +7,7 @@ import numpy as np
 from dudmap import Config
 from dudmap.app.pipeline.calibration import calibrate_start, findings
 from dudmap.core.calibration.estimator import GROUPS, SHUTTER, TESTED, Estimate
+from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 
@@ -50,10 +51,13 @@ def test_what_was_estimated_has_its_uncertainty():
 
 def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
     class Short:
-        calibration = Calibration.registered(CAMERA)
+        camera, calibration = CAMERA, None
 
         def __len__(self):
             return 5
+
+        def __getitem__(self, index):
+            return Frame(index / 30, np.full(CAMERA.shape, 2, np.float32), np.zeros((*CAMERA.shape, 3), np.uint8))
 
     said = []
     assert calibrate_start(Short(), Config(), len(Short()), said.append, lambda done, total: None) is None
