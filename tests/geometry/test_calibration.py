@@ -118,13 +118,15 @@ def test_a_plane_seen_by_two_cameras_has_one_colour():
     assert np.abs(elsewhere[:120, :160].astype(int) - color).mean() > 10
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.01])
 @pytest.mark.parametrize("vignetting", [0.0, 0.4, -0.1])
-def test_the_light_that_vignetting_took_is_given_back(vignetting):
+def test_the_light_that_vignetting_took_is_given_back(vignetting, delay):
+    """With a delay, though nothing moves, each pixel is looked up; without one it stays where it is."""
     camera = Camera(100.0, 100.0, 47.5, 35.5, 96, 72)
     v, u = np.indices(camera.shape)
     lost = np.exp(-vignetting * (np.square(u - 47.5) + np.square(v - 35.5)) / (47.5**2 + 35.5**2))
     seen = np.repeat(np.round(200 * lost)[..., None], 3, axis=2).clip(0, 255).astype(np.uint8)
-    projection = color_projection(Calibration(camera, vignetting=vignetting), np.zeros(6), 0.0)
+    projection = color_projection(Calibration(camera, vignetting=vignetting, delay=delay), np.zeros(6), 0.0)
     depth = np.full(camera.shape, 2.0, np.float32)
     np.testing.assert_allclose(register_color(seen, depth, camera, projection), 200, atol=1)
     shades = register_color(lost.astype(np.float32), depth, camera, projection)
