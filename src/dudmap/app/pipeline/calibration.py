@@ -159,10 +159,8 @@ def calibrate_start(
 def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
     """The calibration that a recording gives, else that of registered colours; where the edges of both images
     contradict its focal length by far, which ``notice`` is told, with that at which they agree."""
-    given, magnification = (
-        sequence.calibration or Calibration.registered(sequence.camera),
-        color_magnification(sequence),
-    )
+    given = sequence.calibration or Calibration.registered(sequence.camera)
+    magnification = color_magnification(sequence)
     if magnification is None:
         return given
     notice(f"colour camera: {unregistered(magnification)}; the calibration begins there")

@@ -189,7 +189,7 @@ def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] |
     before, here, after = mean[best - 1 : best + 2, shift].tolist()
     step = (before - after) / (2 * (before - 2 * here + after))  # to the maximum of the parabola
     ratio = MAGNIFICATIONS[best] ** (1 - step) * MAGNIFICATIONS[best + 1] ** step
-    return float(ratio), float(gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains))))
+    return float(ratio), float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-9))
 
 
 def unregistered(magnification: float) -> str:
@@ -200,14 +200,12 @@ def unregistered(magnification: float) -> str:
 def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
     """Correlations of the edges of depth and colours (magnifications, shifts) for each magnification of the colours."""
     edges, steps = _edges(frame)
-    steps, border, out = _flattened(steps, np.ones_like(steps)), (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT), []
-    size, small = (
-        steps.shape[::-1],
-        [one.resized(WIDTH, len(image)) for one, image in ((given.camera, edges), (camera, steps))],
-    )
+    steps, out = _flattened(steps, np.ones_like(steps)), []
+    size, border = steps.shape[::-1], (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
+    K_color, K_depth = given.camera.resized(WIDTH, len(edges)).K, camera.resized(WIDTH, len(steps)).K
+    rays = given.T_color_depth[:3, :3] @ np.linalg.inv(K_depth)  # of what is far away
     for magnification in MAGNIFICATIONS.tolist():
-        K = small[0].K @ np.diag([magnification, magnification, 1])
-        to_color = K @ given.T_color_depth[:3, :3] @ np.linalg.inv(small[1].K)  # of what is far away
+        to_color = K_color @ np.diag([magnification, magnification, 1]) @ rays
         sampled, inside = (
             np.asarray(cv2.warpPerspective(image, to_color, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
             for image in (edges, np.ones_like(edges))
