@@ -118,6 +118,46 @@ def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
     assert motion.share == pytest.approx(16 / 18)
 
 
+def test_the_pixels_of_a_fitted_motion_are_as_uncertain_as_repeated_fits_show():
+    """Corners on the far side of a room tell little of where the floor before the camera ought to be."""
+    rng = np.random.default_rng(5)
+    far, near = (
+        rng.uniform([-1, -1.5, 4.5], [1, -0.5, 5.5], (25, 3)),
+        rng.uniform([-0.5, 0.3, 0.9], [0.5, 0.6, 1.3], (9, 3)),
+    )
+    points, inlier = np.concatenate([far, near]), np.arange(34) < 25
+    targets, pixels = reproject(SLOW, far, CAMERA), []
+    for _ in range(300):
+        T = refined(SLOW, far, targets + rng.normal(0, 0.2, targets.shape), 5.0, CAMERA)
+        pixels.append(reproject(T, points, CAMERA))
+    error = np.where(inlier, 0.2 * np.sqrt(2 * np.log(2)), 9.0)
+    found = dominant._deviations(SLOW, points, error, inlier, CAMERA)
+    np.testing.assert_allclose(found, np.sqrt(np.var(pixels, axis=0).mean(axis=1)), rtol=0.2)
+    assert found[~inlier].min() > 10 * found[inlier].max()
+
+
+@pytest.mark.parametrize(("columns", "moves"), [((120, 200), False), ((5, 315), True)])
+def test_corners_in_a_corner_of_the_image_do_not_tell_what_moves_elsewhere(monkeypatch, columns, moves):
+    """The floor before the camera is 10 pixels off the motion that the far side of the room was seen to make."""
+    u, v = np.indices(CAMERA.shape)[::-1]
+    level = Level(CAMERA, np.where(v < 70, 4 + u / 160, 1.2).astype(np.float32), np.zeros(CAMERA.shape, np.float32))
+    rng = np.random.default_rng(4)
+    far, floor = rng.integers([columns[0], 5], [columns[1], 65], (50, 2)), rng.integers([5, 80], [310, 230], (60, 2))
+    pixels, is_floor = np.concatenate([far, floor]), np.arange(110) >= 50
+    targets = pixels + rng.normal(0, 0.2, pixels.shape) + np.where(is_floor[:, None], [0.0, 10.0], 0.0)
+    tracked = targets, np.zeros(len(pixels)), np.ones(len(pixels), bool)
+    monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: tracked)
+    monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
+    points = CAMERA.points(*pixels.T, level.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64))
+    view = SimpleNamespace(fine=level, grey=None, corners=pixels, corner_points=points, labelled=level)
+    motion = dominant_motion(view, view, (None, None))
+    on_floor = motion.before.pixels[:, 1] >= 70
+    moving, static = motion.before.moving, motion.before.static
+    assert (np.count_nonzero(moving & on_floor) > 40) if moves else (np.count_nonzero(moving & on_floor) < 8)
+    assert np.count_nonzero(static & on_floor) < 10
+    assert np.count_nonzero(static & ~on_floor) == 50
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_motion_between_those_of_the_world_and_of_slow_people_is_not_taken(seed):
     rng = np.random.default_rng(seed)

@@ -24,6 +24,8 @@ degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
 NOISE_LEVELS = 1.0, 0.5, 0.25
 """Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
 corners of a right motion are measured with 0.07 px per coordinate."""
+LEAST_SIGMA_PX = NOISE_LEVELS[-1] * NOISE_PX / np.sqrt(5.99)
+"""Smallest sigma of the inliers that is believed, pixels per coordinate."""
 OUTLIER_GAIN = 2.996
 """Log-likelihood ratio of a corner without error to an outlier at the largest noise level, 5.99 / 2: a corner is an
 inlier up to the error at which both are equally likely."""
@@ -124,14 +126,14 @@ NOISE_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class LabelledCorners:
-    """Corners of an image, each labelled as static or moving.
+    """Corners of an image, each labelled as static, as moving, or as neither where that is unclear.
 
     Attributes:
         level: The image, at the resolution of the labels.
         segmentation: Its segments.
         points: (n, 3) the corners, metres, camera frame.
         pixels: (n, 2) int, their pixels u, v in ``level``.
-        moving: (n,) bool.
+        moving, static: (n,) bool.
     """
 
     level: Level
@@ -139,12 +141,11 @@ class LabelledCorners:
     points: NDArray[np.float64]
     pixels: NDArray[np.int64]
     moving: NDArray[np.bool_]
+    static: NDArray[np.bool_]
 
-    @cached_property
-    def count_by_segment(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Moving corners (count + 1,) in each segment, and all; entry 0: in none."""
-        size, segment = self.segmentation.count + 1, self.segment_of
-        return np.bincount(segment[self.moving], minlength=size), np.bincount(segment, minlength=size)
+    def count_by_segment(self, which: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
+        """Corners (count + 1,) in each segment, of those that are given (n,); entry 0: in none."""
+        return np.bincount(self.segment_of[which], minlength=self.segmentation.count + 1)
 
     @cached_property
     def segment_of(self) -> NDArray[np.int32]:
@@ -205,8 +206,11 @@ def dominant_motion(
         max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
     with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
-    dropped if it does. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
-    sigma.) The median is by surface: corners on slow people may be more than half of all, and near enough to count.
+    dropped if it does. It is unclear up to MOVES_SIGMAS standard deviations that the covariance of the motion gives its
+    pixel, if it was not known to move: a few corners on the far side of a room do not tell where the floor before the
+    camera ought to be. (The length of a vector of two normally distributed coordinates has
+    the median sqrt(2 ln 2) sigma.) The median is by surface: corners on slow people may be more than half of all, and
+    near enough to count.
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.
@@ -249,13 +253,15 @@ def dominant_motion(
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
     limit = least + MOVES_SHARE * lengths(targets - pixels)
-    moves = error > limit
-    kept = ~moves
-    moves &= (error <= intervals * limit) & (_depth_change(T, points, targets, fine_after) <= intervals * limit)
+    rests = error <= limit
+    clear = error > MOVES_SIGMAS * _deviations(T, points, error, candidate & inlier, camera)
+    too_fast = (error > intervals * limit) | (_depth_change(T, points, targets, fine_after) > intervals * limit)
+    kept, moves = rests | ~too_fast, ~rests & ~too_fast
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
-    targets, points, moves = targets[kept], points[kept], moves[kept]
+    moves &= clear | ~candidate
+    targets, points, moves, rests = targets[kept], points[kept], moves[kept], rests[kept]
     columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
     seen = z > 0
@@ -263,15 +269,47 @@ def dominant_motion(
     return DominantMotion(
         T,
         share,
-        LabelledCorners(before.labelled, segmentations[0], points, labelled[kept], moves),
+        LabelledCorners(before.labelled, segmentations[0], points, labelled[kept], moves, rests),
         LabelledCorners(
             after.labelled,
             segmentations[1],
             points_after,
             _pixels_of_level(targets[seen], fine_after, after.labelled),
             moves[seen],
+            rests[seen],
         ),
     )
+
+
+def _deviations(
+    T: NDArray[np.float64],
+    points: NDArray[np.float64],
+    error: NDArray[np.float64],
+    inlier: NDArray[np.bool_],
+    camera: Camera,
+) -> NDArray[np.float64]:
+    """Standard deviations (n,) per coordinate of the pixels that a fitted motion gives points.
+
+    They follow from its covariance by the normal equations of the inliers, sigma^2 (sum J^T J)^-1, where J (2, 6) is
+    the derivative of a pixel by the twist of the motion: sigma_n^2 = sigma^2 tr(J_n (sum J^T J)^-1 J_n^T) / 2.
+
+    Args:
+        T: (4, 4).
+        points: (n, 3) metres, before the motion.
+        error: (n,) their reprojection errors after it, pixels.
+        inlier: (n,) bool, the points that it was fitted to.
+        camera: Camera of the pixels.
+    """
+    x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+    x, y, by_z, none = x / z, y / z, 1 / z, np.zeros_like(z)
+    u = np.stack([by_z, none, -x * by_z, -x * y, 1 + x * x, -y], axis=1)
+    v = np.stack([none, by_z, -y * by_z, -1 - y * y, x * y, x], axis=1)
+    J = camera.focal[:, None] * np.stack([u, v], axis=1)
+    rows = J[inlier].reshape(-1, 6)
+    covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)
+    sigma = weighted_median(error[inlier], points[inlier, 2] ** 2) / np.sqrt(2 * np.log(2))
+    sigma = max(sigma, pixels_at_width(LEAST_SIGMA_PX, camera))
+    return sigma * np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
 
 
 def _depth_change(
@@ -311,7 +349,7 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
         return np.zeros(level.depth.shape, dtype=bool)
-    num_moving, num_all = corners.count_by_segment
+    num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
     enough = num_moving >= FEWEST_MOVING
     whole = enough & (num_moving >= AGREED * num_all)
     mixed = enough & ~whole
@@ -331,8 +369,7 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
     """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of such corners."""
-    num_moving, num_all = corners.count_by_segment
-    num_static = num_all - num_moving
+    num_static, num_all = corners.count_by_segment(corners.static), corners.count_by_segment()
     static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
     static[0] = False
     return static[corners.segmentation.labels]

@@ -183,6 +183,7 @@ class PosePredictor(Stateful):
     mostly_slow: Remembered[bool] = False
     _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
     _dynamic_start: Remembered[bool] = False  # most of the view has moved in every frame so far
+    _mostly_moving: Remembered[bool] = False  # most of the view moved in the last frame
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
@@ -233,7 +234,8 @@ class PosePredictor(Stateful):
         if self._known_poses and not self.ego_motion.started:
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
-        was_slow, self.mostly_slow = self.mostly_slow, False
+        was_slow, was_moving = self.mostly_slow, self._mostly_moving
+        self.mostly_slow = self._mostly_moving = False
         by_velocity = PosePrediction(
             T_expected, lambda: self._image_pose(self._ego_motion(view)), lambda: self._ego_motion(view)
         )
@@ -260,11 +262,13 @@ class PosePredictor(Stateful):
                 moving, moving_before = moving | slow.moving, slow.moving_first
             young, mostly = self.ego_motion.map_is_young(timestamp), is_majority_dynamic(moving, view.labelled)
             self._dynamic_start = self._dynamic_start and young and mostly
-            self.mostly_slow = slow is not None and mostly
-            rests = motion.static_after if slow is None else slow.static
-            unverified = ~rests if mostly and (young or slow is not None) else None
+            self.mostly_slow = slow is not None and is_majority_dynamic(slow.moving, view.labelled)
+            self._mostly_moving = mostly
+            lasts = self._dynamic_start or (was_moving and mostly)  # a single comparison may be wrong
+            rests = slow.static if slow is not None and self.mostly_slow else motion.static_after & ~moving
+            unverified = ~rests if (young and lasts) or self.mostly_slow else None
             occupancy = None if unverified is None and young else _occupancy(volume, view.labelled, T_image)
-            mapped = unverified is not None and moving_before is None and timestamp not in self._known_poses
+            mapped = lasts and unverified is not None and moving_before is None and timestamp not in self._known_poses
             mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
             crowd_in_map = moving if mapped else None
             if not young:  # where the map is known, it labels better than two images
