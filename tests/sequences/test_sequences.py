@@ -101,6 +101,10 @@ def test_a_known_camera_does_not_fit_images_of_another_size(tmp_path):
     folder = write_recording(tmp_path / "fr1_small", 1, intrinsics=None)
     with pytest.raises(DatasetError, match=r"TUM freiburg1 camera.* is for images of 640x480 pixels.*64x48.*--camera"):
         open_sequence(folder)
+    with pytest.raises(DatasetError, match=r"of 128x96 .*--camera 50,51,31.5,23.5,64,48,1000 if they show the same"):
+        open_sequence(folder, "100,102,63.5,47.5,128,96,1000")
+    with pytest.raises(DatasetError, match=r"of 128x72 .*--camera fx,fy,cx,cy,w,h,depth_scale$"):
+        open_sequence(folder, "100,102,63.5,35.5,128,72,1000")
 
 
 def test_camera_argument_wins(recording):
@@ -221,7 +225,7 @@ def test_unknown_camera(tmp_path):
         ("", "expected the 9 of a 3x3 matrix K"),
         ("fx 60\nfy -60\ncx 31.5\ncy 23.5\n", "positive finite"),
         ("fx 60\nfy nan\ncx 31.5\ncy 23.5\n", "cannot understand the line 'fy nan'"),
-        ("fx 60\nfy 60\ncx 31.5\ncy 23.5\nwidth 640\nheight 480\n", "640x480 pixels, but the recording's are 64x48"),
+        ("fx 60\nfy 60\ncx 31.5\ncy 23.5\nwidth 640\nheight 480\n", "640x480 pixels, but the recording's depth images are 64x48"),
     ],
 )
 def test_intrinsics_that_cannot_be_used(tmp_path, text, sentence):

@@ -27,6 +27,8 @@ COLOR_PREFIX = "color_"
 """Prefix of the keys of a second camera for the colour images, with fx, fy, cx, cy, width and height, which are
 required, and the coefficients of its distortion."""
 COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
+SAME_SHAPE = 0.01
+"""Relative difference of the sides' ratio up to which images of two sizes may show the same view."""
 MOTION_KEY = "T_depth_color"
 """Key of the 12 or 16 numbers, row by row, of the motion that takes points of the colour camera to the depth camera."""
 
@@ -61,12 +63,17 @@ class Intrinsics:
             depth_scale: Units per metre where they are not known.
         """
         expected = (int(self.values.get("width", width)), int(self.values.get("height", height)))
+        values = {"depth_scale": depth_scale, "width": width, "height": height} | self.values
         if expected != (width, height):
+            view = "fx,fy,cx,cy,w,h,depth_scale"
+            if abs(width * expected[1] / (height * expected[0]) - 1) < SAME_SHAPE:
+                numbers = from_camera(_camera(values, values["depth_scale"]).resized(width, height)).values.values()
+                view = ",".join(f"{number:.6g}" for number in list(numbers)[:7]) + " if they show the same view"
             raise DatasetError(
-                f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's are "
-                f"{width}x{height}; give the right intrinsics with --camera fx,fy,cx,cy,w,h,depth_scale"
+                f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's depth images "
+                f"are {width}x{height}; give their intrinsics with --camera {view}"
             )
-        return _camera(self.values | {"width": width, "height": height}, self.values.get("depth_scale", depth_scale))
+        return _camera(values, values["depth_scale"])
 
 
 def _camera(values: dict[str, float], depth_scale: float) -> Camera:
