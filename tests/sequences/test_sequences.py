@@ -225,7 +225,10 @@ def test_unknown_camera(tmp_path):
         ("", "expected the 9 of a 3x3 matrix K"),
         ("fx 60\nfy -60\ncx 31.5\ncy 23.5\n", "positive finite"),
         ("fx 60\nfy nan\ncx 31.5\ncy 23.5\n", "cannot understand the line 'fy nan'"),
-        ("fx 60\nfy 60\ncx 31.5\ncy 23.5\nwidth 640\nheight 480\n", "640x480 pixels, but the recording's depth images are 64x48"),
+        (
+            "fx 60\nfy 60\ncx 31.5\ncy 23.5\nwidth 640\nheight 480\n",
+            "640x480 pixels, but the recording's depth images are 64x48",
+        ),
     ],
 )
 def test_intrinsics_that_cannot_be_used(tmp_path, text, sentence):

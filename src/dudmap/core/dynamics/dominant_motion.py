@@ -246,21 +246,24 @@ def dominant_motion(
     error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
     inlier, areas = error < threshold, points[:, 2] ** 2
-    if np.count_nonzero(candidate & inlier) < FEWEST:
+    fitted = candidate & inlier
+    if np.count_nonzero(fitted) < FEWEST:
         return None
-    share = float(areas[candidate & inlier].sum() / areas[candidate].sum())
+    share = float(areas[fitted].sum() / areas[candidate].sum())
     near = error < MOVES_SIGMAS * threshold
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
     limit = least + MOVES_SHARE * lengths(targets - pixels)
     rests = error <= limit
-    clear = error > MOVES_SIGMAS * _deviations(T, points, error, candidate & inlier, camera)
+    new = ~rests & candidate
+    unclear = np.zeros(len(points), bool)
+    unclear[new] = error[new] <= MOVES_SIGMAS * _deviations(T, points[new], points[fitted], error[fitted], camera)
     too_fast = (error > intervals * limit) | (_depth_change(T, points, targets, fine_after) > intervals * limit)
     kept, moves = rests | ~too_fast, ~rests & ~too_fast
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
-    moves &= clear | ~candidate
+    moves &= ~unclear
     targets, points, moves, rests = targets[kept], points[kept], moves[kept], rests[kept]
     columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
@@ -284,8 +287,8 @@ def dominant_motion(
 def _deviations(
     T: NDArray[np.float64],
     points: NDArray[np.float64],
+    inliers: NDArray[np.float64],
     error: NDArray[np.float64],
-    inlier: NDArray[np.bool_],
     camera: Camera,
 ) -> NDArray[np.float64]:
     """Standard deviations (n,) per coordinate of the pixels that a fitted motion gives points.
@@ -296,20 +299,27 @@ def _deviations(
     Args:
         T: (4, 4).
         points: (n, 3) metres, before the motion.
-        error: (n,) their reprojection errors after it, pixels.
-        inlier: (n,) bool, the points that it was fitted to.
+        inliers: (m, 3) the points that it was fitted to.
+        error: (m,) their reprojection errors, pixels.
         camera: Camera of the pixels.
     """
+    if len(points) == 0:
+        return np.empty(0)
+    rows = _pixel_jacobian(T, inliers, camera).reshape(-1, 6)
+    covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)
+    sigma = weighted_median(error, inliers[:, 2] ** 2) / np.sqrt(2 * np.log(2))
+    sigma = max(sigma, pixels_at_width(LEAST_SIGMA_PX, camera))
+    J = _pixel_jacobian(T, points, camera)
+    return sigma * np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
+
+
+def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Derivatives (n, 2, 6) of the pixels of points (n, 3) after a motion T (4, 4) by a twist of it."""
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     x, y, by_z, none = x / z, y / z, 1 / z, np.zeros_like(z)
     u = np.stack([by_z, none, -x * by_z, -x * y, 1 + x * x, -y], axis=1)
     v = np.stack([none, by_z, -y * by_z, -1 - y * y, x * y, x], axis=1)
-    J = camera.focal[:, None] * np.stack([u, v], axis=1)
-    rows = J[inlier].reshape(-1, 6)
-    covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)
-    sigma = weighted_median(error[inlier], points[inlier, 2] ** 2) / np.sqrt(2 * np.log(2))
-    sigma = max(sigma, pixels_at_width(LEAST_SIGMA_PX, camera))
-    return sigma * np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
+    return camera.focal[:, None] * np.stack([u, v], axis=1)
 
 
 def _depth_change(
