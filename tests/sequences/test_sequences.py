@@ -105,6 +105,8 @@ def test_a_known_camera_does_not_fit_images_of_another_size(tmp_path):
         open_sequence(folder, "100,102,63.5,47.5,128,96,1000")
     with pytest.raises(DatasetError, match=r"of 128x72 .*--camera fx,fy,cx,cy,w,h,depth_scale$"):
         open_sequence(folder, "100,102,63.5,35.5,128,72,1000")
+    with pytest.raises(DatasetError, match=r"0x0; at least 16x16 pixels"):
+        open_sequence(folder, "100,102,63.5,35.5,0,0")
 
 
 def test_camera_argument_wins(recording):

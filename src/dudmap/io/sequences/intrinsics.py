@@ -62,18 +62,18 @@ class Intrinsics:
             width, height: Size of the depth images.
             depth_scale: Units per metre where they are not known.
         """
-        expected = (int(self.values.get("width", width)), int(self.values.get("height", height)))
         values = {"depth_scale": depth_scale, "width": width, "height": height} | self.values
-        if expected != (width, height):
+        camera = _camera(values, values["depth_scale"])
+        if camera.shape != (height, width):
             view = "fx,fy,cx,cy,w,h,depth_scale"
-            if abs(width * expected[1] / (height * expected[0]) - 1) < SAME_SHAPE:
-                numbers = from_camera(_camera(values, values["depth_scale"]).resized(width, height)).values.values()
-                view = ",".join(f"{number:.6g}" for number in list(numbers)[:7]) + " if they show the same view"
+            if not camera.distortion and abs(width * camera.height / (height * camera.width) - 1) < SAME_SHAPE:
+                other = from_camera(camera.resized(width, height)).values
+                view = ",".join(f"{other[key]:.6g}" for key in KEYS[:7]) + " if they show the same view"
             raise DatasetError(
-                f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's depth images "
-                f"are {width}x{height}; give their intrinsics with --camera {view}"
+                f"{self.source} is for images of {camera.width}x{camera.height} pixels, but the recording's depth "
+                f"images are {width}x{height}; give their intrinsics with --camera {view}"
             )
-        return _camera(values, values["depth_scale"])
+        return camera
 
 
 def _camera(values: dict[str, float], depth_scale: float) -> Camera:
