@@ -208,9 +208,8 @@ def dominant_motion(
     with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
     dropped if it does. It is unclear up to MOVES_SIGMAS standard deviations that the covariance of the motion gives its
     pixel, if it was not known to move: a few corners on the far side of a room do not tell where the floor before the
-    camera ought to be. (The length of a vector of two normally distributed coordinates has
-    the median sqrt(2 ln 2) sigma.) The median is by surface: corners on slow people may be more than half of all, and
-    near enough to count.
+    camera ought to be. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
+    sigma.) The median is by surface: corners on slow people may be more than half of all, and near enough to count.
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.

@@ -260,13 +260,8 @@ class PosePredictor(Stateful):
             moving = motion.moving_after
             if slow is not None:
                 moving, moving_before = moving | slow.moving, slow.moving_first
-            young, mostly = self.ego_motion.map_is_young(timestamp), is_majority_dynamic(moving, view.labelled)
-            self._dynamic_start = self._dynamic_start and young and mostly
-            self.mostly_slow = slow is not None and is_majority_dynamic(slow.moving, view.labelled)
-            self._mostly_moving = mostly
-            lasts = self._dynamic_start or (was_moving and mostly)  # a single comparison may be wrong
-            rests = slow.static if slow is not None and self.mostly_slow else motion.static_after & ~moving
-            unverified = ~rests if (young and lasts) or self.mostly_slow else None
+            young = self.ego_motion.map_is_young(timestamp)
+            unverified, lasts = self._watch_crowd(view, motion, slow, moving, was_moving=was_moving)
             occupancy = None if unverified is None and young else _occupancy(volume, view.labelled, T_image)
             mapped = lasts and unverified is not None and moving_before is None and timestamp not in self._known_poses
             mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
@@ -278,6 +273,33 @@ class PosePredictor(Stateful):
             by_velocity, T_world_camera=T_image, moving=moving, slow=slowly, moving_before=moving_before,
             unverified_mask=unverified, crowd_in_map=crowd_in_map,
         )  # fmt: skip
+
+    def _watch_crowd(
+        self,
+        view: FrameView,
+        motion: DominantMotion,
+        slow: SlowMotion | None,
+        moving: NDArray[np.bool_],
+        *,
+        was_moving: bool,
+    ) -> tuple[NDArray[np.bool_] | None, bool]:
+        """Take note of whether most of the view moves, as by the pixels ``moving`` (h, w) bool, and whether slowly.
+
+        A single comparison of two images may be wrong about that: of a fast crowd it is believed from the second frame
+        on (``was_moving`` in the last one) or from the start of the map on.
+
+        Returns:
+            The pixels (h, w) bool that are not verified to rest if most of the view moves, else None; whether it has
+            moved for more than this frame.
+        """
+        young = self.ego_motion.map_is_young(view.timestamp)
+        self._mostly_moving = is_majority_dynamic(moving, view.labelled)
+        self._dynamic_start = self._dynamic_start and young and self._mostly_moving
+        lasts = self._dynamic_start or (was_moving and self._mostly_moving)
+        if slow is not None and is_majority_dynamic(slow.moving, view.labelled):
+            self.mostly_slow = True
+            return ~slow.static, lasts
+        return ~motion.static_after | moving if young and lasts else None, lasts
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image that the next one is compared with: a frame whose pose is accepted."""
