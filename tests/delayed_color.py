@@ -21,7 +21,6 @@ class KnownDelay(CalibrationEstimator):
 
 
 def find_early(monkeypatch, attempts):
-    """Let the self-calibration estimate after these numbers of frames, and use the result two frames later."""
+    """Let the self-calibration estimate after these numbers of frames."""
     monkeypatch.setattr(self_calibration, "ATTEMPTS", attempts)
-    monkeypatch.setattr(self_calibration, "DELAY", 2)
     monkeypatch.setattr(self_calibration, "CalibrationEstimator", KnownDelay)

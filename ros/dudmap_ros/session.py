@@ -154,9 +154,9 @@ class Session:
     def _started(self, info: Any) -> Slam:  # noqa: ANN401
         camera = ros.camera_of(info)
         if self.saved_map is None:
-            return Slam(camera, self.config)
+            return Slam(camera, self.config, live=True)
         saved = SavedMap.load(self.saved_map, self.config.volume.voxel_size)
-        slam = Slam(camera, self.config, saved_map=saved)
+        slam = Slam(camera, self.config, live=True, saved_map=saved)
         slam.localize = self.localize
         if self.watching:
             self.watch = ChangeWatch(SavedMap.load(self.saved_map))  # of its own: the run changes the other one

@@ -1,5 +1,6 @@
 """Calibration while the camera moves: when a result is used, and what it changes in the map."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
 
@@ -20,7 +21,7 @@ from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.faults import SensorFaults
 
 SMALL = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
-FRAMES, FIRST, LATER = 24, 12, 4
+FRAMES, FIRST = 24, 12
 UNREGISTERED = {"color_translation": (0.04, 0.0, 0.0), "color_focal_ratio": 0.92}
 
 
@@ -43,7 +44,7 @@ class Estimator:
     def __init__(self, result: Calibration) -> None:
         self.result, self.may, self.keyframes = result, Event(), []
 
-    def __call__(self, given, sensor):
+    def __call__(self, given, sensor, workers):
         return self
 
     def estimate(self, keyframes):
@@ -55,10 +56,14 @@ class Estimator:
 @pytest.fixture
 def estimator(monkeypatch):
     monkeypatch.setattr(self_calibration, "ATTEMPTS", (FIRST,))
-    monkeypatch.setattr(self_calibration, "DELAY", LATER)
     made = Estimator(truth_of(recording(**UNREGISTERED)))
     monkeypatch.setattr(self_calibration, "CalibrationEstimator", made)
-    return made
+    with ThreadPoolExecutor(1) as beside:
+        monkeypatch.setattr(
+            self_calibration, "estimate_beside", lambda estimator, frames: beside.submit(estimator.estimate, frames)
+        )
+        yield made
+        made.may.set()
 
 
 def observations(count: int):
@@ -68,24 +73,24 @@ def observations(count: int):
 
 
 def when_found(live: bool, estimator) -> int | None:
-    """Frame with which a result is found if it is there from frame FIRST + 1 on."""
-    estimator.may.clear()
+    """Frame with which a result is found; live it is there from two frames after the beginning of the estimation on."""
+    if not live:
+        estimator.may.set()
     calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig(), live=live)
-    for n, (observation, T, mask) in enumerate(observations(FIRST + LATER + 2), start=1):
+    for n, (observation, T, mask) in enumerate(observations(FIRST + 4), start=1):
         calibrating.add(observation, T, mask, 0)
-        if n == FIRST + 1:
+        if live and n == FIRST + 2:
             estimator.may.set()
-            if live:
-                calibrating._running.result(20)
+            calibrating._running.result(20)
         if calibrating.found() is not None:
             assert calibrating.finished
             return n
     return None
 
 
-def test_a_recording_uses_the_result_at_a_fixed_frame_and_a_live_camera_as_soon_as_it_is_there(estimator):
-    assert when_found(False, estimator) == FIRST + LATER
-    assert when_found(True, estimator) == FIRST + 1
+def test_a_recording_waits_for_the_result_and_a_live_camera_uses_it_as_soon_as_it_is_there(estimator):
+    assert when_found(True, estimator) == FIRST + 2
+    assert when_found(False, estimator) == FIRST
     assert estimator.keyframes[0] >= 2
 
 
@@ -99,7 +104,6 @@ def test_poses_that_do_not_fit_those_before_are_not_compared_with_them(estimator
     calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig())
     for n, (observation, T, mask) in enumerate(observations(FIRST), start=1):
         calibrating.add(observation, T, mask, submap=0 if n < FIRST - 1 else 1)
-    calibrating._running.result(20)
     assert estimator.keyframes == [0]
 
 
@@ -125,13 +129,13 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator, ahe
     slam = Slam(SMALL, config)
     views = [slam.prepare(faulty[index]) for index in range(FRAMES)] if ahead else faulty
     results, before = [], None
-    for index in range(FIRST + LATER + 2):
+    for index in range(FIRST + 3):
         results.append(slam.process(views[index]))
-        if index == FIRST + LATER - 1:
+        if index == FIRST - 1:
             T = results[8].T_world_camera
             before = color_error(slam, exact[8], T)
     # the first frame, of which the map is made, is not registered to it
-    assert [n for n, result in enumerate(results) if result.calibrated] == [FIRST + LATER]
+    assert [n for n, result in enumerate(results) if result.calibrated] == [FIRST]
     assert slam.calibration is estimator.result
     assert all(result.state == "tracked" for result in results)
     assert color_error(slam, exact[8], T) < 0.7 * before
@@ -141,10 +145,10 @@ def test_only_frames_since_it_is_known_that_stamps_are_late_have_poses_at_other_
     estimator.may.set()
     estimator.result = replace(Calibration.registered(SMALL), depth_late=0.02, estimated=("delay",))
     slam, frames = Slam(SMALL), recording()
-    for index in range(FIRST + LATER + 3):
+    for index in range(FIRST + 3):
         slam.process(frames[index])
     images, stamps = slam.image_poses.Ts_world_camera, slam.trajectory.Ts_world_camera
-    assert (images != stamps).any(axis=(1, 2)).tolist() == [n > FIRST + LATER for n in range(FIRST + LATER + 3)]
+    assert (images != stamps).any(axis=(1, 2)).tolist() == [n > FIRST for n in range(FIRST + 3)]
 
 
 def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estimator):
@@ -152,5 +156,5 @@ def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estim
     faulty = recording(**UNREGISTERED)
     for config, known in ((Config(), truth_of(faulty)), (Config().override(["sensor.self_calibration=false"]), None)):
         slam = Slam(SMALL, config, calibration=known)
-        assert not any(slam.process(faulty[index]).calibrated for index in range(FIRST + LATER))
+        assert not any(slam.process(faulty[index]).calibrated for index in range(FIRST))
     assert estimator.keyframes == []

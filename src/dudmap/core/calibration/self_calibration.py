@@ -1,17 +1,15 @@
 """Calibration of the colour camera while it moves, and what changes when a better one is found."""
 
-import os
-import sys
-from collections.abc import Callable
 from concurrent.futures import Future
-from threading import Thread, get_native_id
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config, SensorConfig
+from dudmap.core.backends.threads import num_threads
+from dudmap.core.calibration.estimation_process import estimate_beside
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
-from dudmap.core.calibration.keyframes import KeyframeCollector
+from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
@@ -24,22 +22,16 @@ from dudmap.core.tracking.frame_view import FrameView
 ATTEMPTS = (120, 240, 480, 960)
 """Numbers of tracked frames after which the calibration is estimated from the keyframes so far: after the four seconds
 of hand-held motion that show every fault, and each time after twice as long, as more was seen."""
-DELAY = 60
-"""Frames between the beginning of an estimation and the use of its result: the time that it takes beside the tracking,
-so that a recording, whose result must not depend on the machine, rarely has to wait for it."""
-
-PRIORITY = 10
-"""Priority of the thread of an estimation, as of ``nice``: a tenth of the share of the tracking on a busy core."""
 
 
 class SelfCalibration(Stateful):
-    """Estimates the calibration in a thread of its own while frames are tracked.
+    """Estimates the calibration from time to time while frames are tracked.
 
     Each estimate starts from the calibration as given and takes all keyframes of the current submap, whose colours are
     kept as they were recorded, so that it does not matter with which calibration they were tracked.
 
-    ``live``: The result is used as soon as it is there, and not after a fixed number of frames. ``estimate`` is the
-    last one that was finished; None before.
+    ``live``: It is estimated beside the frames and used as soon as it is there. A recording, whose result must not
+    depend on the machine, waits for it. ``estimate`` is the last one that was finished; None before.
     """
 
     estimate: Remembered[Estimate | None] = None
@@ -48,7 +40,6 @@ class SelfCalibration(Stateful):
     _frames: Remembered[int] = 0
     _submap: Remembered[int] = 0
     _running: Remembered[Future[Estimate] | None] = None
-    _due: Remembered[int] = 0
 
     def __init__(self, given: Calibration, sensor: SensorConfig, *, live: bool = False) -> None:
         self.given = given
@@ -80,9 +71,9 @@ class SelfCalibration(Stateful):
         self._collector.add(observation, T_world_camera, dynamic_mask)
         if self._frames >= self._attempts[0] and self._running is None:
             self._attempts.pop(0)
-            self._due = self._frames + DELAY
-            estimator, keyframes = CalibrationEstimator(self.given, self.sensor), list(self._collector.keyframes)
-            self._running = _in_background(lambda: estimator.estimate(keyframes))
+            estimator = CalibrationEstimator(self.given, self.sensor, 1 if self.live else num_threads())
+            start = estimate_beside if self.live else _estimated
+            self._running = start(estimator, list(self._collector.keyframes))
             if not self._attempts:
                 self._collector.clear()
 
@@ -94,25 +85,16 @@ class SelfCalibration(Stateful):
 
     def found(self) -> Calibration | None:
         """A calibration that is to be used from the next frame on; None if the one in use stays."""
-        if self._running is None or not (self._running.done() if self.live else self._frames >= self._due):
+        if self._running is None or not self._running.done():
             return None
         self.estimate, self._running = self._running.result(), None
         return self.estimate.calibration if self.estimate.calibration.estimated else None
 
 
-def _in_background(function: Callable[[], Estimate]) -> "Future[Estimate]":
-    """Result of a function that runs in a thread which does not keep the process alive."""
+def _estimated(estimator: CalibrationEstimator, keyframes: list[ColorKeyframe]) -> "Future[Estimate]":
+    """Result of an estimation that is waited for."""
     future: Future[Estimate] = Future()
-
-    def work() -> None:
-        if sys.platform == "linux":  # where threads have priorities
-            os.setpriority(os.PRIO_PROCESS, get_native_id(), PRIORITY)
-        try:
-            future.set_result(function())
-        except BaseException as error:  # raised where the result is asked for
-            future.set_exception(error)
-
-    Thread(target=work, name="dudmap-calibration", daemon=True).start()
+    future.set_result(estimator.estimate(keyframes))
     return future
 
 
@@ -126,7 +108,7 @@ class ColorCalibration(Stateful):
             standard deviations are known, is kept.
         atlas: The maps and the stored frames.
         color_motion: Registers the colours of the frames.
-        live: A calibration is used as soon as it is found, and not at a fixed frame.
+        live: Frames do not wait for a calibration.
     """
 
     _estimation: Remembered[SelfCalibration | None]

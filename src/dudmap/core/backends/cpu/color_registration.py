@@ -8,7 +8,7 @@ import numpy as np
 from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
-from dudmap.core.formulas.pixel import elements, project, ray, transform
+from dudmap.core.formulas.pixel import project, ray
 
 NEAREST = np.float32(0.05)
 """Depth in the colour camera below which a point is projected as if it were at this depth, metres."""
@@ -27,6 +27,21 @@ def fill_gaps(source, fallback, target):
         z = source[u]
         last = z if z > np.float32(0) else last
         target[u] = last
+
+
+@scalar
+def _along_row(T, y):
+    """A motion (3, 4) of the points (x, y, 1) z of a row: factors of x z, factors of z, and shifts."""
+    return (
+        T[0, 0], T[1, 0], T[2, 0], T[0, 1] * y + T[0, 2], T[1, 1] * y + T[1, 2], T[2, 1] * y + T[2, 2],
+        T[0, 3], T[1, 3], T[2, 3],
+    )  # fmt: skip
+
+
+@scalar
+def _moved(t, x, z):
+    """Such a point after the motion."""
+    return (t[0] * x + t[3]) * z + t[6], (t[1] * x + t[4]) * z + t[7], (t[2] * x + t[5]) * z + t[8]
 
 
 @scalar
@@ -49,28 +64,33 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down, ga
         gain: (w,) float32 out, what vignetting leaves of the brightness there, inverted.
     """
     zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-    p, s, b = elements(projection.place), elements(projection.speed), elements(projection.bend)
+    y_ray = ray(v, intrinsics[3], intrinsics[1])
+    p, s = _along_row(projection.place, y_ray), _along_row(projection.speed, y_ray)
+    b = _along_row(projection.bend, y_ray)
     camera, lens = projection.intrinsics, projection.distortion
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     k1, k2, p1, p2, k3 = lens[0], lens[1], lens[2], lens[3], lens[4]
     offset, readout, height = np.float32(projection.offset), np.float32(projection.readout), np.float32(size[1])
     last_u, last_v, stride = np.float32(size[2] - 1), np.float32(size[1] - 1), np.int32(size[2])
-    by_height, by_fx = one / height, one / intrinsics[0]
+    by_height, by_fx, center = one / height, one / intrinsics[0], intrinsics[2]
     third, falloff = np.float32(1 / 3), np.float32(projection.vignetting)
     middle_u, middle_v = half * last_u, half * last_v
     falloff /= middle_u * middle_u + middle_v * middle_v
-    y_ray = ray(v, intrinsics[3], intrinsics[1])
     guess = offset + readout * ((np.float32(v) + half) / np.float32(size[0]) - half)
-    c_guess = half * guess * guess
+    c = half * guess * guess
+    y0, y1, y2 = p[1] - guess * s[1] + c * b[1], p[4] - guess * s[4] + c * b[4], p[7] - guess * s[7] + c * b[7]
+    z0, z1, z2 = p[2] - guess * s[2] + c * b[2], p[5] - guess * s[5] + c * b[5], p[8] - guess * s[8] + c * b[8]
     for u in range(depth.size):
-        z = depth[u]
-        x, y = (np.float32(u) - intrinsics[2]) * by_fx * z, y_ray * z
-        x0, y0, z0 = transform(p, x, y, z)
-        x1, y1, z1 = transform(s, x, y, z)
-        x2, y2, z2 = transform(b, x, y, z)
-        row = project(y0 - guess * y1 + c_guess * y2, one / max(z0 - guess * z1 + c_guess * z2, NEAREST), fy, cy)
-        tau = offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
+        x, z = (np.float32(u) - center) * by_fx, depth[u]
+        row = project((y0 * x + y1) * z + y2, one / max((z0 * x + z1) * z + z2, NEAREST), fy, cy)
+        # one long loop would neither fill the registers nor keep the processor's units busy
+        across[u], down[u] = x, offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
+    for u in range(depth.size):
+        x, z, tau = across[u], depth[u], down[u]
         c = half * tau * tau
+        x0, y0, z0 = _moved(p, x, z)
+        x1, y1, z1 = _moved(s, x, z)
+        x2, y2, z2 = _moved(b, x, z)
         by_z = one / max(z0 - tau * z1 + c * z2, NEAREST)
         a, d = (x0 - tau * x1 + c * x2) * by_z, (y0 - tau * y1 + c * y2) * by_z
         r2 = a * a + d * d
@@ -105,6 +125,32 @@ def blended_byte(a, b, c, d, shift, across, down, gain):
 
 
 @scalar
+def load_around(words, first, next_row, around):
+    """The four pixels around each point of a row, as ``color_places`` finds them, into ``around`` (4, w)."""
+    for u in range(first.size):
+        n = np.uintp(first[u])
+        around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
+        n += next_row
+        around[2, u], around[3, u] = words[n], words[n + np.uintp(1)]
+
+
+@scalar
+def blend_colors(around, across, down, gain, mixed, target):
+    """Colours between such pixels into a row of 3 w bytes; ``mixed`` (w,) int32 is overwritten."""
+    for u in range(mixed.size):
+        a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
+        red = blended_byte(a, b, c, d, 0, across[u], down[u], gain[u])
+        green = blended_byte(a, b, c, d, 8, across[u], down[u], gain[u])
+        blue = blended_byte(a, b, c, d, 16, across[u], down[u], gain[u])
+        mixed[u] = red | green << 8 | blue << 16
+    for u in range(mixed.size):
+        k, word = np.uintp(3 * u), mixed[u]
+        target[k], target[k + np.uintp(1)], target[k + np.uintp(2)] = (
+            np.uint8(word), np.uint8(word >> 8), np.uint8(word >> 16)
+        )  # fmt: skip
+
+
+@scalar
 def register_rows(start, stop, depth, intrinsics, projection, fallback, size, words, shades, colors):
     """Colours, or intensities, of rows ``start`` to ``stop``; see ``register``."""
     w, next_row = depth.shape[1], np.uintp(size[2])
@@ -115,29 +161,14 @@ def register_rows(start, stop, depth, intrinsics, projection, fallback, size, wo
     for v in range(start, stop):
         fill_gaps(depth[v], fallback, filled)
         color_places(v, filled, intrinsics, projection, size, first, across, down, gain)
-        for u in range(w):
-            n = np.uintp(first[u])
-            around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
-            n += next_row
-            around[2, u], around[3, u] = words[n], words[n + np.uintp(1)]
+        load_around(words, first, next_row, around)
         if shades.size > 0:
             row = shades[v]
             for u in range(w):
                 shade = blended(values[0, u], values[1, u], values[2, u], values[3, u], across[u], down[u])
                 row[u] = gain[u] * shade
-            continue
-        for u in range(w):
-            a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
-            red = blended_byte(a, b, c, d, 0, across[u], down[u], gain[u])
-            green = blended_byte(a, b, c, d, 8, across[u], down[u], gain[u])
-            blue = blended_byte(a, b, c, d, 16, across[u], down[u], gain[u])
-            first[u] = red | green << 8 | blue << 16
-        target = colors[v].reshape(-1)
-        for u in range(w):
-            k, word = np.uintp(3 * u), first[u]
-            target[k], target[k + np.uintp(1)], target[k + np.uintp(2)] = (
-                np.uint8(word), np.uint8(word >> 8), np.uint8(word >> 16)
-            )  # fmt: skip
+        else:
+            blend_colors(around, across, down, gain, first, colors[v].reshape(-1))
 
 
 @kernel

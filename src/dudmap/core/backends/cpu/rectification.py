@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.cpu.color_registration import blended, blended_byte, color_places, fill_gaps
+from dudmap.core.backends.cpu.color_registration import blend_colors, blended, color_places, fill_gaps, load_around
 from dudmap.core.backends.cpu.teams import NO_BAND, done, finish, first_band, take, wait_for_all
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
@@ -17,37 +17,32 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
     zero, half, height = np.float32(0), np.float32(0.5), np.float32(size[1])
     w, next_row, stride = depth.shape[1], np.uintp(size[2]), np.int32(size[2])
     source_row, across, down = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    first, gain = np.empty(w, np.int32), np.empty(w, np.float32)
-    recorded = depth.reshape(-1)
+    first, gain, around = np.empty(w, np.int32), np.empty(w, np.float32), np.empty((4, w), np.int32)
+    depths, recorded = around.view(np.float32), depth.reshape(-1).view(np.int32)
+    by_stride = 1 / np.float64(size[2])
     speed_x, speed_y, speed_z = projection.speed[2, 0], projection.speed[2, 1], projection.speed[2, 3]
+    readout, by_height = np.float32(projection.readout), np.float32(1) / height
+    center, by_fx, y = intrinsics[2], np.float32(1) / intrinsics[0], zero
     for v in range(start, stop):
         fill_gaps(depth[v], fallback, source_row)
         color_places(v, source_row, intrinsics, projection, size, first, across, down, gain)
+        load_around(recorded, first, next_row, around)
+        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
         for u in range(w):
-            n, row = np.uintp(first[u]), first[u] // stride
-            a, b = recorded[n], recorded[n + np.uintp(1)]
-            n += next_row
-            c, d = recorded[n], recorded[n + np.uintp(1)]
+            a, b, c, d = depths[0, u], depths[1, u], depths[2, u], depths[3, u]
             right, below = across[u] >= half, down[u] >= half
             nearest = (d if right else c) if below else (b if right else a)
             near, far = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
             smooth = (near > zero) & (far - near < SAME_SURFACE * near)
             z = blended(a, b, c, d, across[u], down[u]) if smooth else nearest
-            tau = np.float32(projection.readout) * ((np.float32(row) + down[u] + half) / height - half)
-            x = (np.float32(u) - intrinsics[2]) / intrinsics[0] * z
-            y = (np.float32(v) - intrinsics[3]) / intrinsics[1] * z
-            out[v, u] = z + tau * (speed_x * x + speed_y * y + speed_z) if z > zero else zero
-            sources[v, u] = first[u] + np.int32(right) + np.int32(below) * stride
-        if colors.size == 0:
-            continue
-        target = colors[v].reshape(-1)
-        for u in range(w):
-            n, k = np.uintp(first[u]), np.uintp(3 * u)
-            a, b = words[n], words[n + np.uintp(1)]
-            c, d = words[n + next_row], words[n + next_row + np.uintp(1)]
-            target[k] = np.uint8(blended_byte(a, b, c, d, 0, across[u], down[u], gain[u]))
-            target[k + np.uintp(1)] = np.uint8(blended_byte(a, b, c, d, 8, across[u], down[u], gain[u]))
-            target[k + np.uintp(2)] = np.uint8(blended_byte(a, b, c, d, 16, across[u], down[u], gain[u]))
+            row = np.float32(np.floor((np.float64(first[u]) + 0.5) * by_stride))
+            tau = readout * ((row + down[u] + half) * by_height - half)
+            x = (np.float32(u) - center) * by_fx
+            out[v, u] = z + tau * ((speed_x * x + speed_y * y) * z + speed_z) if z > zero else zero
+            sources[v, u] = first[u] + (np.int32(1) if right else np.int32(0)) + (stride if below else np.int32(0))
+        if colors.size > 0:
+            load_around(words, first, next_row, around)
+            blend_colors(around, across, down, gain, first, colors[v].reshape(-1))
 
 
 @kernel
@@ -91,11 +86,15 @@ def recorded_mask(mask, sources, out):
     A recorded pixel lies as far from its place in the rectified image as the pixel recorded there, in the other
     direction: the displacement changes by less than a pixel over its own length.
     """
-    h, w = mask.shape
-    for v in range(h):
-        for u in range(w):
+    h, w = np.int32(mask.shape[0]), np.int32(mask.shape[1])
+    flat, by_width, places = mask.reshape(-1), 1 / np.float64(w), np.empty(w, np.int32)
+    for v in range(np.int32(0), h):
+        for u in range(np.int32(0), w):
             n = sources[v, u]
-            row, column = n // w, n % w
-            target_v = min(max(2 * v - row, 0), h - 1)
-            target_u = min(max(2 * u - column, 0), w - 1)
-            out[v, u] = mask[target_v, target_u]
+            row = np.int32(np.floor((np.float64(n) + 0.5) * by_width))  # a division would not be vectorised
+            column = n - row * w
+            target_v = min(max(np.int32(2 * v) - row, np.int32(0)), h - np.int32(1))
+            target_u = min(max(np.int32(2 * u) - column, np.int32(0)), w - np.int32(1))
+            places[u] = target_v * w + target_u
+        for u in range(w):
+            out[v, u] = flat[np.uintp(places[u])]
