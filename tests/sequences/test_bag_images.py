@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bags import millimetres
+from dudmap.core.backends.cpu import rvl
 from dudmap.errors import FrameError
 from dudmap.io.sequences.bag_messages import color_of, depth_of
 from recordings import HEIGHT, WIDTH, color_image
@@ -99,6 +100,13 @@ def test_compressed_depth_with_and_without_header():
     np.testing.assert_array_equal(depth_of(compressed(png, "16UC1; png compressed "), 1000, "it"), expected)
 
 
+def test_depth_compressed_by_run_lengths():
+    """Columns, rows and RVL after the header, as compressed_depth_image_transport writes it."""
+    data = struct.pack("<iff", 1, 0, 0) + rvl.compressed(millimetres(1))
+    expected = millimetres(1).astype(np.float32) / np.float32(1000)
+    np.testing.assert_array_equal(depth_of(compressed(data, "16UC1; compressedDepth rvl"), 1000, "it"), expected)
+
+
 def test_compressed_float_depth_is_quantised_inverse_depth():
     """As compressed_depth_image_transport writes it: q = a / z + b, with b = 1 - a / z_max and 0 for no reading."""
     z_max, quantisation = 10.0, 100.0
@@ -107,10 +115,11 @@ def test_compressed_float_depth_is_quantised_inverse_depth():
     depth = np.linspace(0.5, 6, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
     q = np.round(a / depth + b).astype(np.uint16)
     q[0, 0] = 0
-    data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", q)[1].tobytes()
-    found = depth_of(compressed(data, "32FC1; compressedDepth png"), 1000, "it")
-    assert found[0, 0] == 0
-    np.testing.assert_allclose(found[1:], depth[1:], atol=0.5 * 36 / a * 1.1)  # half a step of q at 6 m
+    for form, body in (("png", cv2.imencode(".png", q)[1].tobytes()), ("rvl", rvl.compressed(q))):
+        data = struct.pack("<iff", 0, a, b) + body
+        found = depth_of(compressed(data, f"32FC1; compressedDepth {form}"), 1000, "it")
+        assert found[0, 0] == 0
+        np.testing.assert_allclose(found[1:], depth[1:], atol=0.5 * 36 / a * 1.1)  # half a step of q at 6 m
 
 
 @pytest.mark.parametrize(
@@ -118,7 +127,11 @@ def test_compressed_float_depth_is_quantised_inverse_depth():
     [
         (lambda: depth_of(message(IMAGE, "rgb8"), 1000, "it"), "it is encoded as rgb8; expected one of 16UC1"),
         (lambda: color_of(message(millimetres(0), "16UC1"), "it"), "it is encoded as 16UC1; expected one of"),
-        (lambda: depth_of(compressed(b"x" * 40, "16UC1; compressedDepth rvl"), 1000, "it"), "compressed as .*rvl"),
+        (lambda: depth_of(compressed(b"x" * 40, "16UC1; compressedDepth rvl"), 1000, "it"), "no complete RVL image"),
+        (
+            lambda: depth_of(compressed(b"x" * 40, "16UC1; zstd"), 1000, "it"),
+            "compressed as .*zstd.*expected PNG or RVL",
+        ),
     ],
 )
 def test_what_cannot_be_decoded_is_named(bad, sentence):

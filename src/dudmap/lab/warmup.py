@@ -18,6 +18,7 @@ import numpy as np
 from dudmap.app.doctor import COMPILING, compiled_kernels
 from dudmap.app.terminal import say
 from dudmap.config import Config
+from dudmap.core.backends.cpu import rvl
 from dudmap.core.backends.cpu.evidence import BINS, EDGES
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
@@ -118,6 +119,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         with tempfile.TemporaryDirectory() as folder:
             small_map().save(Path(folder) / "map.npz")
             TsdfVolume.load(Path(folder) / "map.npz")
+        rvl.decompressed(rvl.compressed(np.ones((2, 2), np.uint16)))  # of the frames that a map is rebuilt from
 
     def synthetic_frames() -> None:
         from dudmap.lab.synthetic import sequence

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu import rvl
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import exposed_color
 from dudmap.core.geometry.camera import Camera
@@ -26,7 +27,7 @@ MAX_PENDING = 3
 CELLS = 8, 6
 """Cells of an image, across and down, of each of which is known whether a frame was fused in most of it."""
 EncodedFrame = tuple[bytes, bytes, bytes]
-"""Depth, colour and mask of a stored frame as files."""
+"""Depth, colour and mask of a stored frame, compressed."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +177,12 @@ class FrameStore(Stateful):
         import cv2
 
         depth_file, color_file, mask_file = self.encoded(number)
-        steps, mask, bgr = (
+        mask, bgr = (
             np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), kind))
-            for file, kind in (
-                (depth_file, cv2.IMREAD_UNCHANGED), (mask_file, cv2.IMREAD_GRAYSCALE), (color_file, cv2.IMREAD_COLOR)
-            )
-        )  # fmt: skip
+            for file, kind in ((mask_file, cv2.IMREAD_GRAYSCALE), (color_file, cv2.IMREAD_COLOR))
+        )
+        steps = rvl.decompressed(depth_file)
+        assert steps is not None
         depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         kept = self.frames[number]
@@ -238,13 +239,12 @@ def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:
-    """Depth as 16-bit PNG, exposed colour as JPEG, static mask as 1-bit PNG."""
+    """Depth in 16-bit steps, exposed colour as JPEG, static mask as 1-bit PNG."""
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
     steps = np.minimum(frame.depth * np.float32(1 / DEPTH_UNIT) + np.float32(0.5), 65535).astype(np.uint16)
     bgr = cv2.cvtColor(exposed_color(frame.color, exposure), cv2.COLOR_RGB2BGR)
-    depth = cv2.imencode(".png", steps, png)[1]
     color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]
-    return depth.tobytes(), color.tobytes(), mask.tobytes()
+    return rvl.compressed(steps), color.tobytes(), mask.tobytes()

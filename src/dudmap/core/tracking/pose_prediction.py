@@ -184,6 +184,7 @@ class PosePredictor(Stateful):
     _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
     _dynamic_start: Remembered[bool] = False  # most of the view has moved in every frame so far
     _mostly_moving: Remembered[bool] = False  # most of the view moved in the last frame
+    _looked_back: Remembered[bool] = False  # the last frame was compared with an older image, which showed nothing
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
@@ -322,7 +323,8 @@ class PosePredictor(Stateful):
 
         Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
         most of the view is seen to move anyway, few corners would be found again after a longer time. A slow crowd is
-        taken to move on where an older image cannot tell.
+        taken to move on where an older image cannot tell. As long as none shows anything, every second frame is
+        compared: what is slow has not come far in the other.
 
         Args:
             view: The frame.
@@ -332,9 +334,14 @@ class PosePredictor(Stateful):
         """
         if crowd is None and is_majority_dynamic(moving, view.labelled):
             return None
+        looked_back, self._looked_back = self._looked_back, False
+        if looked_back and crowd is None:
+            return None
         slow = self.ego_motion.slow_motion(view.tracked_at(T_world_camera))
         if crowd is None:
-            return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
+            shows = slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled)
+            self._looked_back = slow is not None and not shows
+            return slow if shows else None
         if slow is not None:
             return slow
         segments = view.segmentation()

@@ -313,20 +313,30 @@ def _pixels(message: Any, kind: np.dtype, channels: int, name: str) -> NDArray[A
 
 
 def _compressed_depth(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth of a PNG with or without the header of compressed_depth_image_transport.
+    """Depth of a PNG with or without the header of compressed_depth_image_transport, or of its RVL.
 
     Floats are stored as 16-bit values q of inverse depth, z = a / (q - b), with the parameters a and b in the header.
     """
     data = bytes(message.data)
     if data.startswith(images.PNG):
         return images.decode_depth(data, depth_scale, name)
-    if not data.startswith(images.PNG, COMPRESSED_DEPTH_HEADER.size):
-        raise FrameError(f"{name} is compressed as {message.format!r}; expected PNG, so republish it as raw images")
+    floats, body = message.format.startswith("32FC1"), data[COMPRESSED_DEPTH_HEADER.size :]
+    scale = 1.0 if floats else depth_scale
+    if body.startswith(images.PNG):
+        stored = images.decode_depth(body, scale, name)
+    elif message.format.lower().endswith("rvl"):
+        from dudmap.core.backends.cpu import rvl  # its kernel is not needed for other bags
+
+        steps = rvl.decompressed(body)
+        if steps is None:
+            raise FrameError(f"{name} is no complete RVL image: {len(data)} bytes")
+        stored = images.metres(steps, scale, name)
+    else:
+        said = f"{name} is compressed as {message.format!r}; expected PNG or RVL, so republish it as raw images"
+        raise FrameError(said)
+    if not floats:
+        return stored
     _, a, b = COMPRESSED_DEPTH_HEADER.unpack_from(data)
-    png = data[COMPRESSED_DEPTH_HEADER.size :]
-    if not message.format.startswith("32FC1"):
-        return images.decode_depth(png, depth_scale, name)
-    quantised = images.decode_depth(png, 1.0, name)
     with np.errstate(divide="ignore"):
-        depth = np.float32(a) / (quantised - np.float32(b))
-    return images.metres(np.where(quantised > 0, depth, np.float32(0)), 1.0, name)
+        depth = np.float32(a) / (stored - np.float32(b))
+    return images.metres(np.where(stored > 0, depth, np.float32(0)), 1.0, name)

@@ -1,0 +1,103 @@
+"""Lossless compression of depth images by run lengths and variable-length differences (RVL; Wilson 2017).
+
+An image is a sequence of runs: number of zeros, number of other values, and these as differences to the value before.
+All are written as groups of three bits, lowest first, each with a fourth bit that says whether more follow; eight
+groups make a word of 32 bits, highest first. It takes a fifth of the time of PNG.
+"""
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.threads import kernel, scalar
+
+HEADER = struct.Struct("<II")
+"""Columns and rows, before the words, as compressed_depth_image_transport of ROS writes them."""
+MOST_PIXELS = 1 << 26
+"""Of an image that is believed: a few bytes can claim to be a long run of zeros."""
+
+
+@scalar
+def _put(value, words, place):
+    """Write a number from group ``place`` on into words that are 0; returns the place after it."""
+    while True:
+        group = value & 7
+        value >>= 3
+        group |= 8 if value else 0
+        words[place >> 3] |= np.uint32(group) << np.uint32(28 - 4 * (place & 7))
+        place += 1
+        if value == 0:
+            return place
+
+
+@scalar
+def _get(words, place, last):
+    """A number, and the place after it, which is beyond ``last`` where the words end before the number does."""
+    value, shift = np.int64(0), 0
+    while place < last:
+        group = np.int64((words[place >> 3] >> np.uint32(28 - 4 * (place & 7))) & np.uint32(15))
+        value |= (group & 7) << shift
+        place, shift = place + 1, min(shift + 3, 60)
+        if group < 8:
+            return value, place
+    return value, last + 1
+
+
+@kernel
+def encode(image, words):
+    """Compress an image (n,) uint16 into words (n + 1,) uint32 that are 0; returns how many are used."""
+    n, place, before, number = image.size, 0, np.int64(0), 0
+    while number < n:
+        start = number
+        while number < n and image[number] == 0:
+            number += 1
+        place, start = _put(number - start, words, place), number
+        while number < n and image[number] != 0:
+            number += 1
+        place = _put(number - start, words, place)
+        for k in range(start, number):
+            value = np.int64(image[k])
+            difference = value - before
+            place, before = _put((difference << 1) ^ (difference >> 63), words, place), value
+    return (place + 7) >> 3
+
+
+@kernel
+def decode(words, image):
+    """Restore an image (n,) uint16 from its words, uint32; returns whether they hold such an image."""
+    n, place, last, before, number = image.size, 0, 8 * words.size, np.int64(0), 0
+    while number < n:
+        zeros, place = _get(words, place, last)
+        others, place = _get(words, place, last)
+        if place > last or zeros + others > n - number or zeros + others == 0:
+            return False
+        for k in range(number, number + zeros):
+            image[k] = 0
+        for k in range(number + zeros, number + zeros + others):
+            value, place = _get(words, place, last)
+            before += (value >> 1) ^ -(value & 1)
+            image[k] = np.uint16(before)
+        if place > last:
+            return False
+        number += zeros + others
+    return True
+
+
+def compressed(image: NDArray[np.uint16]) -> bytes:
+    """An image (h, w) with its size."""
+    words = np.zeros(image.size + 1, np.uint32)
+    count = encode(image.reshape(-1), words)
+    return HEADER.pack(*image.shape[::-1]) + words[:count].astype("<u4").tobytes()
+
+
+def decompressed(data: bytes) -> NDArray[np.uint16] | None:
+    """The image (h, w) of such data; None where it holds none."""
+    if len(data) < HEADER.size:
+        return None
+    columns, rows = HEADER.unpack_from(data)
+    words = np.frombuffer(data, "<u4", (len(data) - HEADER.size) // 4, HEADER.size).astype(np.uint32)
+    if not 0 < columns * rows <= MOST_PIXELS:
+        return None
+    image = np.empty((rows, columns), np.uint16)
+    return image if decode(words, image.reshape(-1)) else None
