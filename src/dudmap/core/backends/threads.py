@@ -21,7 +21,9 @@ from typing import Any, TypeVar
 
 from numba import njit
 from numba.core import event
+from numba.core.codegen import CPUCodeLibrary
 from numba.core.dispatcher import Dispatcher
+from numba.core.targetconfig import ConfigStack, TargetConfig
 
 
 def _import_numba() -> None:
@@ -71,6 +73,38 @@ class _Uncollected(event.Listener):
 
 
 event.register("numba:compile", _Uncollected())  # sent under the lock of the compiler
+
+
+def _optimize_callers() -> None:
+    """Optimise what is always inlined, a ``Scalar``, only as far as inlining asks: all else is done in its callers, and
+    to do it before as well takes a tenth of the time of all compilations."""
+    optimize = CPUCodeLibrary._optimize_final_module
+
+    def optimize_less(self: CPUCodeLibrary) -> None:
+        flags, codegen = ConfigStack.top_or_none(), self._codegen
+        if flags is None or not (flags.forceinline and flags.no_cpython_wrapper):
+            optimize(self)
+            return
+        passes, builder = codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=codegen._opt_level, cost="cheap"
+        )
+        passes.run(self._final_module, builder)
+
+    CPUCodeLibrary._optimize_final_module = optimize_less
+
+
+def _compare_flags_at_once() -> None:
+    """Compare the flags of compilations, which is done a hundred thousand times, by those that are set before all, and
+    hash them by their kind: Numba's own hash is that of their names, which all have."""
+    compare = TargetConfig.__eq__
+    TargetConfig.__hash__ = lambda self: hash(type(self))
+    TargetConfig.__eq__ = lambda self, other: (
+        (type(self) is type(other) and self._values == other._values) or compare(self, other)
+    )
+
+
+_optimize_callers()
+_compare_flags_at_once()
 
 
 @cache
