@@ -101,17 +101,17 @@ def window_means(compared, difference, window):
 
 
 @exact_scalar
-def segment_evidence(segments, labels, count, compared, moving, distance, difference):
+def segment_evidence(segments, labels, count, compared, moving, distance, means):
     """Evidence of motion (count + 1, 5) of each segment; row 0 is meaningless.
 
     Args:
         segments: SegmentImage.
         labels, count: Its, or other ones.
         compared, moving: (h, w) bool.
-        distance, difference: (h, w) float32 of distances, metres, and of intensities.
+        distance: (h, w) float32, metres.
+        means: (h, w) float32, ``window_means`` of the differences of intensities.
     """
     h, w = labels.shape
-    means = window_means(compared, difference, segments.window)
     sums, deviations, out = np.zeros((count + 1, 7)), np.zeros(count + 1), np.empty((count + 1, 5))
     for v in range(h):
         for u in range(w):
@@ -272,7 +272,8 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
             compared[v, u] = occupancy == SURFACE
             lit = sample.difference[v, u] + (gain * intensity[v, u] - offset)
             difference[v, u] = np.float32(0) if np.isnan(lit) else lit  # in the air
-    evidence = segment_evidence(segments, labels, count, compared, dynamic, sample.distance, difference)
+    means = window_means(compared, difference, segments.window)
+    evidence = segment_evidence(segments, labels, count, compared, dynamic, sample.distance, means)
     moving = classify_segments(evidence, part / size, segments.min_pixels)
     for v in range(h):
         for u in range(w):
@@ -281,11 +282,10 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
 
 
 @exact_scalar
-def median_mismatches(segments, labels, count, compared, moving, difference):
+def median_mismatches(segments, labels, count, compared, moving, means):
     """Intensity mismatch (count + 1,) of segments by medians: pixels beside something near show its colours, so that
     what stands differs along its outline, while what has moved differs nearly everywhere. Arguments as of
     ``segment_evidence``."""
-    means = window_means(compared, difference, segments.window)
     sizes, out = np.zeros(count + 1, np.int64), np.zeros(count + 1)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -331,8 +331,9 @@ def stand_still(segments, dynamic, gap, difference, settled):
             compared[v, u] = not np.isnan(gap[v, u])
             sigma = max(segments.least_sigma, segments.sigma[v, u])
             displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
-    evidence, found = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, difference), 0
-    mismatches = median_mismatches(segments, parts, 2 * count, compared, displaced, difference)
+    means, found = window_means(compared, difference, segments.window), 0
+    evidence = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, means)
+    mismatches = median_mismatches(segments, parts, 2 * count, compared, displaced, means)
     for n in range(2 * count + 1):
         visible[n] = evidence[n, COMPARED] > 0.7 and evidence[n, SIZE] >= segments.min_pixels
         if visible[n]:
