@@ -323,7 +323,7 @@ class PosePredictor(Stateful):
 
         Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
         most of the view is seen to move anyway, few corners would be found again after a longer time. A slow crowd is
-        taken to move on where an older image cannot tell. As long as none shows anything, every second frame is
+        taken to move on where an older image cannot tell. As long as nothing is seen to move, every second frame is
         compared: what is slow has not come far in the other.
 
         Args:
@@ -335,7 +335,7 @@ class PosePredictor(Stateful):
         if crowd is None and is_majority_dynamic(moving, view.labelled):
             return None
         looked_back, self._looked_back = self._looked_back, False
-        if looked_back and crowd is None:
+        if looked_back and crowd is None and not exceeds_noise_share(moving, view.labelled):
             return None
         slow = self.ego_motion.slow_motion(view.tracked_at(T_world_camera))
         if crowd is None:
