@@ -53,7 +53,7 @@ class Slam(SlamResults, Stateful):
             static before it moved or before it was seen through.
         calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
             as it is; another is where the estimation begins, with ``sensor.self_calibration``.
-        live: A calibration is used as soon as it is found, and the first poses are not estimated a second time.
+        live: No frame waits for a calibration, and the first poses are not estimated a second time.
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.

@@ -19,7 +19,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from numba import njit
+from numba import njit, version_info
 from numba.core import event
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.dispatcher import Dispatcher
@@ -103,8 +103,9 @@ def _compare_flags_at_once() -> None:
     )
 
 
-_optimize_callers()
-_compare_flags_at_once()
+if version_info.short == (0, 68):  # whose private parts these are; others compile as they do
+    _optimize_callers()
+    _compare_flags_at_once()
 
 
 @cache
