@@ -1,20 +1,23 @@
 """Estimation of a calibration in a process of its own while frames are tracked.
 
-In a thread it would hold the interpreter for half of its time, and the frames would wait for it on both cores.
+In a thread it would hold the interpreter for half of its time, and the frames would wait for it on both cores. Both
+processes exchange objects as those of ``multiprocessing`` do, which would run the user's program again in the other.
 """
 
 import os
-import pickle
 import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future
+from multiprocessing.reduction import ForkingPickler
 from threading import Thread
 
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
 from dudmap.core.calibration.keyframes import ColorKeyframe
 
+received = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue] - typeshed leaves it out
+"""Object that another process of ours sent."""
 LOWEST = 19
 """Priority of the process, as of ``nice``, where there is no class of idle processes."""
 
@@ -52,12 +55,12 @@ def _in_other_process(
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
     except OSError as error:
         return None, str(error)
-    content = pickle.dumps((estimator.given, estimator.sensor, list(keyframes)), pickle.HIGHEST_PROTOCOL)
+    content = bytes(ForkingPickler.dumps((estimator.given, estimator.sensor, list(keyframes))))
     answer, said = process.communicate(content)
     if process.returncode != 0:
         lines = said.decode(errors="replace").strip().splitlines()
         return None, f"exit status {process.returncode}{f': {lines[-1]}' if lines else ''}"
-    return pickle.loads(answer), ""
+    return received(answer), ""
 
 
 def main() -> None:
@@ -66,8 +69,8 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     elif sys.platform != "win32":
         os.nice(LOWEST)
-    given, sensor, keyframes = pickle.load(sys.stdin.buffer)
-    pickle.dump(CalibrationEstimator(given, sensor).estimate(keyframes), sys.stdout.buffer)
+    given, sensor, keyframes = received(sys.stdin.buffer.read())
+    sys.stdout.buffer.write(ForkingPickler.dumps(CalibrationEstimator(given, sensor).estimate(keyframes)))
 
 
 if __name__ == "__main__":
