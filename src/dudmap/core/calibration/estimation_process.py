@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from multiprocessing.reduction import ForkingPickler
 from threading import Thread
 
@@ -55,8 +56,10 @@ def _in_other_process(
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
     except OSError as error:
         return None, str(error)
-    content = bytes(ForkingPickler.dumps((estimator.given, estimator.sensor, list(keyframes))))
-    answer, said = process.communicate(content)
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):  # it has ended, and says why; communicate() would write in small pieces
+        process.stdin.write(ForkingPickler.dumps((estimator.given, estimator.sensor, list(keyframes))))
+    answer, said = process.communicate()
     if process.returncode != 0:
         lines = said.decode(errors="replace").strip().splitlines()
         return None, f"exit status {process.returncode}{f': {lines[-1]}' if lines else ''}"
