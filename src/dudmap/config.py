@@ -176,7 +176,7 @@ class TrackerConfig(ConfigSection):
     """Fit gain and offset of the image intensities to those of the map on the coarsest pyramid level."""
     noise_weighting: bool = True
     """Weight each distance residual by the sensor noise at its depth."""
-    iterations: tuple[int, ...] = (8, 6, 3)
+    iterations: tuple[int, ...] = (8, 6, 6)
     """Largest number of iterations per pyramid level, coarse to fine; 0 skips the level."""
     widths: tuple[int, ...] = (80, 160, 320)
     """Image width per pyramid level, coarse to fine, pixels; rounded to a halving of the camera image."""

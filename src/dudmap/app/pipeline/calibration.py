@@ -198,7 +198,7 @@ def calibrate_sequence(
                 continue
             result = slam.process(read.prepared)
             if result.submap != submap:
-                submap, keyframes = result.submap, max(keyframes, list(collector.keyframes), key=len)
+                submap, keyframes = result.submap, max(keyframes, collector.keyframes, key=len)
                 collector.clear()
             if result.state == "repeated":
                 continue

@@ -40,7 +40,7 @@ from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
 """Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
-SCHEMA = 5
+SCHEMA = 6
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 STEPS, LIMIT = 10_000, 100_000

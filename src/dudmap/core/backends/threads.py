@@ -232,11 +232,15 @@ if hasattr(os, "register_at_fork"):
 
 
 def submit(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Start ``function`` in another thread if there is a core for it; the returned function waits for its result."""
+    """Start ``function`` in another thread if there is a core for it.
+
+    Returns:
+        A function that waits for the result; where no thread has come to it yet, it is computed by who asks first.
+    """
     if num_threads() > 1:
         future: Future[Result] = Future()
         _tasks().put(lambda: _fulfil(future, function))
-        return future.result
+        return cache(lambda: function() if future.cancel() else future.result())
     result = function()
     return lambda: result
 
@@ -248,6 +252,8 @@ def also_in_other_threads(function: Callable[[], object], count: int) -> None:
 
 
 def _fulfil(future: Future[Result], function: Callable[[], Result]) -> None:
+    if not future.set_running_or_notify_cancel():
+        return
     try:
         future.set_result(function())
     except BaseException as error:

@@ -1,11 +1,13 @@
 """Frames from which the calibration is estimated."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.median import median
+from dudmap.core.backends.threads import submit
 from dudmap.core.frames.color_registration import recorded_intensity
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry import se3
@@ -81,6 +83,15 @@ def color_levels(camera: Camera) -> list[int]:
     return sorted({halvings_to(width, camera) for width in COLOR_WIDTHS}, reverse=True)
 
 
+def levels_of(
+    observation: Observation, given: Calibration
+) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+    """Depth (h, w) of the observation that is compared, and its recorded intensities (h, w), coarse to fine; ``given``
+    is the calibration of the colour images."""
+    depth, _ = observation.halved(halvings_to(GEOMETRY_WIDTH, observation.camera))
+    return depth, [recorded_intensity(observation, number) for number in color_levels(given.camera)]
+
+
 def keyframe(
     observation: Observation,
     given: Calibration,
@@ -92,18 +103,16 @@ def keyframe(
     the pixels (H, W) that move, in either image; ``given`` is the calibration of the colour images as recorded."""
     import cv2
 
-    level = halvings_to(GEOMETRY_WIDTH, observation.camera)
-    camera = observation.camera.scaled(level)
-    depth, _ = observation.halved(level)
+    camera = observation.camera.scaled(halvings_to(GEOMETRY_WIDTH, observation.camera))
+    depth, recorded = levels_of(observation, given)
     moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
     readings = depth[moving & (depth > 0)]
     distance = float(median(readings)) if len(readings) else 1.0
     depth = np.where(moving, np.float32(0), depth)
-    levels = color_levels(given.camera)
     seen_moving = [
-        _seen_moving(moving, distance, camera, given.camera.scaled(number), given.T_color_depth) for number in levels
+        _seen_moving(moving, distance, camera, given.camera.scaled(number), given.T_color_depth)
+        for number in color_levels(given.camera)
     ]
-    recorded = [recorded_intensity(observation, number) for number in levels]
     intensities = [_filtered(image, mask) for image, mask in zip(recorded, seen_moving, strict=True)]
     brightness = np.where(seen_moving[0], np.float32(np.nan), recorded[0])
     smooth = _off_edges(depth)[::POINT_STRIDE, ::POINT_STRIDE]
@@ -162,20 +171,26 @@ def central_velocity(
 
 
 class KeyframeCollector(Stateful):
-    """Collects ``keyframes``, in the order of time, evenly over the time since tracking began; ``given`` is the
-    calibration of the colour images. ``max_gap`` is the largest time between the two neighbours of a keyframe, seconds,
-    if less than ``MAX_GAP``."""
+    """Collects keyframes, in the order of time, evenly over the time since tracking began; ``given`` is the calibration
+    of the colour images. ``max_gap`` is the largest time between the two neighbours of a keyframe, seconds, if less
+    than ``MAX_GAP``."""
 
-    keyframes: Remembered[list[ColorKeyframe]]
+    _taken: Remembered[list[Callable[[], ColorKeyframe]]]
     _interval: Remembered[float]
+    _latest: Remembered[float] = -np.inf  # time stamp of the last keyframe
     _before: Remembered[tuple[float, NDArray[np.float64]] | None] = None
     _pending: Remembered[tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None] = None
 
     def __init__(self, given: Calibration, max_gap: float = MAX_GAP) -> None:
         self.given = given
         self.max_gap = min(max_gap, MAX_GAP)
-        self.keyframes = []
+        self._taken = []
         self._interval = INTERVAL
+
+    @property
+    def keyframes(self) -> list[ColorKeyframe]:
+        """The keyframes so far; those that another thread is making are waited for."""
+        return [taken() for taken in self._taken]
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
@@ -185,17 +200,34 @@ class KeyframeCollector(Stateful):
         now = observation.timestamp
         if self._pending is not None:
             middle, T, mask = self._pending
-            before = self._before
-            due = self.keyframes[-1].timestamp + self._interval - 1e-3 if self.keyframes else -np.inf
+            before, due = self._before, self._latest + self._interval - 1e-3
             if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
                 velocity = central_velocity(before, (now, T_world_camera))
-                taken = keyframe(middle, self.given, T, velocity, mask)
-                self.keyframes.append(replace(taken, interval=(now - before[0]) / 2))
-                if len(self.keyframes) > MAX_KEYFRAMES:
-                    del self.keyframes[1::2]
-                    self._interval *= 2
+                self._take(middle, T, velocity, mask, (now - before[0]) / 2)
             self._before = middle.timestamp, T
         self._pending = observation, T_world_camera, dynamic_mask
+
+    def _take(
+        self,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        dynamic_mask: NDArray[np.bool_],
+        interval: float,
+    ) -> None:
+        """Have another thread make a keyframe."""
+        levels_of(observation, self.given)  # cached there by this thread, which may use them in the meantime
+
+        def made() -> ColorKeyframe:
+            return replace(
+                keyframe(observation, self.given, T_world_camera, velocity, dynamic_mask), interval=interval
+            )
+
+        self._taken.append(submit(made))
+        self._latest = observation.timestamp
+        if len(self._taken) > MAX_KEYFRAMES:
+            del self._taken[1::2]
+            self._interval *= 2
 
     def interrupt(self) -> None:
         """Tracking was lost, or the poses jumped: the velocity across is not known."""
@@ -204,5 +236,5 @@ class KeyframeCollector(Stateful):
     def clear(self) -> None:
         """Another map has begun, whose poses cannot be compared."""
         self.interrupt()
-        self.keyframes.clear()
-        self._interval = INTERVAL
+        self._taken.clear()
+        self._interval, self._latest = INTERVAL, -np.inf

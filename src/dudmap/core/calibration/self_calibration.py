@@ -73,7 +73,7 @@ class SelfCalibration(Stateful):
             self._attempts.pop(0)
             estimator = CalibrationEstimator(self.given, self.sensor, 1 if self.live else num_threads())
             start = estimate_beside if self.live else _estimated
-            self._running = start(estimator, list(self._collector.keyframes))
+            self._running = start(estimator, self._collector.keyframes)
             if not self._attempts:
                 self._collector.clear()
 
