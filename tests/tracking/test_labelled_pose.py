@@ -51,12 +51,14 @@ def test_what_moves_close_to_the_camera_does_not_take_the_labelled_pose_along(tr
     depth, T = view.labelled.depth.copy(), tracking.T_world_camera
     depth[(depth > 0) & (depth < np.percentile(depth[depth > 0], 20))] -= np.float32(0.012)
     level = replace(view.labelled, depth=depth)
-    T_nearest, before, after = slam.front_end.blind_tracker.nearest(slam.reference, level, T)
+    blind = slam.front_end.blind_tracker
+    before = blind.linearize(slam.reference, level, T, np.ones_like(depth)).residuals[0]
+    T_nearest, after = blind.nearest(slam.reference, level, T)
     assert np.linalg.norm(se3.log(T_nearest @ se3.inverse(T))[:3]) > 0.008
     assert np.nanmean(np.abs(after)) < np.nanmean(np.abs(before))
     moved = SimpleNamespace(blind=False, known_dynamic=None, labelled=level)
     prediction = PosePrediction(T, lambda: None, lambda: None, None)
-    np.testing.assert_array_equal(slam.front_end._by_distances(slam.reference, moved, prediction, T), T)
+    np.testing.assert_array_equal(slam.front_end._by_distances(slam.reference, moved, prediction, tracking), T)
 
 
 def test_the_nearest_minimum_of_the_distances_is_at_the_true_pose_where_a_desk_determines_it(tracked):

@@ -163,21 +163,24 @@ class FrontEnd(Stateful):
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
 
     def _by_distances(
-        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_world_camera: NDArray[np.float64]
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, found: TrackingResult | Minimum
     ) -> NDArray[np.float64]:
-        """Pose (4, 4) near one of both terms at which the distances of the labelled image are smallest.
+        """Pose (4, 4) near the one found of both terms at which the distances of the labelled image are smallest.
 
         Not while images are compared: a mover of the first frame is part of the young map, and distances follow it. Nor
         where the farther half of the readings comes no nearer to the map: what is close to the camera weighs most in
         this minimum, and may be what moves.
         """
+        level, T_world_camera = view.labelled, found.T_world_camera
         if view.blind or prediction.moving is not None or self.tracker.config.color_weight == 0:
             return T_world_camera
-        excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.unverified_mask) if m is not None]
-        weights = initial_weights([view.labelled], self.last_dynamic, excluded)
-        level = view.labelled
-        weights = None if weights is None else weights[0]
-        T_nearest, before, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
+        if isinstance(found, Minimum) and found.level.depth is level.depth:
+            weights, before = found.weights, found.equations.residuals[0]
+        else:
+            excluded = [m for m in (view.known_dynamic, prediction.unverified_mask) if m is not None]
+            [weights] = initial_weights([level], self.last_dynamic, excluded) or [np.ones_like(level.depth)]
+            before = self.blind_tracker.linearize(volume, level, T_world_camera, weights).residuals[0]
+        T_nearest, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
         before, after, on_map = np.abs(before), np.abs(after), np.isfinite(before)
         if not on_map.any():
             return T_world_camera
@@ -197,7 +200,7 @@ class FrontEnd(Stateful):
             labels = self.detector.detect(
                 volume,
                 view.labelled,
-                self._by_distances(volume, view, prediction, tracking.T_world_camera),
+                self._by_distances(volume, view, prediction, tracking),
                 view.timestamp,
                 view.segmentation,
                 prediction.moving,

@@ -204,9 +204,9 @@ class Tracker:
         level: Level,
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32] | None = None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and
-        distances (h, w) of the readings to the map before and after these steps, metres, NaN off the map.
+        distances (h, w) of the readings to the map there, metres, NaN off the map.
 
         Args:
             volume: The map; its window must cover the view.
@@ -216,10 +216,8 @@ class Tracker:
         """
         weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
         rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
-        first = self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
-        before = first.residuals[0]
-        found = self._descend(volume, level, T_world_camera, weights, first, rules, parameters)
-        return found.T_world_camera, before, found.equations.residuals[0]
+        found = self._descend(volume, level, T_world_camera, weights, None, rules, parameters)
+        return found.T_world_camera, found.equations.residuals[0]
 
     def _observability(
         self,
