@@ -111,7 +111,7 @@ class TemporalMemory(Stateful):
         if segmentation is not None:
             dynamic_segments = segmentation.share(dynamic) >= DYNAMIC_SHARE
             dynamic_segments[0] = False
-            marks[dynamic_segments[segmentation.labels]] = 1
+            marks = dynamic_segments[segmentation.labels].view(np.uint8)
         settle_time, start_seconds = self.config.settle_time, self.config.start_seconds
         self._last = frame = RememberedFrame(timestamp, level, T_world_camera, marks)
         settle_frames, recent_frames = self._settle_frames, self._recent_frames

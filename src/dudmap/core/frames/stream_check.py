@@ -167,13 +167,14 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
         reach: How far the camera may have moved in between, metres.
     """
     both = (before > 0) & (after > 0)
+    count, most = np.count_nonzero(both), np.float32(SMALLEST_FACTOR)
+    if count < MIN_PIXELS:
+        return 1.0
+    usual = np.count_nonzero(both & (after < most * before) & (before < most * after))
+    if 2 * usual > count:  # so is the median, which takes longer
+        return 1.0
     before, after = before[both], after[both]
-    if len(before) < MIN_PIXELS:
-        return 1.0
     ratios = after / before
-    usual = np.count_nonzero((ratios < SMALLEST_FACTOR) & (ratios > 1 / SMALLEST_FACTOR))
-    if 2 * usual > len(ratios):  # so is the median, which takes longer
-        return 1.0
     factor = float(np.median(ratios))
     if max(factor, 1 / factor) < SMALLEST_FACTOR:
         return 1.0

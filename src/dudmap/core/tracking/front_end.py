@@ -18,7 +18,7 @@ from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, MotionModel, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
-from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
+from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 
 NO_CHANCE = 3
 """Excess of readings that come nearer to the map over those that do not, in standard deviations of chance."""
@@ -181,10 +181,12 @@ class FrontEnd(Stateful):
             [weights] = initial_weights([level], self.last_dynamic, excluded) or [np.ones_like(level.depth)]
             before = self.blind_tracker.linearize(volume, level, T_world_camera, weights).residuals[0]
         T_nearest, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
-        before, after, on_map = np.abs(before), np.abs(after), np.isfinite(before)
-        if not on_map.any():
+        before, after = np.abs(before), np.abs(after)
+        depth = level.depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
+        depth = depth[np.isfinite(before[::MEDIAN_STRIDE, ::MEDIAN_STRIDE])]
+        if len(depth) == 0:
             return T_world_camera
-        far = level.depth > median(level.depth[on_map])
+        far = level.depth > median(depth)
         nearer, farther = np.count_nonzero(far & (after < before)), np.count_nonzero(far & (before < after))
         return T_nearest if nearer - farther > NO_CHANCE * np.sqrt(nearer + farther) else T_world_camera
 

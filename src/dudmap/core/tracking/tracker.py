@@ -34,7 +34,7 @@ EXPOSURE_NOISE = 0.01
 NEAREST_STEPS = 3
 """Largest number of steps to the minimum next to a pose that is near it."""
 MEDIAN_STRIDE = 4
-"""Every so many pixels, across and down, enter the median intensity difference."""
+"""Every so many pixels, across and down, enter a median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
