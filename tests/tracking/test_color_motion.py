@@ -72,7 +72,7 @@ def test_colours_are_those_of_a_camera_that_sees_at_the_time_and_place_of_the_de
         inside = np.s_[10:-10, 10:-10]
         sharp = smooth(exact[n].color)[inside]
         before.append(np.abs(smooth(faulty[n].color)[inside] - sharp).mean())
-        after.append(np.abs(smooth(view.observation.rgb)[inside] - sharp).mean())
+        after.append(np.abs(smooth(view.colored().rgb)[inside] - sharp).mean())
     assert np.mean(after) < 0.6 * np.mean(before)
 
 

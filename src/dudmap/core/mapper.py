@@ -64,7 +64,7 @@ class FusedFrame:
     @classmethod
     def of(cls, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> "FusedFrame":
         """What of a frame is needed."""
-        observation, fine = view.observation, view.pyramid.fine
+        observation, fine = view.colored(), view.pyramid.fine
         frame = Frame(observation.timestamp, observation.depth, observation.rgb)
         level = Level(fine.camera, fine.depth, fine.intensity)  # without the images it is made from
         return cls(frame, level, estimate.T_world_camera, estimate.exposure, dynamic_mask)
@@ -238,12 +238,12 @@ class Mapper:
 
     def extend(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool) -> None:
         """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
+        if fuse:
+            self.integrate(view, estimate, dynamic_mask)
         if self._config.relocalization.enabled and not (view.blind or self._localize):
             with view.timer("keyframe"):
                 atlas, T_world_camera = self._atlas, estimate.T_world_camera
-                atlas.keyframes.add(view.observation, T_world_camera, dynamic_mask, atlas.current)
-        if fuse:
-            self.integrate(view, estimate, dynamic_mask)
+                atlas.keyframes.add(view.colored(), T_world_camera, dynamic_mask, atlas.current)
         if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp) and not view.blind:
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
@@ -299,6 +299,7 @@ class Mapper:
             static = self._static(dynamic_mask, observation.depth)
             if self._predictor.mostly_slow and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
+            observation = view.colored()
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)

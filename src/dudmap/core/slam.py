@@ -195,13 +195,14 @@ class Slam(SlamResults, Stateful):
         if prediction.crowd_in_map is not None and self.relocalizer.may_start_submaps:
             return self._start_submap(view.with_dynamic(prediction.crowd_in_map))
         estimate = self.front_end.register(self.reference, view, prediction)
+        registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
         if reason and not relocalized:
             return replace(self._lose(view, estimate, reason), checks=verdict.figures)
-        view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
+        view = registered if relocalized is None else self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = estimate.unobserved_motion or self.predictor.ambiguity(view, prediction, estimate)
@@ -343,7 +344,7 @@ class Slam(SlamResults, Stateful):
             return T_world_camera, False
         with view.timer("loops"):
             levels, unverified = view.pyramid.tracked, estimate.unverified_mask
-            query = LoopQuery(view.observation, levels, estimate.tracking, dynamic_mask, estimate.labels, unverified)
+            query = LoopQuery(view.colored(), levels, estimate.tracking, dynamic_mask, estimate.labels, unverified)
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False

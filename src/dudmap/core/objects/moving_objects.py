@@ -64,7 +64,7 @@ class MovingObjects(Stateful):
         if self.fusion is not None:
             with view.timer("bodies"):
                 fused = self.fusion.update(
-                    view.observation, self._movers(frame), level, T_world_camera, estimate.exposure
+                    view.colored(), self._movers(frame), level, T_world_camera, estimate.exposure
                 )
             frame.movers = tuple(fused)
         elif len(self._waiting) > MOST_WAITING:

@@ -117,7 +117,7 @@ class RedundantViews(Stateful):
         if place is None or not config.enabled or not self._is_near(place, estimate.T_world_camera):
             return False
         if config.measure == "features":
-            return self.features.is_redundant(view.observation.rgb)
+            return self.features.is_redundant(view.colored().rgb)
         static = _static(view, estimate)
         known = self._known_share(volume, level, estimate.T_world_camera)
         if not static.any() or known[static].mean() <= config.threshold:
@@ -133,7 +133,7 @@ class RedundantViews(Stateful):
             return
         place = self._place
         if config.measure == "features":
-            self.features.set_reference(view.observation.rgb)
+            self.features.set_reference(view.colored().rgb)
         static = _static(view, estimate)
         if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
             depth, to_carve = np.where(static, level.depth, np.float32(0)), np.zeros(level.depth.shape, np.int64)

@@ -93,7 +93,7 @@ class Relocalizer(Stateful):
             return None
         with view.timer("recognise"):
             keyframes = self.atlas.keyframes
-            features = keyframes.extract(view.observation, view.known_dynamic)
+            features = keyframes.extract(view.colored(), view.known_dynamic)
             self._counted = view.observation.timestamp, len(features)
             candidates = keyframes.match(features)
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.median import median
+from dudmap.core.backends.parameters import ColorProjection
+from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
 from dudmap.core.frames.frame import Frame
@@ -112,7 +114,7 @@ class ColorMotion(Stateful):
         return self._with_levels(view, self._velocity(view, T_world_camera))
 
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
-        """The frame with its colours registered, once its pose (4, 4) is known."""
+        """The frame once its pose (4, 4) is known; another thread registers its colours (``FrameView.colored``)."""
         velocity = self._velocity(view, T_world_camera)
         if self._is_first:  # the next frames are compared with its intensities
             view = self._with_levels(view, velocity)
@@ -128,11 +130,7 @@ class ColorMotion(Stateful):
         """
         if self.calibration is None:
             return frame
-        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
-        calibration = self.calibration
-        if frame.timestamp <= self._rectified_from:  # its depth has the rows' motion that its colours share
-            calibration = replace(calibration, depth_readout=0.0)
-        projection = color_projection(calibration, velocity, offset)
+        projection = self._projection(self.calibration, frame, velocity)
         return replace(frame, color=register_color(frame.color, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
@@ -169,14 +167,24 @@ class ColorMotion(Stateful):
     def _depth_readout(self) -> float:
         return 0.0 if self.calibration is None else self.calibration.depth_readout
 
+    def _projection(self, calibration: Calibration, frame: Frame, velocity: NDArray[np.float64]) -> ColorProjection:
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        if frame.timestamp <= self._rectified_from:  # its depth has the rows' motion that its colours share
+            calibration = replace(calibration, depth_readout=0.0)
+        return color_projection(calibration, velocity, offset)
+
     def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
-        observation = view.observation
-        if self.is_prepared(observation):
+        observation, calibration = view.observation, self.calibration
+        if calibration is None or self.is_prepared(observation):
             return view
-        with view.timer("color"):
-            recorded = observation.as_recorded
-            rgb = self.frame_with_colors(recorded, observation.camera, velocity).color
-            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded.color))
+        recorded = observation.as_recorded
+        projection = self._projection(calibration, recorded, velocity)
+
+        def colored() -> Observation:
+            rgb = register_color(recorded.color, recorded.depth, observation.camera, projection)
+            return replace(observation, rgb=rgb, recorded_rgb=recorded.color)
+
+        return replace(view, colors=submit(colored))
 
     def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Twist per second (6,) after a frame was registered with that of the motion model."""

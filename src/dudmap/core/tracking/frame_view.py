@@ -75,6 +75,7 @@ class FrameView:
         blind: The image is textureless although the first image of the map was not: the pose rests on the distances
             alone, and the frame is not fused.
         color_velocity: (6,) twist of the camera per second with which the colours were registered.
+        colors: Returns the observation with its colours registered; None where those it has are.
     """
 
     observation: Observation
@@ -84,11 +85,19 @@ class FrameView:
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False
     color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    colors: Callable[[], Observation] | None = None
 
     @property
     def timestamp(self) -> float:
         """Time of the depth image, seconds."""
         return self.observation.timestamp
+
+    def colored(self) -> Observation:
+        """The observation with registered colours; waits for the thread that registers them."""
+        if self.colors is None:
+            return self.observation
+        with self.timer("color"):
+            return self.colors()
 
     @property
     def pyramid(self) -> Pyramid:
