@@ -78,12 +78,9 @@ def process_source(
                 display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
         tell(beside=True)
 
-    def complete() -> None:
-        record.add_movers(row, result)
-        keep_images()
-
     if record.dropped is None:
-        background.do(complete)
+        record.add_movers(row, result)
+        background.do(keep_images)
     else:  # what is postponed holds no images
         keep_images()
         background.do(partial(record.add_movers, row, result))
