@@ -56,6 +56,19 @@ def test_an_error_reaches_the_caller_after_all_bands_have_ended():
         threads.submit(lambda: 1 / 0)()
 
 
+def test_what_no_thread_has_come_to_is_computed_once_by_who_asks():
+    busy, goes_on, done = threading.Barrier(4, timeout=30), threading.Event(), []
+    others = [threads.submit(lambda: busy.wait() and goes_on.wait(30)) for _ in range(3)]
+    busy.wait()
+    result = threads.submit(lambda: done.append(threading.get_ident()) or len(done))
+    assert [result(), result()] == [1, 1]
+    goes_on.set()
+    for other in others:
+        other()
+    threads.submit(lambda: None)()
+    assert done == [threading.get_ident()]
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own():

@@ -226,7 +226,7 @@ def test_what_is_no_state_is_named(tmp_path):
         StateReader(tmp_path / "other.db")
     database = StateDatabase(tmp_path / "new.db")
     database._execute("PRAGMA user_version = 99")
-    with pytest.raises(StateError, match="version 99 of the format; this version reads 5"):
+    with pytest.raises(StateError, match="version 99 of the format; this version reads 6"):
         StateReader(tmp_path / "new.db")
     StateDatabase(tmp_path / "empty.db")
     with pytest.raises(StateError, match="holds no checkpoint yet"):

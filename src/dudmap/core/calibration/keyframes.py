@@ -83,9 +83,7 @@ def color_levels(camera: Camera) -> list[int]:
     return sorted({halvings_to(width, camera) for width in COLOR_WIDTHS}, reverse=True)
 
 
-def levels_of(
-    observation: Observation, given: Calibration
-) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+def levels_of(observation: Observation, given: Calibration) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
     """Depth (h, w) of the observation that is compared, and its recorded intensities (h, w), coarse to fine; ``given``
     is the calibration of the colour images."""
     depth, _ = observation.halved(halvings_to(GEOMETRY_WIDTH, observation.camera))
@@ -219,9 +217,7 @@ class KeyframeCollector(Stateful):
         levels_of(observation, self.given)  # cached there by this thread, which may use them in the meantime
 
         def made() -> ColorKeyframe:
-            return replace(
-                keyframe(observation, self.given, T_world_camera, velocity, dynamic_mask), interval=interval
-            )
+            return replace(keyframe(observation, self.given, T_world_camera, velocity, dynamic_mask), interval=interval)
 
         self._taken.append(submit(made))
         self._latest = observation.timestamp
