@@ -128,7 +128,7 @@ class Camera:
         color = np.full((*CAMERA.shape, 3), 90, np.uint8)
         level = Level(CAMERA, depth, color[..., 0].astype(np.float32) / 255)
         dynamic = np.zeros(CAMERA.shape, bool) if dynamic is None else dynamic
-        view = SimpleNamespace(labelled=level, observation=SimpleNamespace(rgb=color))
+        view = SimpleNamespace(labelled=level, colored=lambda: SimpleNamespace(rgb=color))
         estimate = SimpleNamespace(T_world_camera=T, labels=SimpleNamespace(dynamic=dynamic))
         redundant = self.views.is_redundant(self.volume, view, estimate)
         if not redundant:

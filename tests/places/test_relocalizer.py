@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.frames.observation import Level, Observation, Pyramid
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
 from dudmap.core.places.relocalizer import Relocalizer
-from dudmap.core.tracking.frame_view import PoseEstimate, StageTimer
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
 from dudmap.core.tracking.tracker import TrackingResult
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -75,9 +75,13 @@ class Registration:
 
 def recover(subject, register, accept=lambda tracking: True, known_dynamic=None):
     level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
-    view = SimpleNamespace(
-        observation=frame(5.0), labelled=level, timer=StageTimer(), known_dynamic=known_dynamic
-    )  # what of a FrameView is used
+    view = FrameView(
+        frame(5.0),
+        lambda: Pyramid([level], level),
+        lambda: pytest.fail("no segments"),
+        StageTimer(),
+        known_dynamic,
+    )
     return subject.recover(view, register, accept)
 
 
