@@ -128,7 +128,7 @@ class Camera:
         color = np.full((*CAMERA.shape, 3), 90, np.uint8)
         level = Level(CAMERA, depth, color[..., 0].astype(np.float32) / 255)
         dynamic = np.zeros(CAMERA.shape, bool) if dynamic is None else dynamic
-        view = SimpleNamespace(labelled=level, colored=lambda: SimpleNamespace(rgb=color))
+        view = SimpleNamespace(labelled=level)
         estimate = SimpleNamespace(T_world_camera=T, labels=SimpleNamespace(dynamic=dynamic))
         redundant = self.views.is_redundant(self.volume, view, estimate)
         if not redundant:
@@ -225,7 +225,7 @@ def test_the_features_of_the_last_fused_frame_can_decide(scene):
 
     def at(image):
         level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
-        return SimpleNamespace(labelled=level, observation=SimpleNamespace(rgb=image))
+        return SimpleNamespace(labelled=level, colored=lambda: SimpleNamespace(rgb=image))
 
     estimate = SimpleNamespace(T_world_camera=np.eye(4), labels=None)
     volume = SimpleNamespace(voxel_size=0.01)
