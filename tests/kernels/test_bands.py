@@ -4,6 +4,8 @@ import multiprocessing
 import subprocess
 import sys
 import threading
+import time
+import weakref
 
 import pytest
 
@@ -67,6 +69,23 @@ def test_what_no_thread_has_come_to_is_computed_once_by_who_asks():
         other()
     threads.submit(lambda: None)()
     assert done == [threading.get_ident()]
+
+
+def test_what_a_task_holds_is_let_go_once_it_is_done():
+    class Images:
+        pass
+
+    images = Images()
+    held = weakref.ref(images)
+    result = threads.submit(lambda images=images: type(images).__name__)
+    assert result() == "Images"
+    del images
+    for _ in range(100):  # the other thread may still be about to come to it
+        if held() is None:
+            break
+        time.sleep(0.01)
+    assert held() is None
+    assert result() == "Images"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")

@@ -11,6 +11,7 @@ import inspect
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cache, cached_property, partial, update_wrapper
@@ -237,27 +238,34 @@ def submit(function: Callable[[], Result]) -> Callable[[], Result]:
     Returns:
         A function that waits for the result; where no thread has come to it yet, it is computed by who asks first.
     """
-    if num_threads() > 1:
-        future: Future[Result] = Future()
-        _tasks().put(lambda: _fulfil(future, function))
-        return cache(lambda: function() if future.cancel() else future.result())
-    result = function()
-    return lambda: result
+    if num_threads() <= 1:
+        result = function()
+        return lambda: result
+    future: Future[Result] = Future()
+    waiting = deque([function])  # it is let go with all that it holds as soon as it is called
+
+    def fulfil() -> None:
+        try:
+            task = waiting.pop()
+        except IndexError:  # another thread has come to it
+            return
+        try:
+            future.set_result(task())
+        except BaseException as error:
+            future.set_exception(error)
+
+    def computed() -> Result:
+        fulfil()
+        return future.result()
+
+    _tasks().put(fulfil)
+    return computed
 
 
 def also_in_other_threads(function: Callable[[], object], count: int) -> None:
     """Have ``count`` other threads call a function that may be called late, when nothing is left to do."""
     for _ in range(count):
         _tasks().put(function)
-
-
-def _fulfil(future: Future[Result], function: Callable[[], Result]) -> None:
-    if not future.set_running_or_notify_cancel():
-        return
-    try:
-        future.set_result(function())
-    except BaseException as error:
-        future.set_exception(error)
 
 
 def bands(n: int, size: int) -> list[tuple[int, int]]:
