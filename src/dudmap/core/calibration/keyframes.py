@@ -1,7 +1,8 @@
 """Frames from which the calibration is estimated."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,9 +97,11 @@ def keyframe(
     T_world_camera: NDArray[np.float64],
     velocity: NDArray[np.float64],
     dynamic_mask: NDArray[np.bool_],
+    interval: float = MAX_GAP / 2,
 ) -> ColorKeyframe:
     """Keyframe of a preprocessed frame at a pose (4, 4) with a velocity (6,), twist per second in camera axes, without
-    the pixels (H, W) that move, in either image; ``given`` is the calibration of the colour images as recorded."""
+    the pixels (H, W) that move, in either image; ``given`` is the calibration of the colour images as recorded, and
+    ``interval`` as of ``ColorKeyframe``."""
     import cv2
 
     camera = observation.camera.scaled(halvings_to(GEOMETRY_WIDTH, observation.camera))
@@ -121,7 +124,7 @@ def keyframe(
     points, tangents = (image[::POINT_STRIDE, ::POINT_STRIDE][smooth] for image in (points, tangents))
     return ColorKeyframe(
         observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, brightness,
-        T_world_camera, velocity, observation.depth_readout,
+        T_world_camera, velocity, observation.depth_readout, interval,
     )  # fmt: skip
 
 
@@ -200,30 +203,15 @@ class KeyframeCollector(Stateful):
             middle, T, mask = self._pending
             before, due = self._before, self._latest + self._interval - 1e-3
             if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
-                velocity = central_velocity(before, (now, T_world_camera))
-                self._take(middle, T, velocity, mask, (now - before[0]) / 2)
+                velocity, interval = central_velocity(before, (now, T_world_camera)), (now - before[0]) / 2
+                levels_of(middle, self.given)  # cached there by this thread, which may use them in the meantime
+                self._taken.append(submit(partial(keyframe, middle, self.given, T, velocity, mask, interval)))
+                self._latest = middle.timestamp
+                if len(self._taken) > MAX_KEYFRAMES:
+                    del self._taken[1::2]
+                    self._interval *= 2
             self._before = middle.timestamp, T
         self._pending = observation, T_world_camera, dynamic_mask
-
-    def _take(
-        self,
-        observation: Observation,
-        T_world_camera: NDArray[np.float64],
-        velocity: NDArray[np.float64],
-        dynamic_mask: NDArray[np.bool_],
-        interval: float,
-    ) -> None:
-        """Have another thread make a keyframe."""
-        levels_of(observation, self.given)  # cached there by this thread, which may use them in the meantime
-
-        def made() -> ColorKeyframe:
-            return replace(keyframe(observation, self.given, T_world_camera, velocity, dynamic_mask), interval=interval)
-
-        self._taken.append(submit(made))
-        self._latest = observation.timestamp
-        if len(self._taken) > MAX_KEYFRAMES:
-            del self._taken[1::2]
-            self._interval *= 2
 
     def interrupt(self) -> None:
         """Tracking was lost, or the poses jumped: the velocity across is not known."""
