@@ -8,6 +8,7 @@ A file that cannot be read, is no plain file or is too large is an ``OSError``. 
 is nested too deeply, or would unpack to too much is a ``ValueError``, or what zipfile and zlib raise (``DAMAGE``).
 """
 
+import codecs
 import errno
 import json
 import lzma
@@ -104,8 +105,16 @@ def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
-    """Content of a UTF-8 text file of at most ``largest`` bytes, with line ends as ``\\n``."""
-    return read_bytes(path, largest).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    """Content of a UTF-8 or UTF-16 text file of at most ``largest`` bytes, with line ends as ``\\n``."""
+    return decode_text(read_bytes(path, largest)).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decode_text(data: bytes) -> str:
+    """Text in UTF-8, or in UTF-16 as its mark or a zero byte in the first character says; the mark is left out."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    zeros = data[0:1] == b"\0", data[1:2] == b"\0"
+    return data.decode("utf-8-sig" if zeros[0] == zeros[1] else "utf-16-be" if zeros[0] else "utf-16-le")
 
 
 def read_json(path: str | Path) -> Any:  # noqa: ANN401 - any JSON value

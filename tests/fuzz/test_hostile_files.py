@@ -132,6 +132,6 @@ def test_a_matrix_of_another_count_of_numbers(tmp_path):
     folder, _ = layouts.write(layouts.openloris, tmp_path)
     file = folder / "trans_matrix.yaml"
     file.write_text(file.read_text().replace("data: [ ", "data: [ 1, "))
-    refused(lambda: open_sequence(folder), DatasetError, "entry 1 of trans_matrix has no 4x4 matrix")
+    assert "entry 1 of trans_matrix has no 4x4 matrix" in open_sequence(folder).remarks[0]
     file.write_text("parent_frame: a\n child_frame: b\n matrix: " * 20_000)
-    refused(lambda: open_sequence(folder), DatasetError, "expected YAML of keys")
+    assert "expected YAML of keys" in open_sequence(folder).remarks[0]

@@ -345,8 +345,9 @@ def test_a_bad_mask_and_a_bad_ground_truth(recording):
     with pytest.raises(FrameError, match=r"mask/0\.png does not exist"):
         open_sequence(recording).mask(0)
     (recording / "groundtruth.txt").write_text("100 1 2 3\n")
-    with pytest.raises(DatasetError, match="expected 'timestamp tx ty tz"):
-        open_sequence(recording)
+    sequence = open_sequence(recording)
+    assert sequence.ground_truth is None
+    assert "'timestamp tx ty tz qx qy qz qw'" in sequence.remarks[0]
 
 
 SECOND = "fx 60\nfy 60\ncx 31.5\ncy 23.5\ncolor_fx 80\ncolor_fy 81\ncolor_cx 39.5\ncolor_cy 29.5\ncolor_width 80\n"

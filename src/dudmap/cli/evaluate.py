@@ -77,6 +77,8 @@ def trajectory(
     target = _output_folder(out, folder if folder is not None else file.parent)
     if truth is not None:
         true = load_reference(truth)
+        for remark in (*found.remarks, *true.remarks):
+            say(f"dudmap: {remark}", err=True)
         errors = trajectory_figures(found, true, alignment, max_difference)
         figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
         if ending:

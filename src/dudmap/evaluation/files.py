@@ -61,11 +61,13 @@ def load_reference(path: Path) -> Trajectory:
     """
     inside = path.name == "groundtruth.txt" and reader_of(path.parent) not in (None, TumSequence)
     if path.is_file() and not inside and not is_recording(path):
-        return Trajectory.load(path)
+        return Trajectory.load(path, optional=path.name == "groundtruth.txt")
     recording = path.parent if inside else path
-    truth = open_sequence(recording).ground_truth
+    opened = open_sequence(recording)
+    truth = opened.ground_truth
     if truth is None:
-        raise DatasetError(f"the recording {recording} has no true poses; name a file in TUM format")
+        why = "; ".join(opened.remarks) or "it has no true poses"
+        raise DatasetError(f"the recording {recording} cannot be the reference: {why}; name a file in TUM format")
     return truth
 
 

@@ -177,6 +177,7 @@ def inspect(
         *_time_warnings(sequence.timestamps, colors),
         *_truth_warnings(sequence.timestamps, truth),
         *_pairing_warnings(sequence, found.sources),
+        *getattr(sequence, "remarks", ()),
     ]
     return found
 

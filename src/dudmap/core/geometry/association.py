@@ -1,11 +1,14 @@
 """Lists of timed files and their association by time."""
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.times import SECONDS, TimeUnit, time_unit
 from dudmap.errors import DatasetError
 from dudmap.input_files import read_text
 
@@ -14,68 +17,116 @@ LARGEST_GAP = 0.02
 
 
 class TimedFile(NamedTuple):
-    """One line of a list: seconds and path."""
+    """One line of a list: seconds and path, and the unit in which the list gives the time."""
 
     timestamp: float
     path: Path
+    unit: TimeUnit = SECONDS
 
 
-def read_rows(path: Path, columns: str) -> list[tuple[int, list[str]]]:
-    """Line numbers and fields of a text list; ``#`` starts a comment, commas count as blanks.
+FIELD = re.compile(r""""[^"]*"|'[^']*'|[^\s,]+""")
+"""A field of a list, with the quotes around it if there are any; blanks and commas separate fields."""
+
+
+def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[int, list[str]]]:
+    """Line numbers and fields of a text list.
+
+    ``#`` starts a comment, commas count as blanks, and a first line without a digit is a header.
 
     Args:
         path: The list.
         columns: Names of the fields, blank between them, e.g. ``timestamp file``.
+        short: Whether lines with fewer fields are returned, too.
 
     Raises:
-        DatasetError: The file cannot be read or a line does not have these columns.
+        DatasetError: The file cannot be read, or a line does not have these columns.
     """
+    lines = _lines(path, columns, short=short)
+    return [(number, line.replace(",", " ").split()) for number, line in lines]
+
+
+def _lines(path: Path, columns: str, *, short: bool = False) -> Iterator[tuple[int, str]]:
+    """Numbers and text of the lines of a list, without comments and header."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        if len(fields) < len(columns.split()):
-            raise DatasetError(f"{path}, line {number}: expected '{columns}', found {line.strip()!r}")
-        rows.append((number, fields))
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line.strip(", ") and not line.startswith("#")]
+    rows = lines[1:] if len(lines) > 1 and not re.search(r"\d", lines[0][1]) else lines
     if not rows:
         raise DatasetError(f"{path} lists nothing; expected lines '{columns}'")
-    return rows
+    for number, line in rows:
+        if len(line.replace(",", " ").split()) < len(columns.split()) and not short:
+            raise DatasetError(f"{path}, line {number}: expected '{columns}', found {line!r}")
+        yield number, line
 
 
 def read_list(path: Path) -> list[TimedFile]:
-    """Files of a list ``timestamp file``, paths relative to the list's folder.
+    """Files of a list ``timestamp file``, paths relative to the list's folder, times in any unit of ``time_unit``.
 
     Raises:
         DatasetError: The list is unreadable, or its times are not finite and strictly increasing.
     """
-    rows = read_rows(path, "timestamp file")
-    stamps = [parse_stamp(path, number, fields[0]) for number, fields in rows]
-    check_increasing(path, [number for number, _ in rows], stamps)
-    return [TimedFile(stamp, path.parent / fields[1]) for stamp, (_, fields) in zip(stamps, rows, strict=True)]
+    numbers, stamps, names = [], [], []
+    for number, line in _lines(path, "timestamp file"):
+        stamp, *rest = FIELD.finditer(line)
+        numbers.append(number)
+        stamps.append(parse_stamp(path, number, stamp.group()))
+        names.append(_name(path, number, line, rest))
+    check_increasing(path, numbers, stamps)
+    return _in_seconds(path, stamps, names)
 
 
 def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
     """(colour, depth) files of an associations list ``t_rgb rgb_file t_depth depth_file``.
 
-    Some tools write depth first; the folder names decide.
+    Some tools write depth first; the folder names decide. Times are in any unit of ``time_unit``.
 
     Raises:
         DatasetError: The list is unreadable, or its depth times are not finite and strictly increasing.
     """
-    rows = read_rows(path, "t_rgb rgb_file t_depth depth_file")
-    pairs = []
-    for number, fields in rows:
-        first = TimedFile(parse_stamp(path, number, fields[0]), path.parent / fields[1])
-        second = TimedFile(parse_stamp(path, number, fields[2]), path.parent / fields[3])
-        swapped = "depth" in fields[1] and "depth" not in fields[3]
-        pairs.append((second, first) if swapped else (first, second))
-    check_increasing(path, [number for number, _ in rows], [depth.timestamp for _, depth in pairs])
-    return pairs
+    numbers, stamps, names = [], ([], []), ([], [])
+    for number, line in _lines(path, "t_rgb rgb_file t_depth depth_file"):
+        fields = list(FIELD.finditer(line))
+        second = _second_stamp(path, number, line, fields)
+        sides = [(fields[0], fields[1:second]), (fields[second], fields[second + 1 :])]
+        if "depth" in _name(path, number, line, sides[0][1]) and "depth" not in _name(path, number, line, sides[1][1]):
+            sides.reverse()
+        numbers.append(number)
+        for side, (stamp, rest) in enumerate(sides):
+            stamps[side].append(parse_stamp(path, number, stamp.group()))
+            names[side].append(_name(path, number, line, rest))
+    check_increasing(path, numbers, stamps[1])
+    return list(zip(*(_in_seconds(path, stamps[side], names[side]) for side in (0, 1)), strict=True))
+
+
+def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> int:
+    """Place of the second time in a row of two times and two files, whose names may hold blanks."""
+    if len(fields) == 4:
+        return 2
+    places = [place for place in range(2, len(fields) - 1) if re.fullmatch(r"[-+.\deE]+", fields[place].group())]
+    if not places:
+        raise DatasetError(f"{path}, line {number}: expected 't_rgb rgb_file t_depth depth_file', found {line!r}")
+    listed = (place for place in places if (path.parent / _name(path, number, line, fields[1:place])).is_file())
+    return next(listed, places[0])
+
+
+def _name(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> str:
+    """Name of a file in a row: the first of some fields, or all of them if it holds blanks."""
+    if not fields:
+        raise DatasetError(f"{path}, line {number}: expected the name of a file after its time, found {line!r}")
+    name = fields[0].group()
+    if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'":
+        return name[1:-1]
+    whole = line[fields[0].start() : fields[-1].end()]
+    return whole if len(fields) > 1 and (path.parent / whole).is_file() else name
+
+
+def _in_seconds(path: Path, stamps: list[float], names: list[str]) -> list[TimedFile]:
+    unit = time_unit(stamps)
+    rows = zip(stamps, names, strict=True)
+    return [TimedFile(stamp / unit.per_second, path.parent / name, unit) for stamp, name in rows]
 
 
 def parse_stamp(path: Path, number: int, text: str) -> float:
@@ -85,11 +136,11 @@ def parse_stamp(path: Path, number: int, text: str) -> float:
         DatasetError: The text is no number, NaN or infinite.
     """
     try:
-        stamp = float(text)
+        stamp = float(text.strip("\"'"))
     except ValueError:
         stamp = np.nan
     if not np.isfinite(stamp):
-        raise DatasetError(f"{path}, line {number}: the timestamp {text!r} is not a finite number of seconds")
+        raise DatasetError(f"{path}, line {number}: the timestamp {text!r} is not a finite number")
     return stamp
 
 

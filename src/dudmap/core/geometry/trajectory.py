@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import write_text
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import read_rows
+from dudmap.core.geometry.times import SECONDS, time_unit
 from dudmap.errors import DatasetError
 
 LARGEST_STEP = 0.15
@@ -23,10 +24,12 @@ class Trajectory:
     Attributes:
         timestamps: (N,) float64, seconds, strictly increasing.
         Ts_world_camera: (N, 4, 4) float64.
+        remarks: Sentences on what was assumed and left out where they were read.
     """
 
     timestamps: NDArray[np.float64]
     Ts_world_camera: NDArray[np.float64]
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.Ts_world_camera.shape != (len(self.timestamps), 4, 4):
@@ -93,30 +96,54 @@ class Trajectory:
         write_text(path, "\n".join(lines) + "\n")
 
     @classmethod
-    def load(cls, path: str | Path) -> "Trajectory":
-        """Read TUM text; lines starting with ``#`` and empty lines are comments.
+    def load(cls, path: str | Path, *, optional: bool = False) -> "Trajectory":
+        """Read TUM text; comments and a header are left out, and times in another unit than seconds are converted.
+
+        Args:
+            path: The file.
+            optional: Leave out rows that are not eight finite numbers with a non-zero quaternion and a time after all
+                times before, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing, a row is not eight finite numbers, or the times do not increase.
+            DatasetError: The file is missing, it holds no such row, or, unless ``optional``, another row.
         """
         path = Path(path)
-        rows: list[list[float]] = []
-        for number, fields in read_rows(path, "timestamp tx ty tz qx qy qz qw"):
-            try:
-                row = [float(field) for field in fields[:8]]
-            except ValueError:
-                row = []
-            if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
-                raise DatasetError(
-                    f"{path}, line {number}: expected eight finite numbers 'timestamp tx ty tz qx qy qz qw' "
-                    f"with a non-zero quaternion, found {' '.join(fields)!r}"
-                )
-            rows.append(row)
+        rows, latest, wrong = [], -np.inf, []
+        for number, fields in read_rows(path, COLUMNS, short=optional):
+            row = _finite(fields[:8])
+            if row is not None and not (optional and row[0] <= latest):
+                latest = row[0]
+                rows.append(row)
+                continue
+            wrong.append(
+                f"{path}, line {number}: expected eight finite numbers '{COLUMNS}' with a non-zero quaternion, found "
+                f"{' '.join(fields)!r}"
+            )
+            if not optional:
+                raise DatasetError(wrong[0])
+        if not rows:
+            raise DatasetError(wrong[0])
         table = np.array(rows)
+        unit = time_unit(table[:, 0])
+        remarks = [] if unit == SECONDS else [f"the times of {path.name} are taken as {unit.name}"]
+        if wrong:
+            remarks.append(f"{len(wrong)} of {len(wrong) + len(rows)} rows are left out; the first: {wrong[0]}")
         Ts = np.tile(np.eye(4), (len(table), 1, 1))
         Ts[:, :3, 3] = table[:, 1:4]
         Ts[:, :3, :3] = [se3.quat_xyzw_to_rotation(quat) for quat in table[:, 4:8]]
         try:
-            return cls(table[:, 0], Ts)
+            return cls(table[:, 0] / unit.per_second, Ts, tuple(remarks))
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
+
+
+COLUMNS = "timestamp tx ty tz qx qy qz qw"
+
+
+def _finite(fields: list[str]) -> list[float] | None:
+    """Numbers of a row of a trajectory; None if they are no pose."""
+    try:
+        row = [float(field) for field in fields]
+    except ValueError:
+        return None
+    return row if len(row) == 8 and np.all(np.isfinite(row)) and any(row[4:]) else None

@@ -1,6 +1,7 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import astuple, replace
 from functools import cache
 from importlib import import_module
@@ -78,6 +79,7 @@ class Recording(ABC):
         options: Names of the options of ``open_sequence`` that the format has.
         sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
             that they are assumed.
+        remarks: Sentences on what was left out because no run needs it, or assumed.
         timed: Whether the times were read or their rate was given; False where they are invented.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
@@ -95,6 +97,7 @@ class Recording(ABC):
     ground_truth: Trajectory | None = None
     sources: dict[str, str]
     opened: dict[str, Any]
+    remarks: Iterable[str] = ()
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

@@ -5,6 +5,7 @@ A file of poses that cannot be read or holds something else is a ``DatasetError`
 
 import re
 from collections.abc import Iterable, Sized
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile, associate
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.times import SECONDS
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
@@ -68,12 +70,26 @@ class ImageFolder(Recording):
         self.sources = {
             "intrinsics": known.source,
             "depth unit": known.source if unit else f"assumed, usual in the format {self.format}",
-            "times": "the recording" if self.timed else f"assumed, {FRAME_RATE:g} frames a second",
+            "times": self._time_source() if self.timed else f"assumed, {FRAME_RATE:g} frames a second",
             "frames": self._pairing,
         }
         self.calibration = known.calibration()
         self.camera = self._probe(known)
-        self.ground_truth = self._find_ground_truth()
+        self._take_truth()
+
+    def _time_source(self) -> str:
+        units = {file.unit for pair in self._pairs for file in pair} - {SECONDS}
+        taken = f", whose numbers are taken as {' and '.join(sorted(unit.name for unit in units))}" if units else ""
+        return f"the recording{taken}"
+
+    def _take_truth(self) -> None:
+        """Set the ground truth, which no run needs: one that cannot be read is left out, and ``remarks`` say so."""
+        try:
+            self.ground_truth = self._find_ground_truth()
+            said = self.ground_truth.remarks if self.ground_truth is not None else ()
+            self.remarks = [f"ground truth: {remark}" for remark in said]
+        except DatasetError as error:
+            self.ground_truth, self.remarks = None, [f"the ground truth is not used: {error}"]
 
     @property
     def color_timestamps(self) -> NDArray[np.float64]:
@@ -113,7 +129,8 @@ class ImageFolder(Recording):
         self._pairs = [tuple(TimedFile(factor * file.timestamp, file.path) for file in pair) for pair in self._pairs]
         self.timestamps = factor * self.timestamps
         if self.ground_truth is not None:
-            self.ground_truth = Trajectory(factor * self.ground_truth.timestamps, self.ground_truth.Ts_world_camera)
+            truth = self.ground_truth
+            self.ground_truth = replace(truth, timestamps=factor * truth.timestamps)
         self.timed, self.sources["times"] = True, f"--fps {fps:g}"
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
@@ -167,7 +184,7 @@ class ImageFolder(Recording):
     def _stamped_poses(self) -> Trajectory | None:
         """Poses of groundtruth.txt as they stand there, None if there is no such file."""
         file = self.path / "groundtruth.txt"
-        return Trajectory.load(file) if file.is_file() else None
+        return Trajectory.load(file, optional=True) if file.is_file() else None
 
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None

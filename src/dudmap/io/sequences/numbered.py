@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.times import time_unit
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, read_json, read_text
@@ -26,8 +27,6 @@ POSES = ("poses.txt", "pose.txt", "poses", "pose")
 """Files and folders of true poses."""
 LARGEST_NUMBER = 10**8
 """From here on a number in a file name is a time, not the number of a frame: 38 days at 30 frames a second."""
-TIME_UNITS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3), (0.0, 1.0))
-"""Smallest value and units per second of times since 1970: ns, us, ms, s. All lie between 1973 and 5138."""
 
 
 class NumberedSequence(ImageFolder):
@@ -72,13 +71,12 @@ class NumberedSequence(ImageFolder):
         colors, depths = ({_number(file): file for file in kinds[kind]} for kind in ("color", "depth"))
         if max(map(abs, colors)) < LARGEST_NUMBER and all(float(n).is_integer() for n in (*colors, *depths)):
             return self._pair_numbered({int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()})
-        first, second = (sorted(TimedFile(_seconds(n), f) for n, f in files.items()) for files in (colors, depths))
-        return self._pair_timed(first, second)
+        return self._pair_timed(_timed(colors), _timed(depths))
 
     def set_rate(self, fps: float) -> None:
         """As for ``ImageFolder``; groundtruth.txt has times of its own."""
         super().set_rate(fps)
-        self.ground_truth = self._find_ground_truth()
+        self._take_truth()
 
     def _find_ground_truth(self) -> Trajectory | None:
         if (truth := self._stamped_poses()) is not None:
@@ -146,8 +144,10 @@ def _number(file: Path) -> float:
     return float(re.findall(r"\d+(?:\.\d+)?", file.stem)[-1])
 
 
-def _seconds(number: float) -> float:
-    return next(number / units for smallest, units in TIME_UNITS if number >= smallest)
+def _timed(files: dict[float, Path]) -> list[TimedFile]:
+    """Files by time, whose numbers are times in one unit."""
+    unit = time_unit(list(files))
+    return sorted(TimedFile(number / unit.per_second, file, unit) for number, file in files.items())
 
 
 BOP_FILE = "scene_camera.json"

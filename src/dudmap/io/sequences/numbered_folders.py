@@ -1,6 +1,7 @@
 """Data sets in folders of numbered images: ICL-NUIM, 7-Scenes, VolumeDeform, ScanNet, Replica, Redwood and EPFL."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -175,7 +176,7 @@ class VolumeDeformSequence(FrameFiles):
         if self.name == "data":
             self._top = self.path.resolve().parent
             self.name = self._top.name
-            self.ground_truth = self._find_ground_truth()
+            self._take_truth()
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -341,8 +342,9 @@ def _freiburg(folder: Path) -> Trajectory | None:
     for number, fields in read_rows(found[0], "number tx ty tz qx qy qz qw"):
         if not re.fullmatch(r"\d+(\.0*)?", fields[0]):
             raise DatasetError(f"{found[0]}, line {number}: expected the number of a frame, found {fields[0]!r}")
-    raw = Trajectory.load(found[0])
-    return Trajectory(raw.timestamps / FRAME_RATE, MIRROR_Y @ raw.Ts_world_camera @ MIRROR_Y)
+    raw = Trajectory.load(found[0], optional=True)
+    Ts_world_camera = MIRROR_Y @ raw.Ts_world_camera @ MIRROR_Y
+    return replace(raw, timestamps=raw.timestamps / FRAME_RATE, Ts_world_camera=Ts_world_camera)
 
 
 def _pov_pose(path: Path) -> NDArray[np.float64]:

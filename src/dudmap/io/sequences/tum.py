@@ -1,6 +1,7 @@
 """Folders with lists of stamped images: the TUM RGB-D benchmark (Sturm et al. 2012) and data sets of a like layout."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from dudmap.core.geometry.association import TimedFile, associate, read_list, re
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
+from dudmap.input_files import read_text
 from dudmap.io.sequences import images, intrinsics
 from dudmap.io.sequences.archive import origin, unpack
 from dudmap.io.sequences.camera_files import read_yaml
@@ -101,11 +103,10 @@ def _bag_name(path: Path) -> str:
     """Name of the bag that the header of a list of images tells; empty if it tells none."""
     if not path.is_file():
         return ""
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            found = re.match(r"#\s*file:\s*'(.*)'", line)
-            if found or not line.startswith("#"):
-                return found.group(1) if found else ""
+    for line in read_text(path).splitlines():
+        found = re.match(r"#\s*file:\s*'(.*)'", line)
+        if found or not line.startswith("#"):
+            return found.group(1) if found else ""
     return ""
 
 
@@ -143,7 +144,7 @@ class BonnSequence(TumSequence):
             return None
         T_marker_camera = T_MARKER_CAMERA.copy()
         T_marker_camera[:3, :3] = se3.nearest_rotation(T_MARKER_CAMERA[:3, :3])
-        return Trajectory(truth.timestamps, T_ROS @ truth.Ts_world_camera @ T_ROS @ T_marker_camera)
+        return replace(truth, Ts_world_camera=T_ROS @ truth.Ts_world_camera @ T_ROS @ T_marker_camera)
 
 
 class CorbsSequence(TumSequence):
@@ -163,7 +164,7 @@ class CorbsSequence(TumSequence):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         def slashed(file: TimedFile) -> TimedFile:
-            return TimedFile(file[0], Path(str(file[1]).replace("\\", "/")))
+            return file._replace(path=Path(str(file.path).replace("\\", "/")))
 
         return [(slashed(depth), slashed(color)) for depth, color in super()._find_pairs()]
 
@@ -179,7 +180,7 @@ class CorbsSequence(TumSequence):
                 file = unpack(file.with_name(file.name + ".zip"))
             found = sorted(file.rglob("groundtruth.txt")) if file.is_dir() else []
             if found:
-                return Trajectory.load(found[0])
+                return Trajectory.load(found[0], optional=True)
         return None
 
 
@@ -213,7 +214,7 @@ class OpenLorisSequence(ImageFolder):
         truth, path = self._stamped_poses(), self.path / "trans_matrix.yaml"
         if truth is None or not path.is_file():
             return truth
-        return Trajectory(truth.timestamps, truth.Ts_world_camera @ _motion(path, BODY_FRAME, CAMERA_FRAME))
+        return replace(truth, Ts_world_camera=truth.Ts_world_camera @ _motion(path, BODY_FRAME, CAMERA_FRAME))
 
 
 def _matrix(node: Any, key: str) -> NDArray[np.float64] | None:  # noqa: ANN401 - a value of a YAML file

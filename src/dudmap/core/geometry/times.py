@@ -1,0 +1,44 @@
+"""Units of time stamps: exports of ROS and of cameras give nanoseconds, microseconds or milliseconds."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+CENTURY = (1e9, 4.1e9)
+"""Seconds since 1970 of the years 2001 to 2099."""
+LONGEST_STEP = 1000.0
+"""Largest plausible median time between two rows, seconds."""
+SLOWEST_COUNT = 10.0
+"""Median step, up to which stamps are seconds or count frames: as milliseconds they would be 100 images a second, more
+than depth cameras deliver at full size."""
+
+
+class TimeUnit(NamedTuple):
+    """Unit of time stamps: its name, and how many make a second."""
+
+    name: str
+    per_second: float
+
+
+SECONDS = TimeUnit("seconds", 1.0)
+UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), TimeUnit("nanoseconds", 1e9))
+
+
+def time_unit(stamps: ArrayLike) -> TimeUnit:
+    """Unit of time stamps (N,), in any order.
+
+    Stamps that all lie in this century as one of the units are in that unit. Others are told apart by the median step:
+    at 1 to 1000 images a second, it is below 1 in seconds and between 1, 10^3, 10^6 and 10^9 in the other units.
+    """
+    values = np.sort(np.asarray(stamps, dtype=np.float64))
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if len(steps) else 0.0
+    for unit in UNITS if len(values) else ():
+        low, high = (bound * unit.per_second for bound in CENTURY)
+        if low <= values[0] and values[-1] < high and step <= LONGEST_STEP * unit.per_second:
+            return unit
+    if step <= SLOWEST_COUNT:
+        return SECONDS
+    return next((unit for unit in UNITS[1:] if step <= unit.per_second), UNITS[-1])
