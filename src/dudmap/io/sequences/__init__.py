@@ -273,6 +273,8 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
     if all((path / name).is_file() for name in ("metrics.json", "trajectory.txt")):
         raise DatasetError(f"{path} is the result of a run; expected a recording (dudmap view shows results)")
     found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
+    if not found and path.is_dir():
+        found = [(place, readers()[NUMBERED]) for place in _paired_by_content(path, DEPTH_OF_SEARCH)]
     if len(found) > 1:
         names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
         more = f" and {len(found) - 10} more" if len(found) > 10 else ""
@@ -299,34 +301,26 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
     return found
 
 
+def _paired_by_content(path: Path, levels: int) -> list[Path]:
+    """A folder whose images pair by their content where names say nothing, else such folders below it."""
+    from dudmap.io.sequences.image_series import by_content
+
+    if by_content(path):
+        return [path]
+    below = [place for place in sorted(path.iterdir()) if place.is_dir()] if levels > 0 else []
+    return [found for place in below for found in _paired_by_content(place, levels - 1)]
+
+
 def _unknown(path: Path) -> str:
     """Sentence on a folder or file that no reader recognises."""
+    from dudmap.io.sequences.image_series import unknown as images_in
+
     listed = [name for name in ("rgb.txt", "depth.txt") if (path / name).is_file()]
     if listed:
         other = "depth.txt" if listed == ["rgb.txt"] else "rgb.txt"
         return f"{path} is not a recording in TUM layout: {other} not found (an associations.txt would do instead)"
-    formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
-    if path.is_dir() and (images := _images_in(path)):
+    if path.is_dir() and (images := images_in(path)):
         return images
+    formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
     kind = "folder" if path.is_dir() else "file"
     return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"
-
-
-def _images_in(path: Path) -> str:
-    """Sentence on a folder with images in it, in a layout that is not known; empty if there are none."""
-    from dudmap.io.sequences.camera_files import IMAGES, seen
-    from dudmap.io.sequences.numbered import kinds_of_images
-
-    places = [place for place in (path, *sorted(path.iterdir())) if place.is_dir()]
-    places = [place for place in places if any(file.suffix.lower() in IMAGES for file in place.iterdir())]
-    if not places:
-        return ""
-    kinds = kinds_of_images(path)
-    known = [f"{len(files)} {kind} images in {files[0].parent.name}/" for kind, files in kinds.items() if files]
-    missing = " and ".join(kind for kind, files in kinds.items() if not files)
-    there = "; ".join(f"{'.' if place == path else place.name}/ with {seen(place)}" for place in places[:5])
-    return (
-        f"{path} holds images in no known layout: recognised {' and '.join(known) or 'nothing'} by the names, missing "
-        f"numbered {missing} images; there are {there}; name the files with --color PATTERN and --depth PATTERN, such "
-        "as --depth 'FOLDER/*.png'"
-    )

@@ -33,7 +33,7 @@ LARGEST_SETTINGS = 1 << 16
 """Characters in which they are looked for."""
 LARGEST_LIST = 10
 """Kinds of files that a message lists."""
-IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr")
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".webp")
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
     "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"),

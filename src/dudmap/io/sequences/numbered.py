@@ -15,27 +15,21 @@ from dudmap.core.geometry.times import time_unit
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, read_json, read_text
-from dudmap.io.sequences import camera_files, intrinsics
-from dudmap.io.sequences.camera_files import IMAGES
+from dudmap.io.sequences import image_series, intrinsics
 from dudmap.io.sequences.image_folder import ImageFolder, read_matrices, rigid_trajectory
+from dudmap.io.sequences.image_numbers import are_times, keys, last_number
 
-DEPTH_WORDS = ("depth",)
-COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img", "mono")
-NEITHER_WORDS = ("confidence", "right", "mask", "normal", "vis", "infra", "ir")
-"""Words of files and folders that hold other images than depth and colour."""
 POSES = ("poses.txt", "pose.txt", "poses", "pose")
 """Files and folders of true poses."""
-LARGEST_NUMBER = 10**8
-"""From here on a number in a file name is a time, not the number of a frame: 38 days at 30 frames a second."""
 
 
 class NumberedSequence(ImageFolder):
     """Folder of numbered images, in two folders (``color/000001.png``, ``depth/000001.png``) or in one.
 
-    Which images are depth and colour is told by words in the names of files and folders, or by two patterns. Equal
-    numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms. Depth: 16 bit, or float metres.
-    The truth is groundtruth.txt, or matrices camera to world: poses.txt with one per frame, or files with
-    the numbers of the images in a folder ``pose`` or ``poses``.
+    Words in the names of files and folders, the content, or two patterns tell which images are depth and colour
+    (``image_series``). Equal numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms.
+    Depth: 16 bit, or float metres. The truth is groundtruth.txt, or matrices camera to world: poses.txt with one per
+    frame, or files with the numbers of the images in a folder ``pose`` or ``poses``.
 
     Args:
         path: The folder.
@@ -58,18 +52,17 @@ class NumberedSequence(ImageFolder):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a folder holds depth and colour images by the words of their names."""
-        return path.is_dir() and all(kinds_of_images(path).values())
+        return path.is_dir() and all(image_series.by_names(path).values())
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        kinds = kinds_of_images(self.path)
-        for kind, pattern in self._patterns.items():
-            if pattern is not None:
-                kinds[kind] = [file for file in sorted(self.path.glob(pattern)) if _is_numbered_image(file)]
-            if not kinds[kind]:
-                what = f"matches --{kind} {pattern}" if pattern else f"is {kind} by its name; give --{kind} PATTERN"
-                raise DatasetError(f"no numbered image in {self.path} {what}; there are {camera_files.seen(self.path)}")
-        colors, depths = ({_number(file): file for file in kinds[kind]} for kind in ("color", "depth"))
-        if max(map(abs, colors)) < LARGEST_NUMBER and all(float(n).is_integer() for n in (*colors, *depths)):
+        found = image_series.find(self.path, self._patterns)
+        color, depth = found["color"], found["depth"]
+        if color is None or depth is None:
+            raise DatasetError(image_series.unknown(self.path))
+        numbers = keys(color.files, depth.files)
+        self._numbers = dict(zip((*color.files, *depth.files), (*numbers[0], *numbers[1]), strict=True))
+        colors, depths = (dict(zip(n, one.files, strict=True)) for n, one in zip(numbers, (color, depth), strict=True))
+        if not are_times(numbers):
             return self._pair_numbered({int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()})
         return self._pair_timed(_timed(colors), _timed(depths))
 
@@ -85,8 +78,8 @@ class NumberedSequence(ImageFolder):
             place = self.path / name
             if place.is_file():
                 return rigid_trajectory(zip(self.timestamps.tolist(), self._matrices(place), strict=True))
-            files = {_number(file): file for file in place.glob("*.txt") if re.search(r"\d", file.stem)}
-            stamps = {_number(depth.path): depth.timestamp for _, depth in self._pairs}
+            files = {last_number(file): file for file in place.glob("*.txt") if re.search(r"\d", file.stem)}
+            stamps = {self._numbers[depth.path]: depth.timestamp for _, depth in self._pairs}
             if files:
                 known = sorted(files.keys() & stamps.keys())
                 return rigid_trajectory((stamps[number], read_matrices(files[number])[0]) for number in known)
@@ -101,47 +94,6 @@ class NumberedSequence(ImageFolder):
                 f"are {len(self)} frames; expected one pose per frame: complete the file, or move it away"
             )
         return poses
-
-
-def kinds_of_images(path: Path) -> dict[str, list[Path]]:
-    """Numbered colour and depth images of a folder, or of one folder of each kind in it."""
-    found = _sorted_out(path)
-    if not all(found.values()):
-        for kind, words in (("color", COLOR_WORDS), ("depth", DEPTH_WORDS)):
-            folders = [p for p in sorted(path.iterdir()) if p.is_dir() and _kind_of(p.name) == kind]
-            folders.sort(key=lambda p: [word in p.name.lower() for word in words], reverse=True)
-            numbered = ([f for f in sorted(folder.iterdir()) if _is_numbered_image(f)] for folder in folders)
-            found[kind] = next((files for files in numbered if files), [])
-    return found
-
-
-def _sorted_out(path: Path) -> dict[str, list[Path]]:
-    """Colour and depth images among the files of one folder; ``0001.jpg`` is the colour of ``0001_depth.png``."""
-    files = [file for file in sorted(path.iterdir()) if _is_numbered_image(file)]
-    found = {kind: [file for file in files if _kind_of(file.stem) == kind] for kind in ("color", "depth")}
-    if not found["color"]:
-        alike = {re.sub(r"[\W_]*depth[\W_]*", "", file.stem, flags=re.IGNORECASE) for file in found["depth"]}
-        found["color"] = [file for file in files if file.stem in alike]
-    return found
-
-
-def _kind_of(name: str) -> str | None:
-    words = re.findall("[a-z]+", name.lower())
-    text = " ".join(words)
-    if any(word in NEITHER_WORDS or word.startswith(("confid", "mask")) for word in words):
-        return None
-    if any(word in text for word in DEPTH_WORDS):
-        return "depth"
-    return "color" if any(word in text for word in COLOR_WORDS) else None
-
-
-def _is_numbered_image(file: Path) -> bool:
-    return file.suffix.lower() in IMAGES and re.search(r"\d", file.stem) is not None
-
-
-def _number(file: Path) -> float:
-    """Last number in a file's name; a decimal one counts as a whole."""
-    return float(re.findall(r"\d+(?:\.\d+)?", file.stem)[-1])
 
 
 def _timed(files: dict[float, Path]) -> list[TimedFile]:

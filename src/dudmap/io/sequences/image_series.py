@@ -1,0 +1,242 @@
+"""Which numbered images of a folder are colour and which are depth, by names and by content.
+
+A series are the images of one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in the names
+of files and folders decide first. Where they say nothing, or the opposite of the content, the content decides: one
+channel of 16 bits or floats is depth, 8-bit colours are colour.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from dudmap.errors import DatasetError
+from dudmap.io.sequences.camera_files import IMAGES
+from dudmap.io.sequences.image_headers import kind_of
+from dudmap.io.sequences.image_numbers import NUMBER, count_pairs, last_number
+
+WORDS = {"color": ("color", "colour", "rgb", "left", "image", "img", "mono"), "depth": ("depth",)}
+"""Words of files and folders of either kind, the surest first."""
+NEITHER = {"right", "vis", "ir", "seg", "flow"}
+NEITHER_STARTS = "confid", "mask", "normal", "label", "instance", "semantic", "segment", "dispar", "infra", "thermal"
+"""Words, and beginnings of words, of other images than depth and colour."""
+CONTENTS = {
+    "depth": "one channel of 16 bits or floats", "color": "8-bit colours", "gray": "8-bit intensities",
+    "other": "palettes or other values", "": "content that differs or cannot be read",
+}  # fmt: skip
+PROBED = 3
+"""Images of a series whose headers are read."""
+LEAST_SHARE = 0.5
+"""Share of the shorter of two series that must have a partner where names do not tell that both belong together."""
+LARGEST_LIST = 5
+"""Series that a message names."""
+Found = dict[str, "Series | None"]
+"""The series of either kind, None if there is none."""
+
+
+@dataclass
+class Series:
+    """Images of one folder whose names differ by numbers alone.
+
+    Attributes:
+        label: Name of the folder and of the files, with N for every number.
+        files: The images by name.
+        kind: ``depth``, ``color``, ``neither``, or empty, by names, and by content where names contradict each other.
+    """
+
+    label: str
+    files: list[Path]
+    kind: str = ""
+
+    @cached_property
+    def content(self) -> str:
+        """Kind of the values (``image_headers.content``); empty where the sampled images differ or none is read."""
+        sampled = {self.files[k] for k in np.linspace(0, len(self.files) - 1, PROBED).astype(int)}
+        kinds = {kind for file in sampled if (kind := kind_of(file))}
+        return kinds.pop() if len(kinds) == 1 else ""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the content may be of the kind that names say."""
+        return self.content not in {"depth": ("color", "gray", "other"), "color": ("depth",)}.get(self.kind, ())
+
+    def may_be(self, kind: str) -> bool:
+        """Whether the images are of a kind by their content; colours that are called depth are pictures of it."""
+        if self.kind == "neither" or (kind, self.kind) == ("color", "depth"):
+            return False
+        return self.content == kind or (kind == self.kind == "color" and self.content == "gray")
+
+    def rank(self, kind: str) -> tuple[bool, list[bool]]:
+        """Sorts the series that may be of a kind, those with the surest names first."""
+        return self.kind != kind, [word not in self.label.lower() for word in WORDS[kind]]
+
+    def __str__(self) -> str:
+        return f"{self.label} ({len(self.files)} with {CONTENTS[self.content]})"
+
+
+def is_numbered_image(name: str) -> bool:
+    """Whether a file is a numbered image by its name."""
+    stem, suffix = os.path.splitext(name)
+    return suffix.lower() in IMAGES and not name.startswith(".") and re.search(r"\d", stem) is not None
+
+
+def kind_by_name(name: str) -> str:
+    """``depth``, ``color``, ``neither``, or empty, by the words of a name."""
+    words = re.findall("[a-z]+", name.lower())
+    if any(word in NEITHER or word.startswith(NEITHER_STARTS) for word in words):
+        return "neither"
+    text = " ".join(words)
+    return next((kind for kind in ("depth", "color") if any(word in text for word in WORDS[kind])), "")
+
+
+def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
+    """Colour and depth images of a folder: by the given patterns, else by names, else by content.
+
+    Raises:
+        DatasetError: A pattern matches no numbered image, or several series may be meant.
+    """
+    given = {kind: _matching(path, kind, pattern) for kind, pattern in (patterns or {}).items() if pattern}
+    found = by_names(path) | given
+    if len(given) == len(WORDS) or all(one is not None and one.fits for one in found.values()):
+        return found
+    return by_content(path, given) or found
+
+
+def by_names(path: Path) -> Found:
+    """Colour and depth images by words: in a folder, else in one folder of each kind in it."""
+    own = _series_in(path)
+    found = {kind: _surest(own, kind) for kind in WORDS}
+    if (depth := found["depth"]) and not found["color"]:  # 0001.jpg is the colour of 0001_depth.png
+        stems = {re.sub(r"[\W_]*depth[\W_]*", "", file.stem, flags=re.IGNORECASE) for file in depth.files}
+        alike = [file for one in own for file in one.files if file.stem in stems]
+        found["color"] = Series("N", alike, "color") if alike else None
+    if all(found.values()):
+        return found
+    named = [series for name, series in _folders(path) if kind_by_name(name) in WORDS and not _is_recording(series)]
+    return {kind: _surest([one for series in named for one in series], kind) for kind in WORDS}
+
+
+def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
+    """Colour and depth images that pair, by content where names say nothing; empty if there are none.
+
+    Images of both kinds in one folder of the folder are a recording of their own.
+
+    Raises:
+        DatasetError: Several series may be meant.
+    """
+    own, folders = _series_in(path), [series for _, series in _folders(path)]
+    found = _best(path, own, given or {})
+    if found or (not given and any(_is_recording(series) for series in folders)):
+        return found
+    return _best(path, [*own, *(one for series in folders for one in series)], given or {})
+
+
+def unknown(path: Path) -> str:
+    """Sentence on a folder whose images are not known to be depth and colour; empty if there are none."""
+    there = _there(path)
+    return there and (
+        f"{path} holds images in no known layout: {there}; expected colour images of 8 bit and depth images of 16 bit "
+        "or floats with equal numbers: name the files with --color PATTERN and --depth PATTERN, such as --depth "
+        "'FOLDER/*.png'"
+    )
+
+
+def listed(series: list[Series]) -> str:
+    """Some series for a message, the longest first."""
+    texts = [str(one) for one in sorted(series, key=lambda one: -len(one.files))]
+    return ", ".join(texts[:LARGEST_LIST]) + (f" and {len(texts) - LARGEST_LIST} more" * (len(texts) > LARGEST_LIST))
+
+
+def _series_in(folder: Path, name: str = "") -> list[Series]:
+    """Series of numbered images directly in a folder; ``name`` are the folders that lead to it."""
+    found: dict[str, list[Path]] = {}
+    for file in sorted(os.listdir(folder)):
+        if is_numbered_image(file):
+            stem, suffix = os.path.splitext(file)
+            found.setdefault(re.sub(NUMBER, "N", stem) + suffix, []).append(folder / file)
+    word, series = kind_by_name(name), [Series(name + pattern, files) for pattern, files in found.items()]
+    for pattern, one in zip(found, series, strict=True):
+        kinds = {kind_by_name(os.path.splitext(pattern)[0]), word} - {""}
+        if kinds == set(WORDS):
+            kinds = {{"depth": "depth", "color": "color", "gray": "color"}.get(one.content, word)}
+        one.kind = "neither" if "neither" in kinds else next(iter(kinds), "")
+    return series
+
+
+def _folders(path: Path) -> list[tuple[str, list[Series]]]:
+    """Names of the folders in a folder, and the series in each, or in its only folder."""
+    found = []
+    for name in _folder_names(path):
+        series, below = _series_in(path / name, f"{name}/"), _folder_names(path / name)
+        if not series and len(below) == 1:
+            series = _series_in(path / name / below[0], f"{name}/{below[0]}/")
+        found.append((name, series))
+    return found
+
+
+def _folder_names(path: Path) -> list[str]:
+    with os.scandir(path) as entries:
+        return sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
+
+
+def _matching(path: Path, kind: str, pattern: str) -> Series:
+    """Numbered images of a pattern."""
+    files = [file for file in sorted(path.glob(pattern)) if is_numbered_image(file.name)]
+    if not files:
+        raise DatasetError(
+            f"no numbered image in {path} matches --{kind} {pattern}; there are {_there(path) or 'none at all'}"
+        )
+    return Series(pattern, files, kind)
+
+
+def _there(path: Path) -> str:
+    """Numbered images in a folder and its folders, for messages; empty if there are none."""
+    return listed([*_series_in(path), *(one for _, below in _folders(path) for one in below)])
+
+
+def _surest(series: list[Series], kind: str) -> Series | None:
+    """The surest series of a kind, with the others of its folder and kind that have other numbers."""
+    known = [one for one in series if one.kind == kind]
+    known.sort(key=lambda one: (not one.fits, one.rank(kind)[1], one.files[0].parent, -len(one.files)))
+    if not known:
+        return None
+    files, taken = list(known[0].files), {last_number(file) for file in known[0].files}
+    for one in known[1:]:
+        numbers = {last_number(file) for file in one.files}
+        if one.files[0].parent == files[0].parent and one.fits == known[0].fits and not taken & numbers:
+            files, taken = [*files, *one.files], taken | numbers
+    return Series(known[0].label, sorted(files), kind)
+
+
+def _is_recording(series: list[Series]) -> bool:
+    """Whether series of one folder hold both kinds."""
+    return all(any(one.may_be(kind) for one in series) for kind in WORDS)
+
+
+def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
+    """The pair of series of both kinds with the surest names that has the most pairs of images; empty if there is none.
+
+    Raises:
+        DatasetError: Several are alike in both.
+    """
+    candidates = ([given[kind]] if kind in given else [one for one in series if one.may_be(kind)] for kind in WORDS)
+    found: list[tuple[tuple, dict[str, Series]]] = []
+    for color, depth in product(*candidates):
+        count = count_pairs(color.files, depth.files)
+        if count >= max(1, LEAST_SHARE * min(len(color.files), len(depth.files))):
+            found.append(((color.rank("color"), depth.rank("depth"), -count), {"color": color, "depth": depth}))
+    best = min((rank for rank, _ in found), default=None)
+    alike = [pair for rank, pair in found if rank == best]
+    for kind in WORDS:
+        meant = {id(pair[kind]): pair[kind] for pair in alike}
+        if len(meant) > 1:
+            raise DatasetError(
+                f"{path} holds {len(meant)} sets of images that may be the {kind} images: "
+                f"{listed(list(meant.values()))}; name them with --{kind} PATTERN"
+            )
+    return {**alike[0]} if alike else {}
