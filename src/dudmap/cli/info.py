@@ -64,7 +64,14 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
     color = found.color_rate
     rates = [] if found.rate is None else [f"{found.rate:.4g} Hz depth"] + ([f"{color:.4g} Hz colour"] if color else [])
     registered = found.T_color_depth is None
-    color_camera = "assumed to be registered to depth" if registered else _camera(found.color_camera)
+    untested = "; not tested (dudmap calibrate does)" if found.has_color else ""
+    color_camera = (
+        "none"
+        if not found.has_color
+        else "assumed to be registered to depth"
+        if registered
+        else _camera(found.color_camera)
+    )
     shift = None if registered else [1000 * row[3] for row in found.T_color_depth or []]
     return [
         ("recording", found.name),
@@ -72,7 +79,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         ("frames", f"{found.frames} in {found.duration:.2f} s" + (f", {', '.join(rates)}" if rates else "")),
         ("distinct images", _distinct(found)),
         ("depth camera", _camera(found.camera)),
-        ("colour camera", f"{color_camera}; not tested (dudmap calibrate does)"),
+        ("colour camera", color_camera + untested),
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
         *((f"{what} from", source) for what, source in found.sources.items()),
         ("depth", _depth(found)),
@@ -85,6 +92,8 @@ def _distinct(found: "Inspection") -> str:
     depth, color = found.distinct_rate("depth"), found.distinct_rate("color")
     if depth is None or color is None:
         return "not known"
+    if not found.has_color:
+        return f"about {depth:.4g} Hz depth"
     what = {"frame": "both images", "depth": "depth alone", "color": "colour alone"}
     said = [f"{share:.0%} of the frames repeat {what[kind]}" for kind, share in found.repeats.items() if share]
     return f"about {depth:.4g} Hz depth, {color:.4g} Hz colour" + (f"; {', '.join(said)}" if said else "")

@@ -240,7 +240,7 @@ class Mapper:
         """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
-        if self._config.relocalization.enabled and not (view.blind or self._localize):
+        if self._config.relocalization.enabled and not (view.without_image or self._localize):
             with view.timer("keyframe"):
                 atlas, T_world_camera = self._atlas, estimate.T_world_camera
                 atlas.keyframes.add(view.colored(), T_world_camera, dynamic_mask, atlas.current)
@@ -280,7 +280,7 @@ class Mapper:
         after = before[0] @ se3.inverse(Ts[0]) @ np.stack(Ts)  # the first camera is the world
         volume.clear()
         for fused, T in zip(window, after, strict=True):
-            frame = replace(fused.frame, color=exposed_color(fused.frame.color, fused.exposure))
+            frame = replace(fused.frame, color=exposed_color(fused.frame.rgb, fused.exposure))
             volume.integrate(frame, T, self._static(fused.dynamic_mask, frame.depth), WINDOW_STEP)
         stamps = np.array([fused.frame.timestamp for fused in window])
         corrections = after @ se3.inverse(before)

@@ -52,7 +52,9 @@ class FrameResult:
         find_movers: Finds the moving objects; None where there are none to be found.
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
-        blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
+        blind: Whether the image was textureless, or missing in a map with colours: its pose rests on the distances
+            alone, and it is not fused.
+        colorless: Whether the frame has no colour image: its pose rests on the distances alone.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Reason why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
         unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
@@ -80,6 +82,7 @@ class FrameResult:
     submap: int = 0
     corrected: bool = False
     blind: bool = False
+    colorless: bool = False
     uncertain: str = ""
     calibrated: bool = False
     rejected: str = ""

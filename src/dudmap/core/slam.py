@@ -165,14 +165,17 @@ class Slam(SlamResults, Stateful):
             dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
                 from the first registration on.
             arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
-                per metre (1000 unless set: millimetres), 0 = no reading; ``rgb`` (H, W, 3) uint8; ``timestamp`` in s.
+                per metre (1000 unless set: millimetres), 0 = no reading; ``timestamp`` in s; ``rgb`` (H, W, 3) uint8,
+                if there is colour. They may be changed afterwards.
 
         Raises:
-            ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
+            ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
             FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
-        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
-            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (
+            frame is not None and arrays
+        ):
+            raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
         view = self.prepare(frame or Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale), dynamic_mask)
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
@@ -184,7 +187,7 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.predicted(self._rectified(view))
         if self.reference.is_empty:
             return self._start_map(view)
-        blind = view.textureless or self.stream.repeats == "color"  # the colours of the frame say nothing
+        blind = view.textureless or self.stream.repeats == "color"  # the colours of the frame say nothing, or are none
         view = replace(view, blind=blind and not self.bootstrap.textureless)
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
@@ -340,7 +343,7 @@ class Slam(SlamResults, Stateful):
     ) -> tuple[NDArray[np.float64], bool]:
         """Pose of the frame after a loop closure, and whether there was one."""
         T_world_camera = estimate.T_world_camera
-        if self.atlas.history is None or view.blind:
+        if self.atlas.history is None or view.without_image:
             return T_world_camera, False
         with view.timer("loops"):
             levels, unverified = view.pyramid.tracked, estimate.unverified_mask
@@ -386,6 +389,7 @@ class Slam(SlamResults, Stateful):
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=tracking, timings=view.timer.timings, submap=self.atlas.current, blind=view.blind,
+            colorless=not view.observation.has_color,
             unobservable=np.empty((0, 6)) if tracking is None else tracking.unobservable, repeats=self.stream.repeats,
             **details,
         )  # fmt: skip

@@ -28,7 +28,7 @@ from dudmap.core.frames.observation import HALVING_BAND
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.io.sequences import is_timed
+from dudmap.io.sequences import has_color, is_timed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -138,6 +138,8 @@ def calibrate_start(
     sentences on what is done and found, ``progress`` the numbers of frames tracked and of all.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
+    if not has_color(sequence):
+        return None
     if config.preset == "thesis":
         notice(f"colour camera: {ASSUMED}: preset thesis takes the images as they are")
         return None
@@ -248,7 +250,7 @@ class _Excerpt:
 
     def __getitem__(self, index: int) -> Frame:
         frame = self._sequence[self._numbers[index]]
-        depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.color
+        depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.rgb
         for _ in range(self._halvings):
             depth, _ = halve(depth, np.zeros_like(depth), HALVING_BAND)
             height, width = (size // 2 for size in color.shape[:2])

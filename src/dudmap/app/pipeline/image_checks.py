@@ -11,6 +11,7 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.tracking.frame_view import TEXTURELESS
 from dudmap.errors import FrameError
+from dudmap.io.sequences import has_color
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -101,7 +102,7 @@ def focal_error(sequence: "Sequence") -> float | None:
 def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points (N, 3) of two frames with the same appearance that fit one affine motion, each in its camera."""
     sift, points = SiftExtractor(POINTS), []
-    seen = [sift.extract(reduced_grey(frame.color, frame.color.shape[1] // 2)) for frame in frames]
+    seen = [sift.extract(reduced_grey(frame.rgb, frame.rgb.shape[1] // 2)) for frame in frames]
     pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0, mutual=True)
     for frame, features, rows in zip(frames, seen, pairs.T, strict=True):
         u, v = 2 * features.pixels[rows].T + 0.5
@@ -120,9 +121,10 @@ def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float6
 
 def image_warnings(frames: "list[Frame]") -> list[str]:
     """Sentences on what looks wrong in some frames spread over a recording; none for fewer than four frames."""
+    frames = [frame for frame in frames if frame.color is not None]
     if len(frames) < FEWEST:
         return []
-    grays = [_gray(frame.color) for frame in frames]
+    grays = [_gray(frame.rgb) for frame in frames]
     if all(gray.std() < TEXTURELESS for gray in grays):
         plane = "" if _planes(frames) is None else ", which show one plane and not how the camera moves along it"
         what = "the colour images have no texture (black or of one colour)"
@@ -141,7 +143,7 @@ def _turn_warnings(frames: "list[Frame]") -> list[str]:
     """Whether the edges of depth lie on those of colour only after one of the images is turned."""
     gains = []
     for frame in frames:
-        if frame.depth.shape == frame.color.shape[:2]:
+        if frame.depth.shape == frame.rgb.shape[:2]:
             edges, steps = _edges(frame)
             given = _correlation(steps, edges)
             gains.append([_correlation(steps[::rows, ::columns], edges) - given for rows, columns in TURNED.values()])
@@ -164,6 +166,8 @@ def color_magnification(sequence: "Sequence") -> float | None:
     given = sequence.calibration or Calibration.registered(sequence.camera)
     agreement: dict[int, NDArray[np.float32]] = {}
     found = None
+    if not has_color(sequence):
+        return None
     for count in LOOKS:
         for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)).tolist():
             try:
@@ -229,7 +233,7 @@ def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray
 
 def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Images (h, WIDTH) of the edges of the colours and of the depth of a frame."""
-    gray, (height, width) = _gray(frame.color), frame.depth.shape
+    gray, (height, width) = _gray(frame.rgb), frame.depth.shape
     gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     edges = np.minimum(gradient / (gradient.mean() + np.float32(1e-5)), np.float32(STEEPEST))
     return edges.astype(np.float32), _depth_edges(frame.depth, (round(WIDTH * height / width), WIDTH))

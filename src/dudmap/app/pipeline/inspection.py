@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
+from dudmap.io.sequences import has_color
 from dudmap.io.sequences.intrinsics import BY_NAME
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.io.sequences import Sequence
 
+DEPTH_ALONE = "there are no colour images: the camera is tracked by distances alone, and the mesh has no colours"
 SAMPLES = 12
 """Number of evenly spread frames that are read."""
 NEAR, FAR = 0.1, 8.0
@@ -61,6 +63,7 @@ class Inspection:
         frames: Number of frames.
         duration: From the first to the last depth image, seconds.
         rate: Depth images per second (of the median time between two).
+        has_color: Whether there are colour images.
         color_rate: The same for the colour images; None where their times are not known.
         gaps: (time of the last frame before it, length) of every gap, seconds.
         camera, color_camera: Intrinsics of the depth and of the colour camera; the same where they are registered.
@@ -91,6 +94,7 @@ class Inspection:
     median_depth: float | None
     valid_depth: float
     ground_truth: int
+    has_color: bool = True
     unreadable: list[str] = field(default_factory=list)
     repeats: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -148,7 +152,8 @@ def inspect(
     readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
     pixels = sum(frame.depth.size for _, frame in frames)
     camera, calibration = sequence.camera, sequence.calibration
-    colors = getattr(sequence, "color_timestamps", None)
+    colored = (has_color(sequence) and any(frame.color is not None for _, frame in frames)) or not frames
+    colors = getattr(sequence, "color_timestamps", None) if colored else None
     truth = sequence.ground_truth
     found = Inspection(
         name=sequence.name,
@@ -166,10 +171,12 @@ def inspect(
         median_depth=float(np.median(readings)) if len(readings) else None,
         valid_depth=len(readings) / pixels if pixels else 0.0,
         ground_truth=0 if truth is None else len(truth),
+        has_color=colored,
         unreadable=list(unreadable or []),
     )
     found.warnings = [
         *_focal_warnings(sequence, found.sources),
+        *([] if colored else [DEPTH_ALONE]),
         *_depth_warnings(found, readings, "depth_unit" in getattr(sequence, "options", ("depth_unit",))),
         *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),

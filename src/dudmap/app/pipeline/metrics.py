@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dudmap.core.objects.object_tracker import Mover
     from dudmap.errors import FrameError
 
-COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "uncertain")
+COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
 """What ``FrameResult`` says of a frame, of which the number of frames is counted."""
 
 

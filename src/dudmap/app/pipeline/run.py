@@ -21,7 +21,7 @@ from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, D
 from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
-from dudmap.io.sequences import is_timed
+from dudmap.io.sequences import has_color, is_timed
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
@@ -158,7 +158,7 @@ def run(
         if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
                 calibration = calibrate_start(sequence, config, count, notice, counting)
-        elif calibration is None and not live:
+        elif calibration is None and not live and has_color(sequence):
             notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
         slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)

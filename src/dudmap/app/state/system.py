@@ -61,7 +61,7 @@ def images_fingerprint(frame: "Frame | Exception") -> str:
     if isinstance(frame, Exception):
         return hashlib.sha256(str(frame).encode()).hexdigest()
     digest = hashlib.sha256(repr((frame.timestamp, frame.color_timestamp)).encode())
-    for image in (frame.depth, frame.color):
+    for image in (frame.depth, frame.rgb):
         digest.update(np.ascontiguousarray(image).tobytes())
     return digest.hexdigest()
 

@@ -291,6 +291,7 @@ def _losses(metrics: dict[str, Any]) -> Html:
     notes = [
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
         (metrics.get("blind"), "images without contrast were tracked by distances alone and are not in the map"),
+        (metrics.get("colorless"), "frames without colour were tracked by distances alone"),
         (metrics.get("uncertain"), "frames with uncertain poses or labels are not in the map"),
         (metrics.get("degenerate"), "of them do not show all directions of motion"),
         (metrics.get("dropped"), "frames arrived too fast and were dropped"),

@@ -101,7 +101,7 @@ class FrameImages:
     @classmethod
     def of(cls, frame: "Frame", result: "FrameResult", width: int = WIDTH) -> "FrameImages":
         """Every n-th pixel of the images of a frame, at most ``width`` columns of them."""
-        parts = (frame.color, frame.depth, result.dynamic_mask, result.residuals)
+        parts = (frame.rgb, frame.depth, result.dynamic_mask, result.residuals)
         return cls(*(_reduced(part, width) for part in parts))
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
@@ -178,7 +178,7 @@ def save_sheet(
         DudmapError: The file cannot be written.
     """
     far, title = _far([frame]), "dynamic mask: estimated (red)"
-    overlay = mask_overlay(frame.color, dynamic_mask)
+    overlay = mask_overlay(frame.rgb, dynamic_mask)
     if true_mask is not None and true_mask.any():
         outline, _ = cv2.findContours(true_mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(overlay, outline, -1, (0, 255, 0), 1)
@@ -186,7 +186,7 @@ def save_sheet(
     brightness = 0.25 + 0.7 * np.clip(view.normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)
     known, limit = view.depth[..., None] > 0, f"{100 * RESIDUAL_RANGE:.0f} cm"
     pictures = [
-        ("colour", frame.color),
+        ("colour", frame.rgb),
         (f"depth, blue 0 to red {far:.1f} m", depth_colors(frame.depth, far)),
         (title, overlay),
         (f"residuals, blue -{limit} to red {limit}", residual_colors(residuals)),
@@ -207,7 +207,7 @@ def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
     columns, far, rows = min(6, len(frames)), _far([frame for _, frame in frames]), []
     for start in range(0, len(frames), columns):
         part = frames[start : start + columns]
-        rows.append(_row(((f"{n}: {frame.timestamp:.2f} s", frame.color) for n, frame in part), 240, columns))
+        rows.append(_row(((f"{n}: {frame.timestamp:.2f} s", frame.rgb) for n, frame in part), 240, columns))
         label = f"blue 0 to red {far:.1f} m"
         rows.append(_row(((label, depth_colors(frame.depth, far)) for _, frame in part), 240, columns))
     _save(path, np.vstack(rows))

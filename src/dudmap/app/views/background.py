@@ -84,8 +84,8 @@ class BackgroundRenderer:
         if self.other is not None:
             seen = self.other.depth(frame.depth, se3.inverse(T_world_color) @ T_world_camera)
         static = ~moving & (np.abs(seen - depth) < TOLERANCE * depth)
-        gain = exposure_gain(frame.color, color, static)
-        self.sources.append(Source(frame.color, np.where(static, depth, 0).astype(np.float32), T_world_color, gain))
+        gain = exposure_gain(frame.rgb, color, static)
+        self.sources.append(Source(frame.rgb, np.where(static, depth, 0).astype(np.float32), T_world_color, gain))
 
     def colors(
         self, frame: Frame, wanted: NDArray[np.bool_], T_world_color: NDArray[np.float64]
@@ -94,12 +94,12 @@ class BackgroundRenderer:
         exposure, and where they are known (h, w).
         """
         of_map, distances = self._map_in_color(T_world_color)
-        gain = exposure_gain(frame.color, of_map, (distances > 0) & ~wanted)
+        gain = exposure_gain(frame.rgb, of_map, (distances > 0) & ~wanted)
         rows, columns = np.nonzero(wanted & (distances > 0))
         values = of_map[rows, columns] * gain
         found, seen = self._borrowed(rows, columns, distances[rows, columns], T_world_color)
         values[seen] = found[seen] * gain
-        color, known = np.zeros_like(frame.color), np.zeros_like(wanted)
+        color, known = np.zeros_like(frame.rgb), np.zeros_like(wanted)
         color[rows, columns] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
         known[rows, columns] = seen | _inner(distances > 0)[rows, columns]
         return color, known

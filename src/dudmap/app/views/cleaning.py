@@ -137,13 +137,13 @@ class Cleaner:
             asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
             surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
         found, seen = self._renderer.colors(frame, asked, T_world_color)
-        left = unlike(frame.color, found, asked & ~moving & seen, surely)
+        left = unlike(frame.rgb, found, asked & ~moving & seen, surely)
         if self.registered:
             replaced = replaced | left
         replaced = with_shadow(replaced, frame.depth, behind)
         moving = moving | left
         known = seen | ~moving
-        color = continued(np.where((moving & seen)[..., None], found, frame.color), known)
+        color = continued(np.where((moving & seen)[..., None], found, frame.rgb), known)
         return Cleaned(frame, moving, replaced, color, np.where(replaced, behind, frame.depth), known)
 
     def _color_pose(self, frame: Frame) -> NDArray[np.float64]:

@@ -157,7 +157,7 @@ class ColorCalibration(Stateful):
         if self._estimation is None or self._estimation.finished:
             return False
         with view.timer("calibrate"):
-            if corrected or view.blind:
+            if corrected or view.without_image:
                 self._estimation.interrupt(moved=corrected)
             else:
                 self._estimation.add(view.observation, T_world_camera, dynamic_mask, self._atlas.current)

@@ -13,8 +13,17 @@ class FrameArrays(TypedDict, total=False):
     """A frame as plain arrays, see ``Frame.from_arrays``."""
 
     depth: NDArray[np.float32] | NDArray[np.uint16]
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.uint8] | None
     timestamp: float
+
+
+NO_COLOR = (
+    "{} has the shape {} and the type {}; expected (H, W, 3) uint8, red green blue; 16-bit values are depth, which "
+    "needs no colour"
+)
+"""Sentence on an array that is no colour image."""
+GREY = 192
+"""Value of all colours of a frame without colour: light, so that shading shows on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,55 +33,65 @@ class Frame:
     Attributes:
         timestamp: Seconds, of the depth image.
         depth: (H, W) float32, metres along the optical axis, 0 where there is no reading.
-        color: (H, W, 3) uint8, red green blue; of another size where the colour camera is another one.
+        color: (H, W, 3) uint8, red green blue; of another size where the colour camera is another one. None for depth
+            without colour: the frame is then registered by its distances alone.
         color_timestamp: Seconds, of the colour image; None if that is not known. It is used where a calibration of the
             colour camera is.
     """
 
     timestamp: float
     depth: NDArray[np.float32]
-    color: NDArray[np.uint8]
+    color: NDArray[np.uint8] | None = None
     color_timestamp: float | None = None
 
     def __repr__(self) -> str:
         """The sizes without the images."""
-        return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, colour {self.color.shape})"
+        color = "no colour" if self.color is None else f"colour {self.color.shape}"
+        return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]:
+        """Colours (H, W, 3) uint8; ``GREY``, of the size of ``depth``, where the frame has none."""
+        return np.full((*self.depth.shape, 3), GREY, np.uint8) if self.color is None else self.color
 
     @classmethod
     def from_arrays(
         cls,
         depth: NDArray[np.float32] | NDArray[np.uint16],
-        rgb: NDArray[np.uint8],
-        timestamp: float,
+        rgb: NDArray[np.uint8] | None = None,
+        timestamp: float = np.nan,
         depth_scale: float = 1000.0,
     ) -> "Frame":
-        """Frame of two images as a sensor, a file or another program gives them.
+        """Frame of copies of two images as a sensor, a file or another program gives them.
 
         Args:
             depth: (H, W), along the optical axis, registered to colour: floating point in metres, where 0 and values
                 that are not finite mean no reading, or uint16 in units of ``depth_scale``, where 0 means no reading.
-            rgb: (H, W, 3) uint8, red green blue.
+            rgb: (H, W, 3) uint8, red green blue; None for depth without colour.
             timestamp: Seconds.
             depth_scale: Units of uint16 depth per metre; 1000 = millimetres. Not used for floating point.
 
         Raises:
-            FrameError: An array has another shape or type, or the time is not a finite number.
+            FrameError: An argument is no array, or one of another shape or type; the time is not a finite number.
         """
-        if depth.ndim != 2 or not (depth.dtype.kind == "f" or depth.dtype == np.uint16):
+        for name, image in (("depth", depth), ("rgb", rgb)):
+            if not (hasattr(image, "__array__") or (name == "rgb" and image is None)):
+                raise FrameError(f"{name} is a {type(image).__name__}; expected a NumPy array", "type")
+        readings = np.asarray(depth)
+        integers = readings.dtype.kind == "u" and readings.dtype.itemsize == 2  # of either byte order
+        if readings.ndim != 2 or not (readings.dtype.kind == "f" or integers):
             raise FrameError(
-                f"depth has the shape {depth.shape} and the type {depth.dtype}; expected (H, W), floating point in "
-                "metres or uint16 in units of the camera's depth_scale",
+                f"depth has the shape {readings.shape} and the type {readings.dtype}; expected (H, W), floating point "
+                "in metres or uint16 in units of the camera's depth_scale",
                 "type",
             )
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise FrameError(
-                f"rgb has the shape {rgb.shape} and the type {rgb.dtype}; expected (H, W, 3) uint8, red green blue",
-                "type",
-            )
+        color = None if rgb is None else np.array(rgb, order="C")
+        if color is not None and (color.ndim != 3 or color.shape[2] != 3 or color.dtype != np.uint8):
+            raise FrameError(NO_COLOR.format("rgb", color.shape, color.dtype), "type")
         if not np.isfinite(timestamp):
             raise FrameError(f"the timestamp is {timestamp}; expected a finite number of seconds")
-        if depth.dtype.kind == "f":
-            metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        if integers:
+            metres = readings.astype(np.float32) / np.float32(depth_scale)
         else:
-            metres = depth.astype(np.float32) / np.float32(depth_scale)
-        return cls(float(timestamp), metres, np.ascontiguousarray(rgb))
+            metres = np.where(np.isfinite(readings), readings, 0).astype(np.float32)
+        return cls(float(timestamp), metres, color)

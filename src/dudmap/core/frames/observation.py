@@ -36,6 +36,7 @@ class Observation:
         recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
         color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
+        has_color: Whether the frame has a colour image; ``rgb`` and ``intensity`` are of one grey otherwise.
         sources: (H, W) int32, number of the recorded pixel that each pixel shows then; None for its own.
     """
 
@@ -47,6 +48,7 @@ class Observation:
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
     depth_readout: float = 0.0
+    has_color: bool = True
     sources: NDArray[np.int32] | None = field(default=None, repr=False, metadata=CACHE)
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(
@@ -79,6 +81,7 @@ class Observation:
     def as_recorded(self) -> Frame:
         """Depth of the observation and colour as it was recorded."""
         color = self.rgb if self.recorded_rgb is None else self.recorded_rgb
+        color = color if self.has_color else None
         return Frame(self.timestamp, self.depth, color, self.timestamp + self.color_offset)
 
 

@@ -9,7 +9,7 @@ from dudmap.config import PreprocessConfig
 from dudmap.core.backends.cpu.filtering import filter_depth, intensity
 from dudmap.core.backends.parameters import FilterParameters
 from dudmap.core.frames.color_registration import color_projection, register_color
-from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.frame import NO_COLOR, Frame
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -73,17 +73,20 @@ class Preprocessor:
         """
         self._check(frame)
         depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
-        rgb = np.ascontiguousarray(frame.color)
+        rgb = np.ascontiguousarray(frame.rgb)
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
-        if self._unseen is not None:
+        if self._unseen is not None and frame.color is not None:
             depth = np.where(self._unseen, np.float32(0), depth)
         depth = filter_depth(depth, self._parameters)
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
-        if self.calibration is not None:
+        has_color = frame.color is not None
+        if self.calibration is not None and has_color:
             recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
-        return Observation(frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset)
+        return Observation(
+            frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset, has_color=has_color
+        )
 
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
@@ -132,26 +135,25 @@ class Preprocessor:
         return np.asarray(recorded) > 0
 
     def _check(self, frame: Frame) -> None:
-        h, w = self.camera.shape
-        if self.calibration is not None and frame.color.shape != (*self.calibration.camera.shape, 3):
-            color_h, color_w = self.calibration.camera.shape
+        camera, color = self.camera, frame.color
+        color_camera = camera if self.calibration is None else self.calibration.camera
+        for name, image, expected in (("depth", frame.depth, camera), ("colour", color, color_camera)):
+            if not isinstance(image, np.ndarray) and not (image is None and name == "colour"):
+                raise FrameError(f"the {name} image is a {type(image).__name__}; expected a NumPy array", "type")
+            shape = expected.shape if name == "depth" else (*expected.shape, 3)
+            if image is not None and image.shape != shape:
+                which = "camera" if self.calibration is None else f"{name} camera"
+                raise FrameError(
+                    f"the {which} is {expected.width}x{expected.height}, but the {name} image has the shape "
+                    f"{image.shape}; expected {shape}: register and resize the images beforehand",
+                    "resolution",
+                )
+        if frame.depth.dtype.kind != "f":
             raise FrameError(
-                f"the colour camera is {color_w}x{color_h}, but the colour image has the shape {frame.color.shape}",
-                "resolution",
+                f"depth is {frame.depth.dtype}; expected metres as float32 (Frame.from_arrays converts uint16)", "type"
             )
-        unregistered = self.calibration is not None
-        if frame.depth.shape != (h, w) or not (unregistered or frame.color.shape == (h, w, 3)):
-            raise FrameError(
-                f"the camera is {w}x{h}, but the depth image has the shape {frame.depth.shape} and the colour image "
-                f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand",
-                "resolution",
-            )
-        if frame.depth.dtype.kind != "f" or frame.color.dtype != np.uint8:
-            raise FrameError(
-                f"depth is {frame.depth.dtype} and colour {frame.color.dtype}; expected depth in metres as float32 "
-                "and colour as uint8",
-                "type",
-            )
+        if color is not None and color.dtype != np.uint8:
+            raise FrameError(NO_COLOR.format("colour", color.shape, color.dtype), "type")
 
     def _undistorted(
         self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]

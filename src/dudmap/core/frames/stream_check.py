@@ -31,6 +31,8 @@ SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
 LONGEST_MEMORY = 1.0
 """Longest time between two images whose depths are compared, seconds; the camera may look elsewhere then."""
 
+Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
+"""Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""
 Repeats = Literal["", "frame", "depth", "color"]
 """What a frame repeats of the one before, bit for bit."""
 
@@ -64,7 +66,7 @@ class StreamCheck(Stateful):
     _contradicting: Remembered[list[float]]
     _intervals: Remembered[deque[float]]
     _arrived: Remembered[float | None] = None  # stamp of the last frame, valid or not
-    _before: Remembered[tuple[NDArray[np.float32], NDArray[np.uint8]] | None] = None  # depth, colour of the last frame
+    _before: Remembered[Images | None] = None  # of the last frame
     _compared: Remembered[tuple[float, NDArray[np.float32]] | None] = None  # stamp and depth of the last with readings
     _unit: Remembered[float] = 0.0  # logarithm of the factor by which the unit has changed
 
@@ -150,11 +152,12 @@ class StreamCheck(Stateful):
         return Rejection("unit", f"all depths changed by the factor {np.exp(self._unit):.3g} at once: another unit")
 
 
-def repeated(
-    before: tuple[NDArray[np.float32], NDArray[np.uint8]], after: tuple[NDArray[np.float32], NDArray[np.uint8]]
-) -> Repeats:
-    """What the images (depth, colour) of a frame repeat of the one before; a depth image without readings does not."""
+def repeated(before: Images, after: Images) -> Repeats:
+    """What the images of a frame repeat of the one before; a depth image without readings does not. Depth without
+    colour that repeats is a ``frame`` that does."""
     depth = _equal(before[0], after[0]) and bool(after[0].any())
+    if before[1] is None or after[1] is None:
+        return "frame" if depth and before[1] is after[1] else "depth" if depth else ""
     color = _equal(before[1], after[1])
     return "frame" if depth and color else "depth" if depth else "color" if color else ""
 

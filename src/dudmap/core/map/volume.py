@@ -163,7 +163,7 @@ class TsdfVolume(PagedMap):
         """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
 
         Args:
-            frame: Depth (m) and colour of the volume's camera.
+            frame: Depth (m) of the volume's camera, and colour, if there is any.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
             count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
@@ -171,11 +171,12 @@ class TsdfVolume(PagedMap):
         Raises:
             MapError: The images do not have the camera's size.
         """
-        if frame.depth.shape != self.camera.shape or frame.color.shape[:2] != self.camera.shape:
+        rgb = frame.rgb
+        if not frame.depth.shape == rgb.shape[:2] == self.camera.shape:
             raise MapError(
                 f"the volume's camera is {self.camera.width}x{self.camera.height}, but depth is "
                 f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour "
-                f"{frame.color.shape[1]}x{frame.color.shape[0]}"
+                f"{rgb.shape[1]}x{rgb.shape[0]}"
             )
         used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else static_mask
         self.look_at(T_world_camera)
@@ -188,7 +189,7 @@ class TsdfVolume(PagedMap):
         T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (self.window.local_origin * self.block_size)
         constant = self.config.weighting == "constant"
         return DepthView(
-            frame.depth, frame.color, used, np.ones(used.shape, np.uint8) if constant else None,
+            frame.depth, frame.rgb, used, np.ones(used.shape, np.uint8) if constant else None,
             self.camera.intrinsics, self.T_grid_camera(T_world_camera), T_camera_local[:3].astype(np.float32),
             T_world_camera,
         )  # fmt: skip

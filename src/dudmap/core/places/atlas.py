@@ -128,7 +128,7 @@ class Atlas(Stateful):
         ``exposure`` are gain and offset to the colours of the map; what is kept is ``recorded``, the frame with its
         colour as it was recorded (None for the same).
         """
-        color = exposed_color(frame.color, exposure)
+        color = exposed_color(frame.rgb, exposure)
         self.volume.integrate(Frame(frame.timestamp, frame.depth, color), T_world_camera, static_mask)
         if self.history is not None:
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)

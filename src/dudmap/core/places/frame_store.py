@@ -244,7 +244,7 @@ def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, flo
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
     steps = np.minimum(frame.depth * np.float32(1 / DEPTH_UNIT) + np.float32(0.5), 65535).astype(np.uint16)
-    bgr = cv2.cvtColor(exposed_color(frame.color, exposure), cv2.COLOR_RGB2BGR)
+    bgr = cv2.cvtColor(exposed_color(frame.rgb, exposure), cv2.COLOR_RGB2BGR)
     color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]
     return rvl.compressed(steps), color.tobytes(), mask.tobytes()

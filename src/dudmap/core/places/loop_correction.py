@@ -110,7 +110,7 @@ class LoopCorrector(Stateful):
         for i in chosen:
             stored, T = history[nodes[i]], Ts[i]
             depth = np.where(stored.static, stored.frame.depth, np.float32(0))[1::4, 1::4]
-            grey = cv2.cvtColor(stored.frame.color, cv2.COLOR_RGB2GRAY)
+            grey = cv2.cvtColor(stored.frame.rgb, cv2.COLOR_RGB2GRAY)
             size = (depth.shape[1], depth.shape[0])
             intensity = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255)
             volume.look_at(T)

@@ -91,6 +91,8 @@ class Relocalizer(Stateful):
         limits = self.config.relocalization
         if not limits.enabled:
             return None
+        if not view.observation.has_color:
+            return None
         with view.timer("recognise"):
             keyframes = self.atlas.keyframes
             features = keyframes.extract(view.colored(), view.known_dynamic)
@@ -119,9 +121,9 @@ class Relocalizer(Stateful):
         """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
         That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
-        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``. It
-        is compared with the last lost image, in which fast people are found again, and with one LONGEST_BASELINE older,
-        since when slow people have moved.
+        readings for a map and, unless it has no colour, enough features for a keyframe, and it is not of people: see
+        ``_shows_static_world``. It is compared with the last lost image, in which fast people are found again, and with
+        one LONGEST_BASELINE older, since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
         if not self.may_start_submaps or self._lost_since is None:
@@ -136,9 +138,9 @@ class Relocalizer(Stateful):
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
         timestamp, count = self._counted
-        if timestamp != observation.timestamp:  # relocalisation is off
+        if timestamp != observation.timestamp and observation.has_color:  # relocalisation is off
             count = len(self.atlas.keyframes.extract(observation))
-        if count < self.config.relocalization.min_inliers:
+        if observation.has_color and count < self.config.relocalization.min_inliers:
             return False
         if len(recent) < 2:
             return self._shows_static_world(recent[0] if recent else None, view)

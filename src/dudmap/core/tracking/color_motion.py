@@ -131,12 +131,12 @@ class ColorMotion(Stateful):
         if self.calibration is None:
             return frame
         projection = self._projection(self.calibration, frame, velocity)
-        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection))
+        return replace(frame, color=register_color(frame.rgb, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
         """Whether the frame was prepared with all that is known of its colours."""
         calibration = self.calibration
-        if calibration is None or calibration.is_registered(observation.camera):
+        if calibration is None or calibration.is_registered(observation.camera) or not observation.has_color:
             return True
         return calibration is self.given and calibration.is_instant(observation.color_offset)
 
@@ -181,7 +181,7 @@ class ColorMotion(Stateful):
         projection = self._projection(calibration, recorded, velocity)
 
         def colored() -> Observation:
-            rgb = register_color(recorded.color, recorded.depth, observation.camera, projection)
+            rgb = register_color(recorded.rgb, recorded.depth, observation.camera, projection)
             return replace(observation, rgb=rgb, recorded_rgb=recorded.color)
 
         return replace(view, colors=submit(colored))

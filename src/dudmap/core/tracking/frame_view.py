@@ -92,6 +92,11 @@ class FrameView:
         """Time of the depth image, seconds."""
         return self.observation.timestamp
 
+    @property
+    def without_image(self) -> bool:
+        """Whether the pose rests on the distances alone: the image carries no information, or there is none."""
+        return self.blind or not self.observation.has_color
+
     def colored(self) -> Observation:
         """The observation with registered colours; waits for the thread that registers them."""
         if self.colors is None:

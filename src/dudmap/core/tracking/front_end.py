@@ -100,7 +100,7 @@ class FrontEnd(Stateful):
         weights that follow from the labels.
         """
         levels, unverified = view.pyramid.tracked, prediction.unverified_mask
-        tracker = self.blind_tracker if view.blind else self.tracker
+        tracker = self.blind_tracker if view.without_image else self.tracker
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
         split = max(1, len(levels) - 1)
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
@@ -132,7 +132,7 @@ class FrontEnd(Stateful):
             discount = motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
             color_weight = tracker.config.color_weight * discount
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
-        if view.blind:
+        if view.without_image:
             tracking = replace(tracking, color_residual=np.nan)
         return PoseEstimate(tracking, labels, unverified, view)
 
@@ -172,7 +172,7 @@ class FrontEnd(Stateful):
         this minimum, and may be what moves.
         """
         level, T_world_camera = view.labelled, found.T_world_camera
-        if view.blind or prediction.moving is not None or self.tracker.config.color_weight == 0:
+        if view.without_image or prediction.moving is not None or self.tracker.config.color_weight == 0:
             return T_world_camera
         if isinstance(found, Minimum) and found.level.depth is level.depth:
             weights, before = found.weights, found.equations.residuals[0]
@@ -209,7 +209,7 @@ class FrontEnd(Stateful):
                 tracking.exposure,
                 prediction.slow,
             )
-            if view.blind:
+            if view.without_image:
                 labels = replace(labels, hidden=None)
             if view.known_dynamic is None:
                 return labels

@@ -309,7 +309,7 @@ class PosePredictor(Stateful):
         with view.timer("parallax"):
             dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
             gain, _ = estimate.exposure
-            image = view.tracked_at(estimate.T_world_camera, moving=dynamic, blind=view.blind, gain=gain)
+            image = view.tracked_at(estimate.T_world_camera, moving=dynamic, blind=view.without_image, gain=gain)
             self.ego_motion.update(image)
 
     def _slow_motion(

@@ -152,7 +152,7 @@ class ImageConsistency:
             level.depth, level.intensity, dynamic, gaps[0], differences[0], marks[0],
             noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
         )  # fmt: skip
-        shift = np.nan if view.blind or last.blind else shift
+        shift = np.nan if view.without_image or last.blind else shift
         return ImageComparison(shift, agreeing / max(readings, 1), agreeing / max(seen, 1))
 
 

@@ -159,4 +159,4 @@ def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
         if other is not None:
             T_color_depth = se3.inverse(T_world_color) @ T_world_camera
             depth, moving = other.depth(depth, T_color_depth), other.mask(moving, depth, T_color_depth)
-        yield View(f"frame_{index:05d}", frame.color, depth, moving, T_world_color)
+        yield View(f"frame_{index:05d}", frame.rgb, depth, moving, T_world_color)

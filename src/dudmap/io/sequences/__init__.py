@@ -20,7 +20,7 @@ from dudmap.errors import DatasetError, FrameError, printable
 from dudmap.input_files import damaged
 from dudmap.io.sequences import intrinsics
 
-__all__ = ["Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
+__all__ = ["Recording", "Sequence", "has_color", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
 
 
 @runtime_checkable
@@ -81,6 +81,7 @@ class Recording(ABC):
             that they are assumed.
         remarks: Sentences on what was left out because no run needs it, or assumed.
         timed: Whether the times were read or their rate was given; False where they are invented.
+        has_color: Whether there are colour images; without, the ``color`` of all frames is None.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
 
@@ -91,6 +92,7 @@ class Recording(ABC):
     layout: tuple[str, ...] = ()
     """Patterns of files and folders that all lie in every folder of the format."""
     timed = True
+    has_color = True
     camera: Camera
     calibration: Calibration | None = None
     timestamps: NDArray[np.float64]
@@ -197,6 +199,11 @@ def is_recording(path: Path) -> bool:
 def is_timed(sequence: object) -> bool:
     """Whether the times of a sequence are known: not those of a recording whose frames are only numbered."""
     return getattr(sequence, "timed", True)
+
+
+def has_color(sequence: object) -> bool:
+    """Whether a sequence has colour images, which a recording of depth alone has not."""
+    return getattr(sequence, "has_color", True)
 
 
 def open_sequence(

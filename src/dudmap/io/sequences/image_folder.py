@@ -32,7 +32,7 @@ FRAME_RATE = 30.0
 
 
 class ImageFolder(Recording):
-    """Base class of recordings whose frames are a colour file and a depth file each.
+    """Base class of recordings whose frames are a colour file and a depth file each, or, without colour, a depth file.
 
     A format says what its files are called (``color_files`` and so on) or how they pair (``_find_pairs``), and
     optionally its cameras where no file does (``published``), where the truth is (``_find_ground_truth``) and how an
@@ -98,7 +98,7 @@ class ImageFolder(Recording):
 
     def _frame(self, index: int, name: str) -> Frame:
         frame = self._read(index, self.camera.depth_scale)
-        if self.calibration is None and frame.color.shape[:2] != frame.depth.shape:
+        if self.calibration is None and frame.rgb.shape[:2] != frame.depth.shape:
             raise FrameError(self._unequal(index, frame))
         if frame.depth.shape != self.camera.shape:
             raise FrameError(
@@ -110,7 +110,7 @@ class ImageFolder(Recording):
     def _unequal(self, index: int, frame: Frame) -> str:
         color_file, depth_file = self._pairs[index]
         return (
-            f"frame {index}: the colour image {color_file.path} is {size(frame.color)} pixels but the depth image "
+            f"frame {index}: the colour image {color_file.path} is {size(frame.rgb)} pixels but the depth image "
             f"{depth_file.path} is {size(frame.depth)}; both must have one size, with depth registered to "
             "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
         )
@@ -134,7 +134,7 @@ class ImageFolder(Recording):
         self.timed, self.sources["times"] = True, f"--fps {fps:g}"
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of all frames, by increasing time of the depth."""
+        """(colour, depth) files of all frames, by increasing time of the depth; see ``_alone`` for depth alone."""
         return self._pair_numbered(self._numbered(self.color_files), self._numbered(self.depth_files))
 
     def _numbered(self, files: tuple[str, str]) -> dict[int, Path]:
@@ -203,6 +203,11 @@ class ImageFolder(Recording):
         self._pairing, self.image_counts = _counted("equal numbers", colors, depths), (len(colors), len(depths))
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
+    def _alone(self, depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
+        """Pairs of depth files, which have no colour, with themselves."""
+        self.has_color, self._pairing = False, f"{len(depths)} depth images without colour"
+        return [(depth, depth) for depth in depths]
+
     def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart."""
         pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
@@ -241,10 +246,10 @@ class ImageFolder(Recording):
         color_file, depth_file = self._pairs[index]
         try:
             depth = self._read_depth(depth_file.path, depth_scale)
-            color = self._read_color(color_file.path)
+            color = self._read_color(color_file.path) if self.has_color else None
         except FrameError as error:
             raise FrameError(f"frame {index}: {error}") from error
-        if self.calibration is not None and color.shape[:2] != self.calibration.camera.shape:
+        if self.calibration is not None and color is not None and color.shape[:2] != self.calibration.camera.shape:
             expected = self.calibration.camera
             raise FrameError(
                 f"frame {index}: the colour image {color_file.path} is {size(color)} pixels, but the recording's "
@@ -264,11 +269,11 @@ class ImageFolder(Recording):
                 continue
             if frame.depth.any():
                 camera = known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
-                if self.calibration is None and frame.color.shape[:2] != camera.shape:
+                if self.calibration is None and frame.rgb.shape[:2] != camera.shape:
                     if not _is_centered(camera):  # then the intrinsics may be those of the colour images
                         problem = problem or self._unequal(int(index), frame)
                         continue
-                    self.calibration = Calibration(_same_view(camera, *frame.color.shape[:2]))
+                    self.calibration = Calibration(_same_view(camera, *frame.rgb.shape[:2]))
                     self.sources["colour camera"] = "the depth camera, assumed to have its field of view and position"
                 return camera
             problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"

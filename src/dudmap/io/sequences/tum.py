@@ -24,6 +24,8 @@ from dudmap.io.sequences.intrinsics import camera_values
 class TumSequence(ImageFolder):
     """Recording with rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
 
+    Without rgb.txt, and without a folder rgb/, it is a recording of depth alone.
+
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
@@ -51,8 +53,8 @@ class TumSequence(ImageFolder):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a folder has this layout."""
-        lists = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
-        return lists or (path / "associations.txt").is_file()
+        lists = (path / "rgb.txt").is_file() or not (path / "rgb").is_dir()
+        return (lists and (path / "depth.txt").is_file()) or (path / "associations.txt").is_file()
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame, None if mask.txt lists none.
@@ -72,7 +74,10 @@ class TumSequence(ImageFolder):
         associations = self.path / "associations.txt"
         if associations.is_file():
             return read_pairs(associations)
-        return self._pair_timed(read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt"))
+        depths = read_list(self.path / "depth.txt")
+        if not (self.path / "rgb.txt").is_file():
+            return self._alone(depths)
+        return self._pair_timed(read_list(self.path / "rgb.txt"), depths)
 
     def _published(self) -> intrinsics.Intrinsics | None:
         names = self.path.resolve().name, _bag_name(self.path / "rgb.txt")
