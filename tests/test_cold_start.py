@@ -13,6 +13,7 @@ import pytest
 from numba.core import event
 
 import dudmap
+from dudmap.core import kernel_cache
 from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import filtering
 from dudmap.lab import warmup
@@ -176,12 +177,11 @@ def test_the_first_demo_waits_for_the_first_of_two_processes_and_ends_both(tmp_p
 
     monkeypatch.setattr(warmup.subprocess, "Popen", Process)
     monkeypatch.setattr(warmup, "num_threads", lambda: 2)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     with warmup.compiled_for_demo(quiet=True):
         assert calls == [("wait", True)]
     assert calls[1:] == [("terminate", False), ("wait", False), ("terminate", True), ("wait", True)]
     calls.clear()
-    (tmp_path / "cache").mkdir()
-    (tmp_path / "cache" / "kernel.nbi").touch()
+    (kernel_cache.folder() / "kernel.nbi").touch()
     with warmup.compiled_for_demo(quiet=True):
         assert calls == []

@@ -3,25 +3,26 @@
 import io
 import time
 
+import numba
 from rich.console import Console
 
 from dudmap import Config
-from dudmap.app.doctor import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING
 from dudmap.app.pipeline.progress import RunProgress, summary
 from dudmap.app.pipeline.run import run
 from dudmap.app.terminal import counted
+from dudmap.core import kernel_cache
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.io.sequences import open_sequence
 from recordings import write_recording
 
 
 def test_compilation_is_announced_only_while_the_cache_is_empty(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert compiled_kernels() == 0
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    assert kernel_cache.count() == 0
     RunProgress(3, bar=False).announce_compilation()
     assert COMPILING in capsys.readouterr().err
-    (tmp_path / "cache").mkdir()
-    (tmp_path / "cache" / "kernel.nbi").touch()
+    (kernel_cache.folder() / "kernel.nbi").touch()
     RunProgress(3, bar=False).announce_compilation()
     assert not capsys.readouterr().err
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from dudmap import __version__
+from dudmap.errors import DudmapError
 from dudmap.extras import install
 
 COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
@@ -27,17 +28,6 @@ FEATURES = ("avx2", "fma")
 FREE_BYTES = 2**31
 """Space below which a folder counts as nearly full: a map and the results of a long run."""
 State = Literal["good", "note", "bad"]
-
-
-def kernel_cache() -> Path:
-    """Folder in which Numba keeps the compiled kernels, as far as it can be known without compiling."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(given) if given else Path(__file__).parents[1] / "core" / "backends" / "cpu" / "__pycache__"
-
-
-def compiled_kernels() -> int:
-    """Number of kernels in the cache; 0 where there is no cache yet."""
-    return sum(1 for _ in kernel_cache().rglob("*.nbi"))
 
 
 @dataclass(frozen=True)
@@ -135,21 +125,43 @@ def _gpu() -> Check:
 def _caches() -> Iterator[Check]:
     from dudmap.io.sequences.archive import cache_folder
 
-    count = compiled_kernels()
-    if count:
-        kernels = Check("kernel cache", "good", f"{kernel_cache()}, {count} kernels")
+    try:
+        yield _kernel_cache()
+    except ImportError:  # of Numba, which the check of the threads reports
+        pass
+    try:
+        archives = cache_folder()
+        problem = not_writable(archives)
+    except DudmapError as error:
+        yield Check("archive cache", "note", *str(error).split("; "))
+        return
+    if problem:
+        mend = "set DUDMAP_CACHE to a folder that you can write"
+        yield Check("archive cache", "note", f"{archives}: {problem}", mend)
     else:
-        mend = "dudmap warmup compiles all kernels in advance"
-        kernels = Check("kernel cache", "note", f"{kernel_cache()} is empty", mend)
-    yield _writable(kernels, kernel_cache(), "NUMBA_CACHE_DIR", ", or every start compiles for a minute")
-    yield _writable(Check("archive cache", "good", str(cache_folder())), cache_folder(), "DUDMAP_CACHE")
+        yield Check("archive cache", "good", str(archives))
 
 
-def _writable(check: Check, folder: Path, variable: str, why: str = "") -> Check:
-    """The check of a folder, or that it cannot be written."""
-    problem = not_writable(folder)
-    mend = f"set {variable} to a folder that you can write{why}"
-    return Check(check.name, "note", f"{folder}: {problem}", mend) if problem else check
+def _kernel_cache() -> Check:
+    """Where compiled kernels are kept, which Numba decides by trying."""
+    from dudmap.core import kernel_cache
+
+    name, folder, count = "kernel cache", kernel_cache.folder(), kernel_cache.count()
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    mend = "set NUMBA_CACHE_DIR to a folder that you can write and that lasts"
+    if folder is None:
+        return Check(name, "note", "no folder can be written: every start compiles for one to two minutes", mend)
+    if kernel_cache.is_temporary():
+        return Check(
+            name, "note", f"{folder}, {count} kernels, which may not last: no other folder can be written", mend
+        )
+    if given and Path(given).resolve() not in folder.resolve().parents:
+        return Check(name, "note", f"{folder}, since NUMBA_CACHE_DIR={given} cannot be written", mend)
+    if problem := not_writable(folder):
+        return Check(name, "note", f"{folder}: {problem}", mend)
+    if not count:
+        return Check(name, "note", f"{folder} is empty", "dudmap warmup compiles all kernels in advance")
+    return Check(name, "good", f"{folder}, {count} kernels")
 
 
 def _extras() -> Iterator[Check]:

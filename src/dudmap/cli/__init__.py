@@ -7,7 +7,9 @@ sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C.
 
 import ctypes
 import io
+import logging
 import sys
+import warnings
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -147,7 +149,16 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a character, as on Windows
     _share_one_heap()
+    warnings.showwarning = _show_warning
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # that it keeps its list of fonts in a temporary folder
     app()
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    """Print a warning as one line, without the place in the source."""
+    from dudmap.app.terminal import say
+
+    say(f"warning: {message}", err=True)
 
 
 def _share_one_heap() -> None:

@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.app.doctor import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING
 from dudmap.app.terminal import say
 from dudmap.config import Config
+from dudmap.core import kernel_cache
 from dudmap.core.backends.cpu import rvl
 from dudmap.core.backends.cpu.evidence import BINS, EDGES
 from dudmap.core.backends.threads import num_threads
@@ -144,10 +145,11 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 @contextmanager
 def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
-    """Processes compile their parts while this lasts, where there is a core for them; the function waits for the first
-    one."""
-    environment = os.environ | {"DUDMAP_THREADS": "1"}
-    commands = [[sys.executable, "-m", __name__, *parts] for parts in processes] if num_threads() > 1 else []
+    """Processes compile their parts while this lasts, where there is a core and a folder for them; the function waits
+    for the first one."""
+    environment = os.environ | {"DUDMAP_THREADS": "1"} | kernel_cache.environment()
+    useful = num_threads() > 1 and kernel_cache.folder() is not None
+    commands = [[sys.executable, "-m", __name__, *parts] for parts in processes] if useful else []
     with ExitStack() as ends:
         started = [subprocess.Popen(each, env=environment, stdin=subprocess.DEVNULL) for each in commands]
         for process in started:
@@ -160,7 +162,7 @@ def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object
 def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
     """Before the demo as the first run of all, wait until two other processes have compiled what it needs, since a
     compiler takes as much memory again as the run."""
-    if compiled_kernels() or num_threads() < 2:
+    if kernel_cache.count() or num_threads() < 2:
         yield
         return
     if not quiet:
@@ -173,7 +175,7 @@ def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
 def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
     """``compiled_beside`` for the first run, which no kernel is compiled for; before a later ``live`` one those of a
     calibration are loaded, which would hold up the frames."""
-    compiled = compiled_kernels()
+    compiled = kernel_cache.count()
     if live and compiled:
         dict(steps())["colour camera"]()
     return compiled_beside(*(() if compiled else (BESIDE_RUN,)))

@@ -8,8 +8,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 from rich.text import Text
 
-from dudmap.app.doctor import COMPILING, compiled_kernels
+from dudmap.app.doctor import COMPILING
 from dudmap.app.terminal import plain_console
+from dudmap.core import kernel_cache
 
 if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
@@ -109,7 +110,7 @@ class RunProgress:
 
     def announce_compilation(self) -> None:
         """Say that the kernels are compiled first, where that is so."""
-        if not compiled_kernels():
+        if not kernel_cache.count():
             self.note(COMPILING)
 
     def once(self, sentence: str) -> None:

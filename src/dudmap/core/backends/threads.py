@@ -26,6 +26,8 @@ from numba.core.codegen import CPUCodeLibrary
 from numba.core.dispatcher import Dispatcher
 from numba.core.targetconfig import ConfigStack, TargetConfig
 
+from dudmap.core.kernel_cache import store
+
 
 def _import_numba() -> None:
     """Import what Numba needs before its first kernel, without SciPy's linear algebra.
@@ -47,7 +49,6 @@ _import_numba()
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
-    "cache": True,
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
@@ -124,20 +125,17 @@ def _digest(file: Path) -> bytes:
     return hashlib.sha256(file.read_bytes()).digest()
 
 
-def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator that compiles a kernel and stores it until one of the ``sources`` changes.
 
     Numba itself only asks whether the file of the kernel has changed, and not those of the functions inlined into it.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        compiled = njit(**(_OPTIONS | options))(function)
-        if isinstance(compiled, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
-            file = vars(compiled)["_cache"]._cache_file
-            file._source_stamp = sources(inspect.getfile(function))
-            # two processes that compile it for other types at the same time do not write one file
-            file._data_name_pattern = file._data_name_pattern.replace("{number", f"{os.getpid()}.{{number")
-        return compiled
+        kernel = njit(**(_OPTIONS | options))(function)
+        if isinstance(kernel, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
+            store(kernel, sources(inspect.getfile(function)))
+        return kernel
 
     return decorate
 
@@ -155,7 +153,7 @@ class Scalar:
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         update_wrapper(self, function)
         self.py_func, self._options = function, options
-        inlined: dict[str, Any] = {"cache": False, "forceinline": True, "no_cpython_wrapper": True}
+        inlined: dict[str, Any] = {"forceinline": True, "no_cpython_wrapper": True}
         self.inlined = njit(**(_OPTIONS | options | inlined))(function)
 
     @property
@@ -165,15 +163,15 @@ class Scalar:
 
     @cached_property
     def _alone(self) -> Callable[..., Any]:
-        return _compiled(**self._options)(self.py_func)
+        return compiled(**self._options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel of its own."""
         return self._alone(*arguments)
 
 
-kernel = _compiled()
-exact = _compiled(fastmath=False)
+kernel = compiled()
+exact = compiled(fastmath=False)
 """Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
 exact_scalar = partial(Scalar, fastmath=False)
 """Compiles what such loops call; ``py_func`` is the same formula for whole images."""
@@ -181,7 +179,7 @@ scalar = Scalar
 """Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
 function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
 of the two is called depends on whether the caller was compiled in this process or loaded from the cache."""
-written_out = _compiled(inline="always")
+written_out = compiled(inline="always")
 """Compiles scalar mathematics as if it were written out where it is called, so that the compiler orders its sums and
 products together with those around it; takes longer to compile than ``scalar``."""
 

@@ -30,6 +30,7 @@ LARGEST_HEADER = 2**20
 LARGEST_DICTIONARY = 2**27
 """Largest memory for unpacking xz, bytes; the preset 9 needs 65 MB."""
 CHUNK = 2**20
+NAME_FOLDER = "name a folder that you can write in the environment variable DUDMAP_CACHE"
 ORIGIN = "origin.txt"
 """File beside the unpacked folder that names the archive."""
 
@@ -52,11 +53,18 @@ def split(path: Path) -> tuple[Path, PurePosixPath] | None:
 
 
 def cache_folder() -> Path:
-    """Folder of unpacked archives: DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap."""
+    """Folder of unpacked archives: DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap.
+
+    Raises:
+        DatasetError: The user has no home folder.
+    """
     given = os.environ.get("DUDMAP_CACHE")
     if given:
         return Path(given)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dudmap"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if base.startswith("~"):
+        raise DatasetError(f"this user has no home folder to unpack archives in; {NAME_FOLDER}")
+    return Path(base) / "dudmap"
 
 
 def unpack(path: Path) -> Path:
@@ -64,7 +72,7 @@ def unpack(path: Path) -> Path:
 
     Raises:
         DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths that lead out of it,
-            or the disk is full.
+            or the cache cannot be written.
     """
     with damaged(DatasetError, f"the archive {path}"):
         open_plain(path).close()
@@ -74,9 +82,14 @@ def unpack(path: Path) -> Path:
     folder = place / stem(path)
     if folder.is_dir():
         return folder
-    cache_folder().mkdir(parents=True, exist_ok=True)
     try:
-        with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="unfinished-") as unfinished:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        writer = tempfile.TemporaryDirectory(dir=cache_folder(), prefix="unfinished-")
+    except OSError as error:
+        said = f"cannot unpack {path} into {cache_folder()} ({error.strerror})"
+        raise DatasetError(f"{said}; {NAME_FOLDER}") from error
+    try:
+        with writer as unfinished:
             content = Path(unfinished) / "place" / stem(path)
             _unpack_into(path, content, status.st_size)
             (content.parent / ORIGIN).write_bytes(os.fsencode(path.resolve()))

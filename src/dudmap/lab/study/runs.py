@@ -6,9 +6,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from dudmap.app.doctor import compiled_kernels
 from dudmap.app.pipeline.environment import machine
 from dudmap.app.pipeline.run_folder import locked
+from dudmap.core import kernel_cache
 from dudmap.lab.benchmark.measure import FEWER_SAMPLES, Row, measure_each, measure_sequence
 from dudmap.lab.benchmark.suites import Entry, Excerpt
 from dudmap.lab.study.designs import Table
@@ -50,7 +50,7 @@ def conduct(
     sentence ``error`` instead. With ``keep`` the run folders stay in ``runs/``. ``measure`` replaces the system.
     """
     unique = {run.key: run for run in runs}
-    if measure is None and not compiled_kernels():  # once, not in every worker
+    if measure is None and not kernel_cache.count():  # once, not in every worker
         for _, step in steps():
             step()
     threads = max(1, machine()["cores_usable"] // jobs)

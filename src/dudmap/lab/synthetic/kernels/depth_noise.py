@@ -1,10 +1,11 @@
 """Simulation of a depth and colour sensor: seeded noise, quantisation, occlusion shadows and missing readings."""
 
 import numpy as np
-from numba import njit
+
+from dudmap.core.backends.threads import compiled
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(fastmath=False)
 def _mix(a, b, key):
     """Hash of two integers and a key, 64 bits (splitmix64 finaliser)."""
     x = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(key)
@@ -13,7 +14,7 @@ def _mix(a, b, key):
     return x ^ (x >> np.uint64(31))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(fastmath=False)
 def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal, model, depth):
     """Depth readings of a disparity sensor in the rows [row_from, row_to); ``model`` is ``sensors.SensorModel.row``.
 
@@ -91,7 +92,7 @@ def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal,
                 depth[v, u] = np.float32(reading)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(fastmath=False)
 def measure_color(row_from, row_to, exact, table, key, sigma, color):
     """Add noise of ``sigma`` grey values to exact (H, W, 3) float32 and round into color (H, W, 3) uint8.
 
@@ -107,7 +108,7 @@ def measure_color(row_from, row_to, exact, table, key, sigma, color):
                 color[v, u, channel] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(fastmath=False)
 def measure_range(row_from, row_to, exact, cosines, smooth, offsets, key, model, depth):
     """Depth readings of a time-of-flight sensor in the rows; ``model`` is ``sensors.TimeOfFlightModel.row``.
 

@@ -8,7 +8,8 @@ front to back until the nearest remaining one lies behind everything already hit
 """
 
 import numpy as np
-from numba import njit
+
+from dudmap.core.backends.threads import compiled
 
 BOX, ELLIPSOID, CAPSULE, CYLINDER, TORUS = range(5)
 TILE_WIDTH, TILE_HEIGHT = 32, 16
@@ -20,7 +21,7 @@ _LEVEL_STARTS = np.array([sum((TEXTURE_SIZE >> k) ** 2 for k in range(level)) fo
 _MATHS = {"nsz", "contract", "reassoc"}
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
     """Entry of the ray o + t d into the box |x| <= hx, |y| <= hy, |z| <= hz; inf if missed (slab method)."""
     ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
@@ -31,7 +32,7 @@ def box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
     return near if (near <= far) & (near > NEAR) else np.inf
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
     """First hit of an ellipsoid with semi-axes h: a sphere in scaled coordinates."""
     px, py, pz = ox / hx, oy / hy, oz / hz
@@ -44,7 +45,7 @@ def ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
     return t if (rest >= 0.0) & (t > NEAR) else np.inf
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def capsule_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     """First hit of a capsule: all points within ``radius`` of the segment from -half to half on the z axis."""
     squared = radius * radius
@@ -67,7 +68,7 @@ def capsule_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     return best
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     """First hit of a closed cylinder of the given radius along z, |z| <= half."""
     squared = radius * radius
@@ -83,7 +84,7 @@ def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     return min(side, cap)
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def torus_depth(ox, oy, oz, dx, dy, dz, ring, _, tube):
     """First hit of a torus around z by sphere tracing its distance field down to a micrometre."""
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -103,7 +104,7 @@ def torus_depth(ox, oy, oz, dx, dy, dz, ring, _, tube):
     return t
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
     """Depth at which the ray o + t d, in the primitive's own frame, enters it; inf if it does not."""
     if kind == BOX:
@@ -117,7 +118,7 @@ def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
     return torus_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
 
 
-@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(inline="always", fastmath=_MATHS)
 def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
     """Update one line of a tile, from column u0 on, where primitive p is nearer than the hits so far."""
     best, found = out
@@ -130,7 +131,7 @@ def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
         found[k] = np.int16(p) if nearer else found[k]
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def trace(
     row_from, row_to, order, nearest, in_columns, in_rows, kinds, rotations, origins, halves, intrinsics, depth, ids
 ):
@@ -190,7 +191,7 @@ def trace(
                     ids[v, u0 + k] = found[(v - v0) * TILE_WIDTH + k]
 
 
-@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(inline="always", fastmath=_MATHS)
 def surface_normal(kind, x, y, z, hx, hy, hz):
     """Outward unit normal, in the primitive's frame, at a point of its surface."""
     if kind == BOX:
@@ -216,7 +217,7 @@ def surface_normal(kind, x, y, z, hx, hy, hz):
     return nx * scale, ny * scale, nz * scale
 
 
-@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(inline="always", fastmath=_MATHS)
 def texture_color(atlas, texture, level, u, v):
     """Bilinear look-up in one level of a repeating texture; (red, green, blue) in 0..255."""
     size = TEXTURE_SIZE >> level
@@ -237,7 +238,7 @@ def texture_color(atlas, texture, level, u, v):
     return red, green, blue
 
 
-@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(inline="always", fastmath=_MATHS)
 def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
     """Colour (0..1, three numbers) and cosine of incidence of primitive p where the ray (x, y, 1) t meets it.
 
@@ -291,7 +292,7 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
     )
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@compiled(fastmath=_MATHS)
 def shade(
     row_from, row_to, kinds, rotations, origins, halves, intrinsics, depth, ids,
     materials, textures, atlas, lights, up, sky, vignette, gain, color, cosines,
@@ -366,7 +367,7 @@ def shade(
                     cosines[v, u] = np.float32(cosine)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(fastmath=False)
 def count_views(first, last, vertices, normals, T, intrinsics, depth, near, far, grazing, counts):
     """Add one to counts[k] for every vertex in [first, last) that the ideal depth image (H, W) shows.
 

@@ -1,0 +1,150 @@
+"""The folder in which compiled kernels are stored: chosen here, for all kernels, and nowhere else.
+
+Numba refuses to define a kernel if it can write into none of its folders. Then the kernels of dudmap go to a folder of
+this user in the temporary folder, or are compiled in memory.
+"""
+
+import multiprocessing
+import os
+import pickle
+import stat
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba.core import caching
+from numba.core.dispatcher import Dispatcher
+
+_KINDS: dict[str, Any] = {
+    kind.__name__.lstrip("_").removesuffix("CacheLocator"): kind for kind in caching.CacheImpl._locator_classes
+}
+"""Numba's choices of a folder, by names that had an underscore before Numba 0.62."""
+
+
+class KernelCacheWarning(UserWarning):
+    """Compiled kernels do not last."""
+
+
+def folder() -> Path | None:
+    """Folder of the compiled kernels of a frame; None if they are compiled in memory."""
+    place = _Locator.from_function(folder, str(Path(__file__).parent / "backends" / "cpu" / "__init__.py"))
+    return None if place is None else Path(place.get_cache_path())
+
+
+def count() -> int:
+    """Number of kernels in the folder."""
+    place = folder()
+    return 0 if place is None else sum(1 for _ in place.glob("*.nbi"))
+
+
+def is_temporary() -> bool:
+    """Whether the kernels are stored in the temporary folder."""
+    place, private = folder(), _private()
+    return place is not None and private is not None and private in place.parents
+
+
+def environment() -> dict[str, str]:
+    """Environment variables with which a child process stores its kernels in the same folder, without a warning."""
+    return {"NUMBA_CACHE_DIR": str(_private())} if is_temporary() else {}
+
+
+def store(kernel: Dispatcher, stamp: str) -> None:
+    """Load the compiled forms of a kernel from the folder and store them there, until ``stamp`` changes."""
+    try:
+        vars(kernel)["_cache"] = _Cache(kernel.py_func, stamp)
+    except RuntimeError:  # Numba found no folder
+        _say_once("in memory, at each start, for one to two minutes")
+
+
+class _Cache(caching.FunctionCache):
+    """Numba's cache of one kernel, without which it works, too: when the disk is full, or a file in it is damaged."""
+
+    def __init__(self, function: Any, stamp: str) -> None:  # noqa: ANN401 - any function
+        super().__init__(function)
+        self._cache_file._source_stamp = stamp
+        # two processes that compile it for other types at the same time do not write one file
+        self._cache_file._data_name_pattern = self._cache_file._data_name_pattern.replace(
+            "{number", f"{os.getpid()}.{{number"
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
+        """The compiled form for a signature, None if it has to be compiled."""
+        try:
+            return super().load_overload(sig, target_context)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
+        """Store a compiled form if that is possible."""
+        try:
+            try:
+                super().save_overload(sig, data)
+            except (EOFError, pickle.UnpicklingError):  # the list of what is stored is damaged
+                self.flush()
+                super().save_overload(sig, data)
+        except OSError as error:
+            _say_once(f"in memory, since {self.cache_path} cannot be written ({error.strerror})")
+
+
+class _Locator:
+    """Chooses the folder: NUMBA_CACHE_DIR, the package's own, the user's, or the temporary one."""
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> Any:  # noqa: ANN401 - a locator of Numba
+        """Locator of the first folder that can be written, None if there is none."""
+        kinds = [_KINDS["UserProvided"], _KINDS["InTree"]]
+        if os.path.isabs(os.path.expanduser("~")):  # else Numba would make a folder of the name ~
+            kinds.append(_KINDS["UserWide"])
+        found = (kind.from_function(function, file) for kind in (*kinds, _PrivateLocator))
+        return next((locator for locator in found if locator is not None), None)
+
+
+class _PrivateLocator(_KINDS["InTree"]):
+    """The folder of this user in the temporary folder."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:  # noqa: ANN401
+        super().__init__(py_func, py_file)
+        self._cache_path = os.path.join(str(_private()), self.get_suitable_cache_subpath(py_file))
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:  # noqa: ANN401
+        """Locator for a kernel, None if there is no such folder."""
+        found = None if _private() is None else super().from_function(py_func, py_file)
+        if found is not None:
+            _say_once(f"in {_private()}, which may not last")
+        return found
+
+
+class _Impl(caching.CompileResultCacheImpl):
+    _locator_classes = [_Locator]  # noqa: RUF012 - as Numba has it
+
+
+_Cache._impl_class = _Impl
+
+
+@cache
+def _private() -> Path | None:
+    """Folder of this user in the temporary folder, in which nobody else can put or replace a file."""
+    try:
+        base = Path(tempfile.gettempdir())
+        temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}
+        if os.name != "posix" or str(base) not in temporary:  # not the current folder, Python's last resort
+            return None
+        if base.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:  # others may rename what is in it
+            return None
+        path = base / f"dudmap-{os.getuid()}"
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+    except OSError:
+        return None
+    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return path if own else None
+
+
+@cache
+def _say_once(where: str) -> None:
+    if multiprocessing.parent_process() is None:
+        said = f"kernels are compiled {where}; set NUMBA_CACHE_DIR to a folder that you can write and that lasts"
+        warnings.warn(said, KernelCacheWarning, stacklevel=2)
