@@ -30,6 +30,7 @@ class FakeResult:
     relocalized: bool = False
     corrected: bool = False
     blind: bool = False
+    colorless: bool = False
     submap: int = 0
     uncertain: str = ""
     calibrated: bool = False
