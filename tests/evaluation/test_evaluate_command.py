@@ -14,6 +14,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
+from dudmap.evaluation.trajectory import adjusted
 from layout_images import pose, tum_line
 from layouts import bonn, replica, write
 from run_folders import write_run
@@ -210,3 +211,22 @@ def test_times_per_stage_are_a_table_for_a_paper(tmp_path):
     rows = (tmp_path / "run" / "timings.tex").read_text(encoding="utf-8").splitlines()
     assert rows[2].startswith(f"total & {figures['total_median_ms']:.1f} & ")
     assert len(rows) == 3 + len(columns.stages) + 1
+
+
+def test_scale_and_time_offset_of_a_run(folders, tmp_path):
+    run, recording = folders
+    plain = figures(run, "--reference", recording)
+    found = Trajectory.load(run / "trajectory.txt")
+    adjusted(found, 7.25, 0.4).save(tmp_path / "other.txt")
+    refused = evaluate(tmp_path / "other.txt", "--reference", recording)
+    assert refused.exit_code == 1
+    assert re.search("^dudmap: 0 of 50 .* give --time-offset auto", refused.stderr)
+    out = figures(tmp_path / "other.txt", "--reference", recording, "--time-offset", "auto", "--scale")
+    assert out["time_offset_s"] == pytest.approx(-7.25, abs=0.005)
+    assert out["scale"] == pytest.approx(2.5, rel=0.01)
+    assert out["ate_rmse_m"] == pytest.approx(plain["ate_rmse_m"], rel=0.02)
+    given = figures(tmp_path / "other.txt", "--reference", recording, "--time-offset", "-7.25", "--scale")
+    assert given["ate_rmse_m"] == pytest.approx(plain["ate_rmse_m"], rel=0.02)
+    outcome = evaluate(run, "--reference", recording, "--time-offset", "0.2")
+    assert "50 of 50 estimated and 60 true poses" in outcome.stdout
+    assert re.search(r"hint: the clocks seem to differ: with -0\.[12]\d+ s .*--time-offset auto", outcome.stdout)

@@ -1,6 +1,7 @@
 """Trajectory errors against exact motions, a plain transcription of the definition, and evo as a separate program."""
 
 import json
+import re
 import subprocess
 import sys
 import zipfile
@@ -13,7 +14,9 @@ from scipy.spatial.transform import Rotation
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.evaluation.trajectory import ate, pair_poses, rpe
+from dudmap.evaluation.hints import hints
+from dudmap.evaluation.time_offset import MotionComparison
+from dudmap.evaluation.trajectory import adjusted, ate, fit_scale, pair_poses, rpe
 
 RNG_SEED = 7
 
@@ -163,9 +166,12 @@ def test_constant_drift_per_second_and_no_pair_across_a_gap():
 def test_errors_are_one_sentence():
     reference = hand_held(20)
     late = Trajectory(reference.timestamps + 100, reference.Ts_world_camera)
-    with pytest.raises(DatasetError, match=r"within 20 ms of a pose of the reference \(0\.000 to 0\.633 s\)"):
+    with pytest.raises(
+        DatasetError,
+        match=r"0 of 20 .* within 20 ms of a pose of the reference \(0\.000 to 0\.633 s.*--time-offset auto",
+    ):
         ate(late, reference)
-    with pytest.raises(DatasetError, match="only 2 of 2 estimated poses"):
+    with pytest.raises(DatasetError, match="2 of 2 estimated poses"):
         ate(Trajectory(reference.timestamps[:2], reference.Ts_world_camera[:2]), reference)
     with pytest.raises(DatasetError, match="holds no pose"):
         ate(Trajectory(np.empty(0), np.empty((0, 4, 4))), reference)
@@ -233,3 +239,81 @@ def test_relative_error_equals_that_of_evo(delta, unit, flags, files, tmp_path):
         theirs = evo("evo_rpe", tmp_path, *flags, "--all_pairs", "-r", relation)
         assert getattr(ours, name).rmse == pytest.approx(theirs["rmse"], rel=1e-5)
         assert getattr(ours, name).max == pytest.approx(theirs["max"], rel=1e-5)
+
+
+def test_scale_and_errors_of_a_scaled_estimate_equal_those_of_evo(files, tmp_path):
+    """Sim(3) alignment of a monocular estimate; evo prints the scale it corrects."""
+    adjusted(files[0], scale=0.13).save(tmp_path / "est.txt")
+    estimate = Trajectory.load(tmp_path / "est.txt")
+    scale = fit_scale(estimate, files[1])
+    assert scale == pytest.approx(1 / 0.13, rel=0.01)
+    scaled = adjusted(estimate, scale=scale)
+    for align, flags in (("se3", ["-a"]), ("origin", ["--align_origin"]), ("none", [])):
+        theirs = evo("evo_ape", tmp_path, *flags, "--correct_scale")
+        assert ate(scaled, files[1], align).rmse == pytest.approx(theirs["rmse"], rel=1e-6), align
+    theirs = evo("evo_rpe", tmp_path, "-a", "--correct_scale", "-d", "30", "-u", "f", "--all_pairs")
+    assert rpe(scaled, files[1]).rmse == pytest.approx(theirs["rmse"], rel=1e-5)
+    fixed = Trajectory(files[1].timestamps, np.tile(np.eye(4), (len(files[1]), 1, 1)))
+    with pytest.raises(DatasetError, match="do not determine a scale"):
+        fit_scale(fixed, files[1])
+
+
+def test_errors_at_a_time_offset_equal_those_of_evo(files, tmp_path):
+    adjusted(files[0], -12.345).save(tmp_path / "est.txt")
+    estimate = Trajectory.load(tmp_path / "est.txt")
+    found = MotionComparison(estimate, files[1]).best().seconds
+    assert found == pytest.approx(12.345, abs=0.01)  # noise of 2 cm and 0.6 deg on every pose
+    theirs = evo("evo_ape", tmp_path, "-a", "--t_offset", f"{found:.6f}")
+    assert ate(adjusted(estimate, round(found, 6)), files[1]).rmse == pytest.approx(theirs["rmse"], rel=1e-5)
+
+
+# -- clocks and bodies ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("offset", [0.173, -4.2, 1403636579.763])
+@pytest.mark.parametrize("body", [np.eye(4), se3.exp(np.array([0.1, -0.2, 0.05, 1.2, -0.4, 2.0]))])
+def test_time_offset_is_found_whatever_world_body_scale_and_rate(offset, body):
+    reference = hand_held(900)
+    estimate = disturbed(Trajectory(reference.timestamps[200:600:3], reference.Ts_world_camera[200:600:3] @ body))
+    found = MotionComparison(adjusted(estimate, -offset, 0.2), reference).best()
+    assert found.seconds == pytest.approx(offset, abs=0.005)
+    assert found.unexplained < 0.05
+
+
+def test_time_offset_of_a_camera_that_only_turns_is_found_by_its_rotations():
+    t = np.arange(300) / 30
+    angles = 0.5 * np.sin(t) + 0.3 * np.sin(2.3 * t + 1)
+    Ts = np.array([se3.exp(np.array([0, 0, 0, 0, angle, 0])) for angle in angles])
+    found = MotionComparison(Trajectory(t[50:250] + 0.4, Ts[50:250]), Trajectory(t, Ts)).best()
+    assert found.seconds == pytest.approx(-0.4, abs=0.002)
+
+
+def test_no_time_offset_is_invented():
+    reference = hand_held(300)
+    fixed = Trajectory(reference.timestamps, np.tile(np.eye(4), (300, 1, 1)))
+    with pytest.raises(DatasetError, match="does not move; give --time-offset SECONDS"):
+        MotionComparison(fixed, fixed).best()
+    with pytest.raises(DatasetError, match="fewer than half"):
+        MotionComparison(reference, Trajectory(reference.timestamps[:50], reference.Ts_world_camera[:50])).best()
+
+
+def test_another_clock_and_another_body_are_hinted_at_and_noise_is_not():
+    reference = hand_held(600)
+    estimate = disturbed(reference, translation=0.01)
+    assert hints(estimate, reference, 0.02) == []
+    (clock,) = hints(adjusted(estimate, 0.3), reference, 0.02)
+    assert re.search(r"with -0\.(299|30\d) s .* --time-offset auto", clock)
+    turn = se3.exp(np.array([0.02, 0, 0.01, *(np.radians(133) * np.array([0.6, 0, 0.8]))]))
+    (other,) = hints(estimate, Trajectory(reference.timestamps, reference.Ts_world_camera @ turn), 0.02)
+    assert "turned by 133 deg" in other
+
+
+def test_too_few_matches_are_refused_with_the_option_that_mends_them():
+    reference = hand_held(300)
+    sparse = Trajectory(reference.timestamps[::30], reference.Ts_world_camera[::30])
+    assert ate(reference, sparse).num_pairs == 10  # every pose of the sparser one
+    half = Trajectory(reference.timestamps[::3], reference.Ts_world_camera[::3])
+    with pytest.raises(DatasetError, match=r"^0 of 100 .* a larger --max-difference, or --time-offset auto"):
+        ate(adjusted(half, 0.05), half)
+    with pytest.raises(DatasetError, match=r"^9 of 300 .*at least 30 are needed: give a larger --max-difference"):
+        ate(adjusted(reference, reference.timestamps[-1] - 8 / 30), reference)

@@ -53,6 +53,12 @@ def trajectory(
         str, Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
     ] = "se3",
     max_difference: GapOption = 0.02,
+    time_offset: Annotated[
+        str, Option(help="Seconds to add to the times of the estimate; auto: best agreement.", metavar="S|auto")
+    ] = "0",
+    scale: Annotated[
+        bool, Option("--scale", help="Also fit the scale of the estimate (Sim(3) alignment), as for one camera.")
+    ] = False,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
     plot_format: FormatOption = None,
@@ -64,9 +70,12 @@ def trajectory(
     """
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
-    from dudmap.evaluation.trajectory import path_figures, trajectory_figures
+    from dudmap.evaluation.hints import hints
+    from dudmap.evaluation.time_offset import MotionComparison
+    from dudmap.evaluation.trajectory import adjusted, fit_scale, path_figures, trajectory_figures
 
     ending = _plot_ending(plots, plot_format)
+    seconds = None if time_offset == "auto" else o.numbers(time_offset, 1, "--time-offset")[0]
     file, folder = find_trajectory(estimate)
     found = Trajectory.load(file)
     truth = find_reference(reference, folder)
@@ -74,13 +83,21 @@ def trajectory(
     figures |= path_figures(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
     alignment = cast("Align", align)  # checked by ate
     pictures: list[Path] = []
+    shown: dict[str, str] = {}
     target = _output_folder(out, folder if folder is not None else file.parent)
     if truth is not None:
         true = load_reference(truth)
         for remark in (*found.remarks, *true.remarks):
             say(f"dudmap: {remark}", err=True)
+        seconds = MotionComparison(found, true).best().seconds if seconds is None else seconds
+        found = adjusted(found, seconds)
+        factor = fit_scale(found, true, max_difference) if scale else 1.0
+        found = adjusted(found, scale=factor)
+        figures |= ({"time_offset_s": round(seconds, 6)} if seconds else {}) | ({"scale": factor} if scale else {})
         errors = trajectory_figures(found, true, alignment, max_difference)
         figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
+        figures["hints"] = hints(found, true, max_difference)
+        shown["pairs"] = f"{figures['pairs']} of {len(found)} estimated and {len(true)} true poses"
         if ending:
             pictures = _plot_trajectory(target, ending, found, true, alignment, max_difference)
     if ending and folder is not None and (folder / "residuals.npz").is_file():
@@ -91,7 +108,7 @@ def trajectory(
     if ending and not pictures:
         raise DatasetError("there is nothing to plot without a reference; name one with --reference")
     name = "evaluation.json" if folder is not None else f"{file.stem}.evaluation.json"
-    _report(figures, target / name, pictures, as_json=as_json, title="trajectory")
+    _report(figures, target / name, pictures, as_json=as_json, title="trajectory", shown=shown)
 
 
 @app.command()
@@ -262,8 +279,16 @@ def _output_folder(out: Path | None, default: Path) -> Path:
     return target
 
 
-def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool, title: str) -> None:
-    """Write the figures as JSON and print them."""
+def _report(
+    figures: Figures,
+    file: Path,
+    pictures: list[Path],
+    *,
+    as_json: bool,
+    title: str,
+    shown: dict[str, str] | None = None,
+) -> None:
+    """Write the figures as JSON and print them, those in ``shown`` as they stand there, and hints below the table."""
     text = json.dumps(figures, allow_nan=False)
     with writing(file):
         write_text(file, text + "\n")
@@ -275,11 +300,13 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
     from dudmap.app.terminal import plain_console
 
     table = Table(title=title, show_header=False)
-    for key, value in figures.items():
+    for key, value in (figures | (shown or {})).items():
         if value is not None and not isinstance(value, list | dict):
             table.add_row(*_shown(key, value))
     console = plain_console()
     console.print(table)
+    for hint in figures.get("hints", []):
+        console.print(f"hint: {hint}", soft_wrap=True)
     console.print("written: " + ", ".join(str(path) for path in [file, *pictures]), soft_wrap=True)
 
 
@@ -287,7 +314,8 @@ def _shown(key: str, value: object) -> tuple[str, str]:
     """Name and value of a figure for people: errors of a trajectory in millimetres and degrees."""
     match = re.fullmatch(r"((?:ate|rpe|drift|rotation)_\w+?)_(m|deg)(?:_per_(m|s))?", key)
     if not isinstance(value, float) or match is None:
-        return key, f"{value:.6g}" if isinstance(value, float) else str(value)
+        digits = 16 if key == "time_offset_s" else 6
+        return key, f"{value:.{digits}g}" if isinstance(value, float) else str(value)
     name, unit, per = match.groups()
     text = f"{1000 * value:.1f} mm" if unit == "m" else f"{value:.2f} deg"
     note = " (see rotation_rmse)" if name.startswith("ate_rot") else ""

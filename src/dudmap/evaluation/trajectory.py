@@ -5,6 +5,7 @@ seconds apart. Trajectories that cannot be compared (no overlap in time, or fewe
 ``DatasetError``, arguments that are not acceptable a ``ConfigError``.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, Self, get_args
@@ -23,6 +24,8 @@ Align = Literal["se3", "origin", "none"]
 Unit = Literal["s", "m"]
 
 FEWEST_PAIRS = 3
+SMALLEST_SHARE = 0.1
+"""Smallest share of the poses of the shorter trajectory with a partner: errors over fewer do not describe its path."""
 SMALLEST_SPREAD = 1e-3
 """Positions that spread less than this across their principal direction (metres, and as a share of the spread along
 it) do not determine a rotation."""
@@ -132,19 +135,51 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
         if not len(trajectory):
             raise DatasetError(f"the {name} trajectory holds no pose; nothing can be compared")
     pairs = associate(estimate.timestamps, reference.timestamps, max_difference)
-    if not pairs:
-        raise DatasetError(
-            f"no pose of the estimate ({_span(estimate)}) lies within {1000 * max_difference:g} ms of a pose of the "
-            f"reference ({_span(reference)}); give the reference of the same recording, or a larger difference"
-        )
-    if len(pairs) < FEWEST_PAIRS:
-        raise DatasetError(
-            f"only {len(pairs)} of {len(estimate)} estimated poses lie within {1000 * max_difference:g} ms of one of "
-            f"{len(reference)} reference poses; at least {FEWEST_PAIRS} are needed"
-        )
+    if len(pairs) < max(FEWEST_PAIRS, SMALLEST_SHARE * min(len(estimate), len(reference))):
+        raise DatasetError(_unpaired(len(pairs), estimate, reference, max_difference))
     pairs.sort()
     first, second = np.array(pairs).T
     return PosePairs(estimate.timestamps[first], estimate.Ts_world_camera[first], reference.Ts_world_camera[second])
+
+
+def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_difference: float) -> str:
+    """Sentence on trajectories of which too few poses match in time, with the option that the times suggest."""
+    shortest = min(len(estimate), len(reference))
+    if shortest < FEWEST_PAIRS:
+        mend = f"give a trajectory of at least {FEWEST_PAIRS} poses"
+    elif estimate.timestamps[0] > reference.timestamps[-1] or reference.timestamps[0] > estimate.timestamps[-1]:
+        mend = "give --time-offset auto if both are of one recording"
+    else:
+        mend = "give a larger --max-difference, or --time-offset auto if their clocks differ"
+    needed = max(FEWEST_PAIRS, math.ceil(SMALLEST_SHARE * shortest))
+    return (
+        f"{pairs} of {len(estimate)} estimated poses ({_span(estimate)}) lie within {1000 * max_difference:g} ms of a "
+        f"pose of the reference ({_span(reference)}, {len(reference)} poses); at least {needed} are needed: {mend}"
+    )
+
+
+def fit_scale(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> float:
+    """Scale that brings the positions of the estimate closest to the reference's (Umeyama 1991, eq. 42).
+
+    Raises:
+        DatasetError: The trajectories do not match in time, or one of them does not move.
+    """
+    _, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
+    positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
+    T, _ = umeyama(targets, positions)
+    positions, targets = positions - positions.mean(axis=0), targets - targets.mean(axis=0)
+    variance = float((positions**2).sum())
+    scale = float((targets * (positions @ T[:3, :3].T)).sum()) / variance if variance else 0.0
+    if not scale > 0:
+        raise DatasetError("the positions do not determine a scale: one of the trajectories does not move")
+    return scale
+
+
+def adjusted(estimate: Trajectory, seconds: float = 0.0, scale: float = 1.0) -> Trajectory:
+    """Trajectory with ``seconds`` added to its times and its positions times ``scale``."""
+    Ts = estimate.Ts_world_camera.copy()
+    Ts[:, :3, 3] *= scale
+    return Trajectory(estimate.timestamps + seconds, Ts)
 
 
 def ate(
@@ -188,6 +223,40 @@ def rpe(
     across gaps where tracking was lost, and leaves out all pairs that end at the last pose.) Metres are counted along
     the reference path.
     """
+    times, motion_estimate, motion_reference = _motions(estimate, reference, delta, unit, max_difference)
+    return RpeResult.of(times, se3.inverse(motion_reference) @ motion_estimate, delta, unit)
+
+
+def body_rotation(
+    estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP
+) -> tuple[Numbers, float, float]:
+    """Rotation of the reference's body in the camera, if its poses are those of another body on the camera.
+
+    Rotations of two bodies on one camera are ``R_body_camera`` apart: ``r_camera = R_camera_body r_body`` for the
+    rotation vectors of their motions in one second.
+
+    Returns:
+        R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976), and the root mean square of the
+        rotational RPE per second without and with this rotation, degrees.
+
+    Raises:
+        DatasetError: The trajectories do not match in time or are shorter than a second.
+    """
+    _, motions, motions_reference = _motions(estimate, reference, 1.0, "s", max_difference)
+    turns, turns_reference = se3.log_all(motions)[:, 3:], se3.log_all(motions_reference)[:, 3:]
+    R = se3.nearest_rotation(turns.T @ turns_reference)
+    turned = np.tile(np.eye(4), (len(motions), 1, 1))
+    turned[:, :3, :3] = R.T @ motions[:, :3, :3] @ R
+    before, after = (
+        np.degrees(se3.rotation_angles(se3.inverse(motions_reference) @ moved)) for moved in (motions, turned)
+    )
+    return R, Statistics.of(before).rmse, Statistics.of(after).rmse
+
+
+def _motions(
+    estimate: Trajectory, reference: Trajectory, delta: float, unit: Unit, max_difference: float
+) -> tuple[Numbers, Numbers, Numbers]:
+    """Times of the first pose (N,), and motions (N, 4, 4) of estimate and reference between the pairs of ``rpe``."""
     if unit not in get_args(Unit) or not (np.isfinite(delta) and delta > 0):
         raise ConfigError(f"delta is {delta} {unit}; expected a positive number of {' or '.join(get_args(Unit))}")
     stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
@@ -200,10 +269,7 @@ def rpe(
     if not len(i):
         length = position[-1] - position[0]
         raise DatasetError(f"no two poses are {delta:g} {unit} apart; the compared part is {length:.3g} {unit} long")
-    motion_reference = se3.inverse(Ts_reference[i]) @ Ts_reference[j]
-    motion_estimate = se3.inverse(Ts_estimate[i]) @ Ts_estimate[j]
-    E = se3.inverse(motion_reference) @ motion_estimate
-    return RpeResult.of(stamps[i], E, delta, unit)
+    return stamps[i], se3.inverse(Ts_estimate[i]) @ Ts_estimate[j], se3.inverse(Ts_reference[i]) @ Ts_reference[j]
 
 
 def trajectory_figures(

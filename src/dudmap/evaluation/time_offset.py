@@ -1,0 +1,130 @@
+"""Difference between the clocks of two trajectories of one camera, found from its motion."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import LARGEST_STEP, Trajectory
+from dudmap.errors import DatasetError
+
+Numbers = NDArray[np.float64]
+
+STEP = LARGEST_STEP / 3
+"""Step between the offsets that are compared first, seconds: three within a time of steady motion."""
+GRID = STEP / 5
+"""Step between the times at which the turns of the reference are computed, seconds: that of motion capture."""
+WINDOW = 2 * LARGEST_STEP
+"""Time over which rotations are compared, seconds: two times of steady motion."""
+SAMPLES = 300
+"""Largest number of compared poses of the estimate: neighbours in time are no independent measurements."""
+SMALLEST_OVERLAP = 0.5
+"""Smallest share of the estimate within the time of the reference. Short parts of two paths agree by chance."""
+CHUNK = 1000
+"""Number of offsets that are compared at a time; bounds the memory to 30 MB."""
+LARGEST_HINT = CHUNK * STEP / 2
+"""Largest offset that is looked for unasked, seconds: comparing these offsets takes 0.2 s."""
+
+
+class TimeOffset(NamedTuple):
+    """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
+
+    ``unexplained`` is ``1 - r^2``, 0 for equal motions and 1 for unrelated ones. r is the correlation of the positions
+    after their alignment, or that of the angles of rotation: the mean of both where both are defined.
+    """
+
+    seconds: float
+    unexplained: float
+
+
+class MotionComparison:
+    """Compares the motions of two trajectories at any time offset, independent of world frame, body frame and scale.
+
+    Raises:
+        DatasetError: A trajectory has fewer than two poses.
+    """
+
+    def __init__(self, estimate: Trajectory, reference: Trajectory) -> None:
+        if min(len(estimate), len(reference)) < 2:
+            raise DatasetError("a trajectory of one pose has no motion; no time offset can be found")
+        chosen = np.unique(np.linspace(0, len(estimate) - 1, SAMPLES).astype(int))
+        self.times, self.positions = estimate.timestamps[chosen], estimate.Ts_world_camera[chosen, :3, 3]
+        self.turns = _turns(estimate, self.times)
+        self.reference = reference
+        start, stop = reference.timestamps[[0, -1]]
+        self.grid = np.linspace(start, stop, max(2, 1 + int(np.ceil((stop - start) / GRID))))
+        self.grid_turns = _turns(reference, self.grid)
+
+    def best(self, largest: float = np.inf) -> TimeOffset:
+        """Best offset of at most ``largest`` seconds at which half of the estimate lies within the reference's time.
+
+        Raises:
+            DatasetError: There is no such offset, or one of the two does not move.
+        """
+        start, stop = self.reference.timestamps[0] - self.times[-1], self.reference.timestamps[-1] - self.times[0]
+        offsets = np.arange(max(start, -largest), min(stop, largest) + STEP, STEP)
+        parts = np.split(offsets, range(CHUNK, len(offsets), CHUNK))
+        found = np.concatenate([self._unexplained(part) for part in parts])
+        if not np.isfinite(found).any():
+            raise DatasetError(
+                "no time offset can be found: fewer than half of the estimated poses fit into the time of the "
+                "reference, or one of the two does not move; give --time-offset SECONDS"
+            )
+        near = float(offsets[np.argmin(found)])
+        step = minimize_scalar(lambda step: min(self.at(near + step), 1.0), bounds=(-STEP, STEP), method="bounded").x
+        seconds = min(near, near + float(step), key=self.at)
+        return TimeOffset(seconds, self.at(seconds))
+
+    def at(self, seconds: float) -> float:
+        """Share of the motion that an offset leaves unexplained; infinite if it cannot be computed."""
+        return float(self._unexplained(np.array([seconds]))[0])
+
+    def _unexplained(self, offsets: Numbers) -> Numbers:
+        """``at`` for offsets (M,)."""
+        known = self.reference.timestamps
+        times = self.times + offsets[:, None]
+        weights = ((times >= known[0]) & (times <= known[-1])).astype(np.float64)
+        enough = weights.mean(axis=1) >= SMALLEST_OVERLAP
+        axes = self.reference.Ts_world_camera[:, :3, 3].T
+        places = np.stack([np.interp(times, known, axis) for axis in axes], axis=-1)
+        turns = np.interp(times, self.grid, self.grid_turns)
+        both = weights * np.isfinite(turns + self.turns)
+        shares = np.stack([
+            _unrelated(places, np.broadcast_to(self.positions, places.shape), weights),
+            _unrelated(np.nan_to_num(turns)[..., None], np.nan_to_num(self.turns)[None, :, None], both),
+        ])  # fmt: skip
+        defined = np.isfinite(shares)
+        mean = np.where(defined, shares, 0).sum(axis=0) / np.maximum(defined.sum(axis=0), 1)
+        return np.where(enough & defined.any(axis=0), mean, np.inf)
+
+
+def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
+    """``1 - r^2`` of points (M, K, d) with weights (M, K) at the best rotation (Umeyama 1991); NaN without motion."""
+    total = np.maximum(weights.sum(axis=1), 1)[:, None, None]
+    w = weights[..., None]
+    a, b = (w * (points - (w * points).sum(axis=1, keepdims=True) / total) for points in (a, b))
+    H = np.swapaxes(a, 1, 2) @ b
+    singular = np.linalg.svd(H, compute_uv=False)
+    if H.shape[-1] == 3:
+        singular[:, 2] *= np.sign(np.linalg.det(H))  # -1 where the best orthogonal matrix is a reflection
+    else:
+        singular = H[..., 0]  # numbers are not turned: their correlation keeps its sign
+    spreads = (a**2).sum(axis=(1, 2)) * (b**2).sum(axis=(1, 2))
+    r = np.maximum(singular.sum(axis=1), 0) / np.sqrt(np.where(spreads > 0, spreads, np.nan))
+    return 1 - r**2
+
+
+def _turns(trajectory: Trajectory, times: Numbers) -> Numbers:
+    """Angles (N,) by which the camera turns in ``WINDOW`` seconds after given times, radians; NaN near the end."""
+    Ts, stamps = trajectory.Ts_world_camera, trajectory.timestamps
+    motions = se3.log_all(se3.inverse(Ts[:-1]) @ Ts[1:])
+
+    def at(moments: Numbers) -> Numbers:
+        before = np.clip(np.searchsorted(stamps, moments, side="right") - 1, 0, len(stamps) - 2)
+        shares = (moments - stamps[before]) / (stamps[before + 1] - stamps[before])
+        return Ts[before] @ se3.exp_all(np.clip(shares, 0, 1)[:, None] * motions[before])
+
+    angles = se3.rotation_angles(se3.inverse(at(times)) @ at(times + WINDOW))
+    return np.where(times + WINDOW <= stamps[-1], angles, np.nan)
