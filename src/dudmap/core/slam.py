@@ -12,7 +12,7 @@ from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.frames.frame import Frame, FrameArrays
+from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
 from dudmap.core.frames.observation import Observation, Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
@@ -39,7 +39,6 @@ from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
-from dudmap.errors import ConfigError
 
 
 class Slam(SlamResults, Stateful):
@@ -174,11 +173,7 @@ class Slam(SlamResults, Stateful):
             ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
             FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
-        if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (
-            frame is not None and arrays
-        ):
-            raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
-        view = self.prepare(frame or Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale), dynamic_mask)
+        view = self.prepare(given_frame(frame, arrays, self.camera.depth_scale), dynamic_mask)
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
         if rejection:
