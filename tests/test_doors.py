@@ -6,9 +6,18 @@ from pathlib import Path
 import dudmap
 
 ROOT = Path(dudmap.__file__).parent
-DOORS = ("core", "io", "evaluation", "app", "lab", "fleet", "cli")
+DOORS = ("core", "thesis", "io", "evaluation", "app", "lab", "fleet", "cli")
 """From the bottom up: each may import those before it."""
-FOUNDATION = {"atomic_file", "config", "errors", "extras", "input_files", "own_folder", "presets"}
+FOUNDATION = {
+    "atomic_file",
+    "config",
+    "errors",
+    "extras",
+    "input_files",
+    "own_folder",
+    "config_section",
+    "thesis_config",
+}
 """Modules of the root, which every part may import, and which import only each other."""
 
 

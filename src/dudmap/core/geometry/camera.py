@@ -28,7 +28,8 @@ class Camera:
         cx, cy: Principal point in pixels.
         width, height: Image size in pixels.
         depth_scale: Units of 16-bit depth images per metre; 1000 = millimetres, the unit of most sensors.
-        distortion: Coefficients k1, k2, p1, p2[, k3] of the Brown-Conrady model (thesis eq. 3.88), empty for none.
+        distortion: Coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the Brown-Conrady model, the last three of its
+            denominator (thesis eq. 3.87, 3.88); empty for none.
     """
 
     fx: float
@@ -61,9 +62,10 @@ class Camera:
             raise DatasetError(f"camera image is {self.width}x{self.height}; at least 16x16 pixels are needed")
         if self.width * self.height > LARGEST_PIXELS:
             raise DatasetError(f"camera image is {self.width}x{self.height}; at most {LARGEST_PIXELS} pixels are read")
-        if len(self.distortion) not in (0, 4, 5):
+        if len(self.distortion) not in (0, 4, 5, 8):
             raise DatasetError(
-                f"camera has {len(self.distortion)} distortion coefficients; expected none, 4 (k1 k2 p1 p2) or 5 (k3)"
+                f"camera has {len(self.distortion)} distortion coefficients; expected none, "
+                "4 (k1 k2 p1 p2), 5 (k3) or 8 (k4 k5 k6)"
             )
 
     @property
