@@ -82,7 +82,6 @@ class FakeSlam:
         localize=False,
         max_blocks=None,
         timed=True,
-        ignore=None,
     ):
         type(self).timed = timed
         self.localize = localize

@@ -13,25 +13,37 @@ def test_toml_round_trip(tmp_path):
 
 
 def test_a_file_may_name_a_few_keys_only(tmp_path):
-    (tmp_path / "mine.toml").write_text('preset = "thesis"\n[tracker]\nhuber = 0.03\n')
+    (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.03\n")
     config = Config.load(tmp_path / "mine.toml")
     assert config.tracker.huber == 0.03
-    assert config.tracker.noise_weighting is False
+    assert config.tracker.damping == Config().tracker.damping
 
 
-def test_the_thesis_preset_has_the_thesis_values():
-    config = Config().override(["preset=thesis"])
-    assert config.volume.voxel_size == 0.01
-    assert (config.tracker.huber, config.tracker.damping, config.tracker.color_weight) == (0.01, 0.02, 0.1325)
-    assert config.similarity.threshold == 0.84
-    assert (config.preprocess.filter_alpha, config.preprocess.filter_sigma_px) == (0.012, 4.0)
-    assert config.tracker.stop == config.tracker.stop_coarse == 1e-3
-    assert (config.volume.weighting, config.dynamics.method) == ("constant", "em")
-    # eq. 4.57 needs distances beyond its threshold, and the band must hold the noise at the far end of the sensor
-    band, sensor = config.volume.truncation_voxels * config.volume.voxel_size, config.sensor
-    assert band > config.dynamics.noise_threshold
-    assert band >= 3 * (sensor.sigma_base + sensor.sigma_scale * 4.0**2)
-    assert not config.relocalization.enabled
+def test_the_system_of_the_thesis_has_the_values_of_the_thesis():
+    thesis = Config().override(["system=thesis"]).thesis
+    assert (thesis.tau, thesis.rho, thesis.lambda_0, thesis.upsilon) == (0.01, 0.01, 0.02, 0.1325)  # section 6.1
+    assert (thesis.similarity, thesis.alpha, thesis.sigma_s) == (0.84, 12, 4)  # section 4.3
+    assert (thesis.iterations, thesis.stop) == (5, 1e-3)  # algorithm 2
+    assert thesis.d_max > thesis.theta, "eq. 4.57 needs distances beyond its threshold"
+
+
+@pytest.mark.parametrize(
+    ("assignments", "says"),
+    [
+        (["system=thesis", "tracker.huber=0.02"], "the system thesis has no parameter tracker.huber"),
+        (["thesis.rho=0.02"], "the system dudmap has no parameter thesis.rho"),
+    ],
+)
+def test_parameters_of_another_system_are_refused_by_name(assignments, says):
+    with pytest.raises(ConfigError, match=says):
+        Config().override(assignments).check_used()
+
+
+def test_presets_of_earlier_versions(tmp_path):
+    (tmp_path / "old.toml").write_text('preset = "default"\n')
+    assert Config.load(tmp_path / "old.toml") == Config()
+    with pytest.raises(ConfigError, match='system = "thesis"'):
+        Config().override(["preset=thesis"])
 
 
 @pytest.mark.parametrize(
@@ -48,7 +60,7 @@ def test_the_thesis_preset_has_the_thesis_values():
         ("volume.max_readings=2", "no voxel would ever be trusted"),
         ("tracker.iterations=[1]", "one entry per level"),
         ("tracker.huber", "key=value"),
-        ("preset=best", "thesis"),
+        ("system=best", "thesis"),
         ("tracker.huber.x=1", "not acceptable"),
     ],
 )

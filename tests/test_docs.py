@@ -102,7 +102,7 @@ def test_every_parameter_is_listed_with_its_part():
     rows = re.findall(r"^\| `([a-z]+)` \| .* \| (.*) \|$", page, flags=re.MULTILINE)
     listed = {f"{part}.{key}" for part, names in rows for key in re.findall(r"`([a-z0-9_]+)`", names)}
     assert listed == {key for key in keys() if "." in key}
-    assert {part for part, _ in rows} == {key.partition(".")[0] for key in keys()} - {"preset"}
+    assert {part for part, _ in rows} == {key.partition(".")[0] for key in keys()} - {"system"}
 
 
 def test_the_printed_configuration_is_the_default(tmp_path):

@@ -53,9 +53,9 @@ def test_the_demo_leaves_a_run_folder_with_a_picture(demo):
     assert picture.std() > 20
 
 
-@pytest.mark.parametrize("preset", ["default", "thesis"])
-def test_a_real_excerpt_is_tracked(tmp_path, preset):
-    report = run(open_sequence(EXCERPT), Config.from_tree({"preset": preset}), tmp_path, progress=False)
+@pytest.mark.parametrize("system", ["dudmap", "thesis"])
+def test_a_real_excerpt_is_tracked(tmp_path, system):
+    report = run(open_sequence(EXCERPT), Config.from_tree({"system": system}), tmp_path, progress=False)
     assert report.metrics["tracked"] == 12
     assert report.metrics["ate_rmse_m"] <= 0.012
     assert report.metrics["mesh_triangles"] > 10_000

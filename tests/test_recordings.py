@@ -2,7 +2,7 @@
 
     DUDMAP_DATA=FOLDER pytest -m data tests/test_recordings.py
 
-Every sequence folder in it is run in full by the default configuration and by preset thesis.
+Every sequence folder in it is run in full by the default configuration and by the system of the thesis.
 """
 
 import os
@@ -43,7 +43,7 @@ CUT_ATE_M = 0.025
 MARGIN = 1.5
 """Factor on these errors, for processors that round differently."""
 TRACKED_BY_THESIS = 0.95
-"""Smallest share of tracked frames with preset thesis."""
+"""Smallest share of tracked frames of the system of the thesis."""
 
 pytestmark = [
     pytest.mark.data,
@@ -124,8 +124,8 @@ def test_a_camera_that_jumps_is_not_silently_wrong_without_colour(pieces):
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
-def test_preset_thesis_tracks(folder, tmp_path):
-    config = Config.from_tree({"preset": "thesis"})
+def test_the_system_of_the_thesis_tracks(folder, tmp_path):
+    config = Config.from_tree({"system": "thesis"})
     metrics = run(open_sequence(folder), config, tmp_path, progress=False, save_map=False).metrics
     assert metrics["tracked"] >= TRACKED_BY_THESIS * metrics["frames"], metrics["lost_frames"][:3]
 

@@ -85,7 +85,6 @@ def test_a_map_is_exposed_as_usual_though_the_camera_begins_in_the_dark(recordin
 @pytest.mark.parametrize(
     "assignments",
     [
-        ["preset=thesis"],
         ["tracker.robust=tukey"],
         ["tracker.second_pass=false"],
         ["tracker.constant_velocity=false"],

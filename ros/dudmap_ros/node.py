@@ -27,7 +27,6 @@ SETTINGS = {
     "saved_map": "",
     "localize": False,
     "watch": False,
-    "ignore": "",
     "save_to": "dudmap_run",
     "surface_period": 5.0,
     "mesh_triangles": 50_000,
@@ -69,9 +68,8 @@ class DudmapNode(LifecycleNode):
         try:
             config = config_of({key: self.setting(key) for key in self.keys})
             self.session = Session(
-                config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch"),
-                self.setting("ignore") or None,
-            )  # fmt: skip
+                config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch")
+            )
         except DudmapError as error:
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE

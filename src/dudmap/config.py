@@ -12,18 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from dudmap.atomic_file import write_text
+from dudmap.config_section import ConfigSection
 from dudmap.errors import ConfigError
 from dudmap.input_files import parse_toml, read_toml
-from dudmap.presets import PRESETS
-
-
-class ConfigSection(BaseModel):
-    """Base class of all sections: immutable, rejects unknown keys, documented by the docstrings of its fields."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+from dudmap.thesis_config import ThesisConfig
 
 
 def reading_sigma(z: Any, base: Any, scale: Any) -> Any:  # noqa: ANN401 - numbers or arrays
@@ -339,8 +334,9 @@ class MoversConfig(ConfigSection):
 class Config(ConfigSection):
     """All parameters."""
 
-    preset: Literal["default", "thesis"] = "default"
-    """Set of values from which the configuration starts."""
+    system: Literal["dudmap", "thesis"] = "dudmap"
+    """System that processes the frames: the default one, or that of the thesis as written, whose parameters are those
+    of the section ``thesis`` alone."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
     """Where the frames are computed: cpu, cuda, or cuda:1 for the second GPU (extra gpu); auto takes a GPU where one
     works and ``volume.adaptive`` is off; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""
@@ -354,10 +350,11 @@ class Config(ConfigSection):
     loops: LoopsConfig = LoopsConfig()
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
+    thesis: ThesisConfig = ThesisConfig()
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":
-        """Configuration of a TOML file; parameters it does not set keep the value of its preset.
+        """Configuration of a TOML file; parameters it does not set keep their defaults.
 
         Raises:
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
@@ -372,17 +369,15 @@ class Config(ConfigSection):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "Config":
-        """Configuration of nested dictionaries; parameters they do not set keep the value of their preset.
+        """Configuration of nested dictionaries; parameters they do not set keep their defaults.
 
         Raises:
             ConfigError: A key is unknown or a value invalid.
         """
+        tree = _without_preset(tree)
         _check_keys(tree)
-        preset = tree.get("preset", "default")
-        if not isinstance(preset, str) or preset not in PRESETS:
-            raise ConfigError(f"unknown preset {preset!r}; expected one of {', '.join(PRESETS)}")
         try:
-            return cls.model_validate(_merged(PRESETS[preset], tree))
+            return cls.model_validate(tree)
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"]) or "configuration"
@@ -391,7 +386,7 @@ class Config(ConfigSection):
     def override(self, assignments: Iterable[str]) -> "Config":
         """Configuration with assignments ``key=value`` applied, e.g. ``tracker.huber=0.02``.
 
-        Values are TOML or plain words. An assignment of ``preset`` discards all present values.
+        Values are TOML or plain words.
 
         Raises:
             ConfigError: An assignment is malformed, its key unknown or its value invalid.
@@ -408,9 +403,25 @@ class Config(ConfigSection):
                 if not isinstance(branch, dict):
                     raise ConfigError(f"{key.strip()} is not a key: {part} holds a value")
             branch[parts[-1]] = _value(text.strip())
-        base = {} if "preset" in tree else self.model_dump()
+        tree = _without_preset(tree)
         _check_keys(tree)
-        return self.from_tree(_merged(base, tree))
+        return self.from_tree(_merged(self.model_dump(), tree))
+
+    def check_used(self) -> None:
+        """Refuse parameters that differ from their defaults and that ``system`` does not have.
+
+        Raises:
+            ConfigError: There is such a parameter; the sentence names it.
+        """
+        used, default = self.system == "thesis", Config()
+        for key in keys():
+            section, _, name = key.partition(".")
+            foreign = bool(name) and (section == "thesis") != used
+            if foreign and getattr(getattr(self, section), name) != getattr(getattr(default, section), name):
+                other = "dudmap" if used else "thesis"
+                raise ConfigError(
+                    f"the system {self.system} has no parameter {key}; leave it out, or choose --system {other}"
+                )
 
     def to_toml(self) -> str:
         """TOML text of all values."""
@@ -423,11 +434,21 @@ class Config(ConfigSection):
 
 def keys() -> list[str]:
     """All dotted keys."""
-    out = ["preset", "device"]
+    out = ["system", "device"]
     for part, field in Config.model_fields.items():
         if isinstance(field.default, ConfigSection):
             out += [f"{part}.{key}" for key in type(field.default).model_fields]
     return out
+
+
+def _without_preset(tree: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The tree without the key ``preset`` of earlier versions, whose only use was the default."""
+    if tree.get("preset", "default") != "default":
+        raise ConfigError(
+            f'the key preset = {tree["preset"]!r} is gone; system = "thesis" (--system thesis) runs the system of the '
+            "thesis as written, with the parameters of the section thesis"
+        )
+    return {key: value for key, value in tree.items() if key != "preset"}
 
 
 def _check_keys(tree: Mapping[str, Any]) -> None:

@@ -101,7 +101,7 @@ def test_systems_are_configurations(tmp_path):
     assert found["none"].dynamics.method == "none"
     assert found["threshold"].dynamics.method == "threshold"
     assert not found["em"].dynamics.free_space
-    assert found["thesis"].preset == "thesis"
+    assert found["thesis"].system == "thesis"
     assert (
         len({str(config) for config in systems(USUAL["ablation"]).values()}) == 13
     )  # two-passes has the default configuration

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import dudmap
 from dudmap.cli import COMMANDS, app
 from dudmap.cli.config import commented
-from dudmap.config import PRESETS, Config
+from dudmap.config import Config
 from dudmap.core.geometry.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH, cut, write_recording
 
@@ -85,11 +85,11 @@ def test_wrong_usage_is_exit_code_2(recording):
 # -- config -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_config_prints_toml_that_reads_back(preset, tmp_path):
-    result = call("config", "--preset", preset)
+@pytest.mark.parametrize("system", ["dudmap", "thesis"])
+def test_config_prints_toml_that_reads_back(system, tmp_path):
+    result = call("config", "--system", system)
     assert result.exit_code == 0
-    assert Config.from_tree(tomllib.loads(result.stdout)) == Config.from_tree({"preset": preset})
+    assert Config.from_tree(tomllib.loads(result.stdout)) == Config.from_tree({"system": system})
 
 
 def test_config_explains_every_parameter():
@@ -99,8 +99,8 @@ def test_config_explains_every_parameter():
             assert lines[number - 1].startswith("# "), line
 
 
-def test_config_of_an_unknown_preset():
-    assert "unknown preset 'fancy'; expected one of default, thesis" in sentence_of("config", "--preset", "fancy")
+def test_config_of_an_unknown_system():
+    assert "system = 'fancy' is not acceptable" in sentence_of("config", "--system", "fancy")
 
 
 # -- run --------------------------------------------------------------------------------------------------------------
@@ -137,17 +137,27 @@ def test_quiet_prints_nothing(slam, recording):
     assert result.output == ""
 
 
-def test_parameters_come_from_file_preset_and_single_assignments(slam, recording, tmp_path):
+def test_parameters_come_from_file_and_single_assignments(slam, recording, tmp_path):
     (tmp_path / "my.toml").write_text("[volume]\nvoxel_size = 0.02\n")
     call("run", recording, "--config", "my.toml", "--set", "tracker.huber=0.03", "--out", "a")
     used = Config.load("a/config.toml")
     assert (used.volume.voxel_size, used.tracker.huber) == (0.02, 0.03)
-    call("run", recording, "--preset", "thesis", "--set", "dynamics.method=none", "--out", "b")
-    used = Config.load("b/config.toml")
-    assert used.preset == "thesis"
-    assert used.dynamics.method == "none"
-    assert used.tracker.noise_weighting is False
-    assert "are mutually exclusive" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
+    assert "the system thesis has no parameter volume.voxel_size" in sentence_of(
+        "run", recording, "--config", "my.toml", "--system", "thesis"
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--passes", "2"], "second pass"),
+        (["--max-memory", "1GB"], "memory limit"),
+        (["--masks", "desk/rgb"], "given masks"),
+        (["--set", "tracker.huber=0.02"], "tracker.huber"),
+    ],
+)
+def test_the_system_of_the_thesis_names_options_that_it_does_not_have(recording, option, says):
+    assert f"no {says}" in sentence_of("run", recording, "--system", "thesis", *option).replace("parameter ", "")
 
 
 def test_what_was_calibrated_beforehand_is_not_estimated_again(slam, recording):
@@ -170,7 +180,7 @@ def test_what_was_calibrated_beforehand_is_not_estimated_again(slam, recording):
         (["--set", "volume.voxel_size=-1"], "volume.voxel_size = -1 is not acceptable"),
         (["--set", "volume.voxel_size"], "expected key=value"),
         (["--config", "missing.toml"], "cannot read the configuration missing.toml"),
-        (["--preset", "fancy"], "unknown preset 'fancy'"),
+        (["--system", "fancy"], "system = 'fancy' is not acceptable"),
         (["--camera", "1,2,3"], "expected fx,fy,cx,cy"),
         (["--camera", "500,500,320,240,640,480"], "640x480 pixels, but the recording's depth images are 64x48"),
         (["--out", "desk/rgb.txt"], "cannot write into the run folder desk/rgb.txt"),

@@ -77,7 +77,7 @@ CALLS = {
     "evaluate masks": ["evaluate", "masks", "run", "recording"],
     "evaluate timings": ["evaluate", "timings", "seen"],
     "doctor": ["doctor"],
-    "config": ["config", "--preset", "thesis"],
+    "config": ["config", "--system", "thesis"],
 }
 """Quick calls; the answers of the other commands have their own test below, or go through the same function."""
 
@@ -144,7 +144,7 @@ MISSING = {
     "live": ["live", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
     "demo": ["demo", "--set", "no.such=1"], "synth": ["synth", "out", "--scene", "moon"],
     "evaluate": ["evaluate", "nowhere"], "evaluate mesh": ["evaluate", "mesh", "nowhere", "there"],
-    "evaluate masks": ["evaluate", "masks", "nowhere", "there"], "config": ["config", "--preset", "none"],
+    "evaluate masks": ["evaluate", "masks", "nowhere", "there"], "config": ["config", "--system", "none"],
     "benchmark": ["benchmark", "synthetic", "--systems", "none-such"], "study": ["study", "nowhere.toml"],
     "gate": ["benchmark", "gate", "--figures", "nowhere.toml"],
 }  # fmt: skip
@@ -228,10 +228,10 @@ def test_no_color_is_honoured_on_a_terminal(where, no_color):
     [
         ("dudmap ca", {"calibrate"}),
         ("dudmap evaluate ma", {"masks"}),
-        ("dudmap run --prese", {"--preset"}),
-        ("dudmap run --preset th", {"thesis"}),
+        ("dudmap run --syste", {"--system"}),
+        ("dudmap run --system th", {"thesis"}),
         ("dudmap run --set tracker.hub", {"tracker.huber="}),
-        ("dudmap config --preset ", {"default", "thesis"}),
+        ("dudmap config --system ", {"dudmap", "thesis"}),
         ("dudmap live real", {"realsense"}),
     ],
 )

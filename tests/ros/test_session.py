@@ -95,7 +95,7 @@ def test_parameters_are_the_configuration_keys():
     assert config_of(defaults) == Config()
     changed = config_of(defaults | {"tracker.huber": 0.02, "tracker.widths": [40, 80, 160]})
     assert (changed.tracker.huber, changed.tracker.widths) == (0.02, (40, 80, 160))
-    assert config_of(defaults | {"preset": "thesis"}) == Config.from_tree({"preset": "thesis"})
+    assert config_of(defaults | {"system": "thesis"}) == Config.from_tree({"system": "thesis"})
     assert all(isinstance(value, bool | int | float | str | list) for value in defaults.values())
 
 

@@ -46,7 +46,6 @@ CASES = {
     "a person": ([], 18, 23, ()),
     "the first moments": ([], 4, 10, ()),
     "objects with meshes": (["movers.meshes=true", "movers.enabled=true"], 18, 23, ()),
-    "thesis": (["preset=thesis"], 8, 13, ()),
     "every frame kept": (["loops.keep_gap=1", "relocalization.keyframe_gap=1", "loops.min_age=0.2"], 18, 23, ()),
     "lost": (["submaps.patience=0.3"], 16, 24, range(12, 18)),
     "several voxel sizes": (["volume.adaptive=true", "volume.adaptive_bend=0.05"], 9, 14, ()),
@@ -101,7 +100,7 @@ def test_a_system_that_calibrates_itself_is_stored_after_every_frame(tmp_path, m
     assert slam.calibration.delay == DELAY
 
 
-@pytest.mark.parametrize("settings", [["movers.meshes=true", "movers.enabled=true"], ["preset=thesis"]])
+@pytest.mark.parametrize("settings", [["movers.meshes=true", "movers.enabled=true"], ["similarity.measure=features"]])
 def test_what_a_snapshot_does_not_copy_never_changes(tmp_path, settings):
     """Arrays of frozen classes are written by another thread while the next frames are processed."""
     sequence = synthetic.sequence("room", movers=("person", "ball"), frames=20, camera=SMALL, camera_path="fast",

@@ -17,7 +17,7 @@ GOOD = {"factors": {"tracker.huber": [0.005, 0.01, 0.02]}, "sequences": [ROOM], 
 def test_runs_are_points_times_sequences_times_replicates():
     plan = make_plan(
         {
-            "base": ["preset=thesis"],
+            "base": ["device=cpu"],
             "factors": {"tracker": {"huber": [0.005, 0.01]}, "dynamics.method": ["em", "none"]},
             "sequences": [{**ROOM, "replicates": 3, "seed": 5}, {"name": "other", "scene": "box", "frames": 6}],
             "responses": ["ate", "ms"],
@@ -26,7 +26,7 @@ def test_runs_are_points_times_sequences_times_replicates():
     runs = plan.runs()
     assert len(runs) == 4 * 4 == len({run.key for run in runs})
     assert {run.entry.parameters["seed"] for run in runs if run.sequence == "room"} == {5, 6, 7}
-    assert {run.config.preset for run in runs} == {"thesis"}
+    assert {run.config.device for run in runs} == {"cpu"}
     assert {(run.config.tracker.huber, run.config.dynamics.method) for run in runs} == {
         (huber, method) for huber in (0.005, 0.01) for method in ("em", "none")
     }
@@ -49,12 +49,14 @@ def test_the_same_run_has_the_same_key_and_another_one_has_not():
     assert not {run.key for run in first.runs()} & {run.key for run in longer.runs()}
 
 
-@pytest.mark.parametrize(("table", "runs"), [("6.1", 81), ("6.2", 10), ("6.3", 12)])
+@pytest.mark.parametrize(
+    ("table", "runs"), [("4.1", 16), ("4.2", 8), ("6.1", 81), ("6.2", 10), ("6.3", 12), ("figure 4.5", 7)]
+)
 def test_the_studies_of_the_thesis_have_its_runs(table, runs):
     plan = thesis_plan(table)
     plan.check()
     assert len(plan.runs()) == runs
-    assert {run.config.preset for run in plan.runs()} == {"thesis"}
+    assert {run.config.system for run in plan.runs()} == {"thesis"}
 
 
 @pytest.mark.parametrize(
@@ -83,7 +85,7 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"responses": ["speed"]}, "unknown response 'speed'"),
         ({"responses": ["mask_iou"]}, "no true masks of anything that moves"),
         ({"responses": ["rpe"]}, "shorter than one second"),
-        ({"base": ["preset=best"]}, "unknown preset"),
+        ({"base": ["system=best"]}, "system = 'best'"),
         ({"confirm": -1}, "confirmation runs"),
         ({"calibrate": "yes"}, "true or false"),
         ({"faktors": {}}, "unknown key 'faktors' of the design"),

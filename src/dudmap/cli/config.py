@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from dudmap.config import Config
 
 
-def config(preset: o.PresetOption = None, as_json: o.JsonOption = False) -> None:
+def config(system: o.SystemOption = None, as_json: o.JsonOption = False) -> None:
     """Print all parameters with their meanings as TOML, the format of --config."""
-    found = o.read_config(None, preset, None)
+    found = o.read_config(None, system, None)
     answer(found.model_dump(mode="json"), commented(found).rstrip("\n"), as_json=as_json)
 
 

@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Recording
 
 GROUPS = {
-    "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --ignore --run "
-    "--trajectory --reference --max-frames --every",
+    "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --run --trajectory "
+    "--reference --max-frames --every",
     "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
     "--resolution --heights --world",
     "Calibration": "--calibration",
     "Live and viewing": "--live --view --host --port --token --orbit --sweep",
     "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
-    "Advanced": "--config --preset --set --device --jobs --resume --checkpoint-every --help",
+    "Advanced": "--system --config --set --device --jobs --resume --checkpoint-every --help",
 }
 """Options by the group of the help pages that they stand in; those of a single command stand before them."""
 
@@ -56,11 +56,9 @@ def arranged(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved bet
     return command
 
 
-def preset_names(incomplete: str) -> list[str]:
-    """Presets that begin so, for the shell."""
-    from dudmap.presets import PRESETS
-
-    return [name for name in PRESETS if name.startswith(incomplete)]
+def system_names(incomplete: str) -> list[str]:
+    """Systems that begin so, for the shell."""
+    return [name for name in ("dudmap", "thesis") if name.startswith(incomplete)]
 
 
 def parameter_names(incomplete: str) -> list[str]:
@@ -93,8 +91,13 @@ PassesOption = Annotated[
 SeedOption = Annotated[int, Option(min=0, help="Seed of all that is random.", metavar="N")]
 SizeOption = Annotated[str, Option(help="Image size in pixels.", metavar="WxH")]
 
-PresetOption = Annotated[
-    str | None, Option(help="Preset of the parameters: default or thesis.", metavar="NAME", autocompletion=preset_names)
+SystemOption = Annotated[
+    str | None,
+    Option(
+        help="System that processes the frames: dudmap, or thesis as its chapter 4 describes it.",
+        metavar="NAME",
+        autocompletion=system_names,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -109,10 +112,6 @@ JobsOption = Annotated[
     int, Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
-IgnoreOption = Annotated[
-    Path | None,
-    Option(help="Image, white at pixels that never count, such as a robot's arm in view.", metavar="MASK.png"),
-]
 SaveMasksOption = Annotated[bool, Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")]
 HostOption = Annotated[
     str, Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
@@ -170,12 +169,12 @@ class ParameterOptions:
     """Options that give the parameters."""
 
     config: Annotated[Path | None, Option(help="TOML file of parameters.", metavar="FILE")] = None
-    preset: PresetOption = None
+    system: SystemOption = None
     assignments: SetOption = None
 
     def read(self, *more: str) -> "Config":
         """The parameters, some of them set by ``more``."""
-        return read_config(self.config, self.preset, [*(self.assignments or []), *more])
+        return read_config(self.config, self.system, [*(self.assignments or []), *more])
 
 
 @dataclass(frozen=True)
@@ -281,13 +280,11 @@ def memory_size(text: str | None) -> int | None:
         raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
 
 
-def read_config(file: Path | None, preset: str | None, assignments: list[str] | None) -> "Config":
-    """Configuration of a file or a preset, with single parameters set."""
+def read_config(file: Path | None, system: str | None, assignments: list[str] | None) -> "Config":
+    """Configuration of a file or the defaults, with the system and single parameters set."""
     from dudmap.config import Config
 
-    if file is not None and preset is not None:
-        raise ConfigError(
-            f"--config and --preset are mutually exclusive; write preset = {preset!r} into {file} instead"
-        )
-    config = Config.load(file) if file is not None else Config.from_tree({"preset": preset} if preset else {})
-    return config.override(assignments or [])
+    config = Config() if file is None else Config.load(file)
+    config = config.override([*([f"system={system}"] if system else []), *(assignments or [])])
+    config.check_used()
+    return config

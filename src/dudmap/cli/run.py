@@ -31,7 +31,6 @@ def run(
         Path | None,
         Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
     ] = None,
-    ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<recording>.")] = None,
     save_masks: o.SaveMasksOption = True,
@@ -94,9 +93,14 @@ def run(
         say(f"warning: {warning}", err=True)
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
-    if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
+    ours = config.system == "dudmap"
+    if ours and (calibration != "auto" or not live):  # what has been estimated beforehand is not estimated again
         config = config.override(["sensor.self_calibration=false"])
-    storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, watching.report)
+    storing = (
+        None
+        if live or checkpoint_every == 0 or not ours
+        else Storing(recording.opened, checkpoint_every, watching.report)
+    )
     if watch and mapped.saved is None:
         raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
     with observers(watching) as watchers, run_compiled_beside(live=live):
@@ -107,8 +111,8 @@ def run(
             watchers += (ChangeWatch(SavedMap.load(mapped.saved), watchers),)
         done = run_sequence(
             recording, config, out,
-            max_frames=max_frames, save_masks=save_masks, masks=masks, ignore=ignore, progress=not quiet,
-            live=live, passes=passes, calibration=given, calibrate=calibration == "auto" and not live,
+            max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
+            calibration=given, calibrate=calibration == "auto" and not live and ours,
             saved_map=saved_map, localize=mapped.localize, max_memory=o.memory_size(mapped.max_memory),
             observers=watchers, storing=storing, warnings=warnings,
         )  # fmt: skip
@@ -123,7 +127,7 @@ def run_parameters(
     from dudmap.core.places.saved_map import SavedMap
 
     saved = mapped.saved
-    if saved is not None and parameters.config is parameters.preset is None and (saved / "config.toml").is_file():
+    if saved is not None and parameters.config is parameters.system is None and (saved / "config.toml").is_file():
         parameters = replace(parameters, config=saved / "config.toml")
     config = parameters.read(*([f"device={mapped.device}"] if mapped.device else []))
     resolve(config.device, adaptive=config.volume.adaptive)  # refused before anything takes time

@@ -79,13 +79,14 @@ def thesis(
     recordings: Annotated[
         list[Path] | None, Argument(help="Recordings; default: a synthetic room with a walking person.")
     ] = None,
-    table: Annotated[str, Option(help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
+    table: Annotated[str, Option(help="Table 4.1, 4.2, 6.1, 6.2 or 6.3.")] = "6.1",
+    figure: Annotated[str | None, Option(help="Figure 4.5: the similarity threshold.")] = None,
     max_frames: o.MaxFramesOption = None,
     published: Annotated[
         bool, Option("--published", help="Analyse the printed values of table 6.1; nothing is run.")
     ] = False,
 ) -> None:
-    """Repeat the sensitivity study of the thesis (chapter 6)."""
+    """Repeat a study of the thesis (chapters 4 and 6) with its system."""
     from dudmap.lab.study.study import published_report, thesis_plan
 
     need("study", "dudmap study", STUDY)
@@ -93,8 +94,9 @@ def thesis(
         out = options.out or Path("runs/study/thesis-published")
         options.answer(published_report(out), out)
     else:
-        plan = thesis_plan(table, recordings or (), max_frames)
-        options.run(plan, options.out or Path("runs/study") / f"thesis-{table}")
+        name = table if figure is None else f"figure {figure}"
+        plan = thesis_plan(name, recordings or (), max_frames)
+        options.run(plan, options.out or Path("runs/study") / f"thesis-{name.replace(' ', '-')}")
 
 
 @app.command()

@@ -121,7 +121,6 @@ class SlamArguments:
     localize: bool
     max_blocks: int | MemoryLimit | None
     timed: bool
-    ignore: NDArray[np.bool_] | None
 
 
 class SlamResults:
@@ -158,6 +157,11 @@ class SlamResults:
         Another object after a new submap was started or two were joined. ``atlas.volume`` is the map as it is.
         """
         self.atlas.complete()
+        return self.atlas.volume
+
+    @property
+    def live_volume(self) -> TsdfVolume:
+        """Map of the current submap as it is, for viewers."""
         return self.atlas.volume
 
     @property

@@ -68,7 +68,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         return slam
 
     def variants() -> None:
-        for variant in ("preset=thesis", "dynamics.method=threshold", "tracker.robust=tukey"):
+        for variant in ("dynamics.method=threshold", "tracker.robust=tukey"):
             slam = Slam(CAMERA, Config().override([variant, *SMALL]))
             for frame in frames:
                 slam.process(frame)

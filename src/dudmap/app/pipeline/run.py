@@ -4,14 +4,14 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.frame_processing import process_source
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run_folder import IGNORED, RunReport, locked, prepare_run_folder, save_mask, write_run_folder
+from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
@@ -22,7 +22,6 @@ from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import has_color, is_timed
-from dudmap.io.sequences.images import read_ignored
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
@@ -45,7 +44,6 @@ def run(
     save_masks: bool = False,
     save_map: bool = True,
     masks: str | Path | None = None,
-    ignore: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
     live: bool = False,
@@ -84,7 +82,6 @@ def run(
         save_map: Write map.npz and keyframes.npz.
         masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
             ones. Frames with and without a mask are counted.
-        ignore: Image, white at the pixels of the depth or colour image that never count; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
         ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
             would distort the times. The result does not depend on it.
@@ -105,7 +102,7 @@ def run(
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with a camera or ``saved_map``; ``localize`` without a
-            ``saved_map``; ``storing`` with a camera.
+            ``saved_map``; ``storing`` with a camera; an option that the configured system does not have.
         CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
         DudmapError: Another process writes into the folder, it cannot be written, the recording cannot be used, or no
             frame could be tracked.
@@ -136,19 +133,21 @@ def run(
         raise ConfigError("a live run cannot be stored: it does not stop for what is missed; drop live or storing")
     if record is not None and not live:
         raise ConfigError("only the frames of a camera are recorded; these are on the disk already")
-    ignored = None if ignore is None else read_ignored(ignore, sequence.camera, calibration or sequence.calibration)
+    if config.system == "thesis":
+        foreign = {"second pass": passes == 2, "saved map": saved_map, "memory limit": max_memory, "given masks": masks,
+                   "checkpoints": storing}  # fmt: skip
+        if found := [name for name, given in foreign.items() if given]:
+            raise ConfigError(f"the thesis' system has no {found[0]}; leave the option out or choose the system dudmap")
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
         passes=passes, saved_map=_resolved(saved_map and saved_map.folder), localize=localize, max_memory=max_memory,
-        storing=storing, ignore=None if ignored is None else (out / IGNORED).resolve(),
+        storing=storing,
     )  # fmt: skip
     figures = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
     with locked(out), ExitStack() as files:
         display = RunProgress(count and count * passes, bar=progress)
         notice = display.note if progress else lambda text: None
         prepare_run_folder(out, masks, save_masks=save_masks)
-        if ignored is not None:
-            save_mask(out / IGNORED, ignored)
         recorder = store = None
         if record is not None:
             recorder = Recorder(Path(record), sequence.camera, sequence.calibration)
@@ -163,7 +162,7 @@ def run(
             display.announce_compilation()
         if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
-                calibration = calibrate_start(sequence, config, count, notice, counting, ignored)
+                calibration = calibrate_start(sequence, config, count, notice, counting)
         elif calibration is None and not live and has_color(sequence):
             notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
@@ -188,14 +187,17 @@ class Job:
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
         """A new system for this recording."""
+        if self.options.config.system == "thesis":
+            from dudmap.thesis import ThesisSlam
+
+            slam = ThesisSlam(self.sequence.camera, self.options.config.thesis, given["calibration"])
+            return cast("Slam", slam)  # it has the attributes that a run without the options refused by ``run`` reads
         from dudmap.core.map.memory_limit import MemoryLimit
         from dudmap.core.slam import Slam
 
         limit = None if self.options.max_memory is None else MemoryLimit(self.options.max_memory)
-        timed, path = is_timed(self.sequence), self.options.ignore
-        calibration = given.get("calibration") or self.sequence.calibration
-        ignored = None if path is None else read_ignored(path, self.sequence.camera, calibration)
-        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, ignore=ignored, **given)
+        timed = is_timed(self.sequence)
+        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, **given)
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""

@@ -40,10 +40,8 @@ LOCKED_BYTE = 1 << 20
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
     "timings.csv", "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
-    "merge.json", "report.html", "changes.jsonl", "ignored.png",
+    "merge.json", "report.html", "changes.jsonl",
 )  # fmt: skip
-IGNORED = "ignored.png"
-"""Copy of the mask of the pixels that never count."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
@@ -237,7 +235,8 @@ def write_run_folder(
         steps.append(save_mesh)
         if save_map:
             steps.append(lambda: volume.save(out / "map.npz"))
-            steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
+            if config.system == "dudmap":
+                steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
     for number, (path, part) in enumerate(others, start=2):
         steps += [
             partial(path.save, out / f"trajectory-{number}.txt"),

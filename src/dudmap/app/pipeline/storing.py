@@ -86,7 +86,6 @@ class RunOptions(BaseModel):
     localize: bool = False
     max_memory: int | None = None
     storing: Storing | None = None
-    ignore: Path | None = None
 
 
 class StoredRun(BaseModel):

@@ -71,7 +71,7 @@ class LiveView(RunObserver):
         """Begin with an empty page."""
         self._slam = slam
         none = np.zeros(0, dtype=np.int32)
-        slam.atlas.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
+        slam.live_volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
         self._window.set_camera(slam.camera)
         with self._changed:
             self._news = _News(restart=True)
@@ -81,7 +81,7 @@ class LiveView(RunObserver):
         start = time.perf_counter()
         assert self._slam is not None
         images = None if isinstance(read.frame, FrameError) else FrameImages.of(read.frame, result)
-        self._feed.offer(self._slam.atlas.volume)
+        self._feed.offer(self._slam.live_volume)
         figures = FrameFigures.of(result, ms)
         with self._changed:
             self._news.figures.append(figures)
@@ -101,7 +101,7 @@ class LiveView(RunObserver):
     def finish(self, out: Path) -> None:
         """Show the final trajectory and mesh."""
         if self._slam is not None and self._error is None:
-            self._feed.offer(self._slam.atlas.volume, now=True)
+            self._feed.offer(self._slam.live_volume, now=True)
             with self._changed:
                 self._news.poses = self._poses()
                 self._changed.notify()

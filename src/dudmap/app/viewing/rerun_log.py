@@ -78,12 +78,12 @@ class RerunLog(RunObserver):
         stream.log("plots/ms", rr.Scalars(figures.ms))
         stream.log("plots/residual_mm", rr.Scalars(1000 * figures.residual))
         stream.log("plots/moving_percent", rr.Scalars(100 * figures.dynamic_share))
-        self._log_map(self._feed.changes(self._slam.atlas.volume))
+        self._log_map(self._feed.changes(self._slam.live_volume))
 
     def finish(self, out: Path) -> None:
         """Log the final map and trajectory, and close the file."""
         if self._slam is not None:
-            self._log_map(self._feed.changes(self._slam.atlas.volume, now=True))
+            self._log_map(self._feed.changes(self._slam.live_volume, now=True))
         self._stream.flush()
         self._stream.disconnect()
 

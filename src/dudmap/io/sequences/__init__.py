@@ -87,8 +87,6 @@ class Recording(ABC):
 
     format = ""
     options: tuple[str, ...] = ()
-    truth = ""
-    """Conversion of the published poses into the ground truth, if they are no camera poses in our axes."""
     suffix = ""
     """Suffix of the files of the format, where it is that of files."""
     layout: tuple[str, ...] = ()
@@ -131,11 +129,6 @@ class Recording(ABC):
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame, None if it is not known."""
         return None
-
-    def set_depth_unit(self, unit: float) -> None:
-        """Replace the metres per unit of the 16-bit depth images."""
-        self.camera = replace(self.camera, depth_scale=1.0 / unit)
-        self.sources["depth unit"] = f"--depth-unit {unit:g}"
 
     @abstractmethod
     def _frame(self, index: int, name: str) -> Frame:
@@ -256,7 +249,8 @@ def open_sequence(
         make: Any = reader
         recording = make(place, camera, **given)
         if depth_unit is not None:
-            recording.set_depth_unit(depth_unit)
+            recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
+            recording.sources["depth unit"] = f"--depth-unit {depth_unit:g}"
         if fps is not None:
             recording.set_rate(fps)
         recording.name = printable(recording.name)

@@ -99,11 +99,12 @@ def measure_sequence(
 
     if ahead is None:
         ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
-    config = config.override(["sensor.self_calibration=false"])  # estimated beforehand or not at all
+    if config.system == "dudmap":
+        config = config.override(["sensor.self_calibration=false"])  # estimated beforehand or not at all
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         report = run(
             sequence, config, out or Path(temporary), max_frames=max_frames, progress=False, ahead=ahead,
-            save_map=out is not None, passes=passes, calibrate=calibrate,
+            save_map=out is not None, passes=passes, calibrate=calibrate and config.system == "dudmap",
         )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)

@@ -73,7 +73,7 @@ class Tenths(RunObserver):
             cpu, wall = np.median(self._times, axis=0)
             size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
             row = {"frames": index + 1, "cpu_ms": float(cpu), "ms": float(wall), "memory_mb": resident_bytes() / 1e6,
-                   "blocks": self._slam.atlas.volume.num_blocks, "folder_mb": size / 1e6, "lost": self._lost,
+                   "blocks": self._slam.live_volume.num_blocks, "folder_mb": size / 1e6, "lost": self._lost,
                    "error_mm": 1000 * max(self._errors, default=float("nan"))}  # fmt: skip
             self.rows.append(row)
             self._done(row)

@@ -64,7 +64,7 @@ class DesignFile(BaseModel):
     model_config = STRICT
 
     name: str = ""
-    base: list[str] = Field([], description='a list of settings such as ["preset=thesis"]')
+    base: list[str] = Field([], description='a list of settings such as ["system=thesis"]')
     factors: dict[str, Any] = Field({}, description='a table such as "tracker.huber" = [0.005, 0.01]')
     design: str | dict[str, Any] = Field({}, description="a table with kind, samples, ...")
     sequences: list[dict[str, Any]] = Field([], description="tables [[sequences]] with path or scene")

@@ -81,7 +81,7 @@ def write_report(
         f"{f.key}: {', '.join(map(str, f.levels)) if f.levels else f'{f.low:g} to {f.high:g} ({f.scale})'}"
         for f in plan.factors
     )
-    report.text(f"Base configuration: {plan.base.preset}. {machine()['cpu']}, {versions()}".replace("'", ""))
+    report.text(f"System: {plan.base.system}. {machine()['cpu']}, {versions()}".replace("'", ""))
     effects: dict[str, Table] = {}
     for name in plan.responses:
         try:
@@ -114,15 +114,19 @@ def write_report(
     return "\n".join([*lines, f"Confirmation runs: {confirmation}"])
 
 
-HUBER, DAMPING, VOXEL, WEIGHT = "tracker.huber", "tracker.damping", "volume.voxel_size", "tracker.color_weight"
+HUBER, DAMPING, VOXEL, WEIGHT = "thesis.rho", "thesis.lambda_0", "thesis.tau", "thesis.upsilon"
 TABLES: Mapping[str, dict[str, list[float]]] = {
     "6.1": {HUBER: [0.005, 0.01, 0.025], DAMPING: [0.002, 0.01, 0.02], VOXEL: [0.01, 0.02, 0.05],
             WEIGHT: [0.025, 0.1, 0.175]},
     "6.2": {WEIGHT: [0.1, 0.11, 0.12, 0.125, 0.1275, 0.13, 0.1325, 0.14, 0.15, 0.175]},
     "6.3": {VOXEL: [0.005, 0.01, 0.02, 0.05], WEIGHT: [0.01, 0.025, 0.04]},
+    "4.1": {HUBER: [0.002, 0.005, 0.01, 0.02], DAMPING: [0.002, 0.005, 0.02, 0.1]},
+    "4.2": {"thesis.iterations": [1, 2, 3, 6], "thesis.subsample": ["original", "quarter"]},
+    "figure 4.5": {"thesis.similarity": [0.6, 0.7, 0.75, 0.8, 0.84, 0.9, 1.0]},
 }  # fmt: skip
-"""Factors and levels: table 6.1 with figures 6.1, 6.2 and 6.4, table 6.2 with figure 6.3, and table 6.3. The other keys
-have the values of preset ``thesis``, which are those of the thesis in tables 6.2 and 6.3."""
+"""Factors and levels of tables 4.1, 4.2, 6.1 (figures 6.1, 6.2 and 6.4), 6.2 (figure 6.3) and 6.3, and of the curves in
+figures 4.5 and 4.6. The other keys have the defaults of the section ``thesis``. The band is fixed in metres: the voxel
+size varies alone."""
 ROOM: dict[str, Any] = {
     "name": "room", "scene": "room", "movers": ["person"], "frames": 240, "camera": [320, 240],
 }  # fmt: skip
@@ -133,12 +137,12 @@ PUBLISHED_CONFIRMATION = 89.0
 
 
 def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int | None = None) -> Plan:
-    """Plan of table 6.1, 6.2 or 6.3 of the thesis, on ``ROOM`` unless recordings are named."""
+    """Plan of one of the ``TABLES`` of the thesis, on ``ROOM`` unless recordings are named."""
     some = {} if frames is None else {"frames": frames}
     return make_plan(
         {
-            "name": f"thesis, table {table}",
-            "base": ["preset=thesis"],
+            "name": f"thesis, {table}" if " " in table else f"thesis, table {table}",
+            "base": ["system=thesis"],
             "factors": find(table, TABLES, "table"),
             "sequences": [{"path": str(path.absolute()), **some} for path in recordings] or [{**ROOM, **some}],
         }
