@@ -241,7 +241,7 @@ def spoil_all_truncated(folder):
         (spoil_empty, "is empty; expected a recording"),
         (spoil_result, "is the result of a run; expected a recording (dudmap view shows results)"),
         (spoil_times, "no colour image lies within 20 ms of a depth image"),
-        (spoil_nan, "depth.txt, line 1: the timestamp 'nan' is not a finite number of seconds"),
+        (spoil_nan, "depth.txt, line 1: the timestamp 'nan' is not a finite number"),
         (spoil_order, "depth.txt, line 2: the timestamp 1.000000 comes after 2.000000"),
         (spoil_all_depth(np.full((HEIGHT, WIDTH), 9, np.uint8)), "holds uint8 values; expected 16 bit or float"),
         (spoil_all_depth(np.full((24, 32), 9, np.uint16)), "both must have one size"),
