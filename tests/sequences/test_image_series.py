@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline.inspection import inspect
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import images, open_sequence
 from layout_images import color, exr, millimetres, write_color, write_depth
@@ -102,8 +103,36 @@ def test_pictures_of_depth_and_labels_are_no_colour(tmp_path):
         write_color(tmp_path / "depth_colored" / f"{k}.png", k)
         write_color(tmp_path / "labels" / f"{k}.png", k)
         write_color(tmp_path / "masks" / f"image_{k}.png", k)
-    with pytest.raises(DatasetError, match=r"holds images in no known layout: depth/N\.png \(3 with one channel of 16"):
+    assert not open_sequence(tmp_path, CAMERA).has_color
+
+
+@pytest.mark.parametrize("name", ["depth/{k}.png", "{k}.png", "seq/range_{t}.png", "a/b/{k}.png"])
+def test_depth_without_colour_is_a_recording_of_depth_alone(name, tmp_path):
+    for k in range(3):
+        write_depth(tmp_path / "in" / name.format(k=k, t=stamp(k)), k)
+        write_color(tmp_path / "in" / "masks" / f"{k}.png", k)
+    if name.startswith(("seq", "a")):
+        for file in (tmp_path / "in" / "masks").iterdir():
+            file.unlink()
+    sequence = open_sequence(tmp_path / "in", CAMERA)
+    assert not sequence.has_color
+    assert sequence[1].color is None
+    assert sequence.timed == ("{t}" in name)
+    np.testing.assert_allclose(sequence[1].depth, millimetres(1) / 1000, atol=1e-4)
+    assert sequence.sources["frames"] == "3 depth images without colour"
+    (warning,) = inspect(sequence).warnings
+    assert warning.startswith("there are no colour images")
+
+
+def test_depth_beside_images_that_may_be_colour_is_not_alone(tmp_path):
+    for k in range(3):
+        write_depth(tmp_path / "depth" / f"{k}.png", k)
+        write_color(tmp_path / "frames" / f"{k}.png", k)
+        gray = cv2.imread(str(tmp_path / f"frames/{k}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"frames/{k}.png"), gray)
+    with pytest.raises(DatasetError, match=r"frames/N\.png \(3 with 8-bit intensities\)"):
         open_sequence(tmp_path, CAMERA)
+    assert not open_sequence(tmp_path / "depth", CAMERA).has_color  # named as such
 
 
 def test_recordings_below_are_not_mixed(tmp_path):

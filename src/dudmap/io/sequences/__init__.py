@@ -1,7 +1,7 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import astuple, replace
 from functools import cache
 from importlib import import_module
@@ -281,7 +281,7 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
         raise DatasetError(f"{path} is the result of a run; expected a recording (dudmap view shows results)")
     found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
     if not found and path.is_dir():
-        found = [(place, readers()[NUMBERED]) for place in _paired_by_content(path, DEPTH_OF_SEARCH)]
+        found = [(place, readers()[NUMBERED]) for place in _places_by_content(path)]
     if len(found) > 1:
         names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
         more = f" and {len(found) - 10} more" if len(found) > 10 else ""
@@ -308,14 +308,19 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
     return found
 
 
-def _paired_by_content(path: Path, levels: int) -> list[Path]:
-    """A folder whose images pair by their content where names say nothing, else such folders below it."""
-    from dudmap.io.sequences.image_series import by_content
+def _places_by_content(path: Path) -> list[Path]:
+    """Folders whose images are depth and colour by their content, else those of depth alone: a folder or below it."""
+    from dudmap.io.sequences.image_series import alone, by_content, unknown
 
-    if by_content(path):
-        return [path]
-    below = [place for place in sorted(path.iterdir()) if place.is_dir()] if levels > 0 else []
-    return [found for place in below for found in _paired_by_content(place, levels - 1)]
+    def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:
+        if kinds(place):
+            return [place]
+        if levels == 0 or (kinds is alone and unknown(place)):  # depth beside other images is not alone
+            return []
+        folders = (below for below in sorted(place.iterdir()) if below.is_dir())
+        return [found for below in folders for found in search(below, kinds, levels - 1)]
+
+    return search(path, by_content, DEPTH_OF_SEARCH) or search(path, alone, DEPTH_OF_SEARCH)
 
 
 def _unknown(path: Path) -> str:

@@ -95,7 +95,8 @@ def kind_by_name(name: str) -> str:
 
 
 def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
-    """Colour and depth images of a folder: by the given patterns, else by names, else by content.
+    """Colour and depth images of a folder: by the given patterns, else by names, else by content; empty if there are
+    none.
 
     Raises:
         DatasetError: A pattern matches no numbered image, or several series may be meant.
@@ -104,7 +105,7 @@ def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
     found = by_names(path) | given
     if len(given) == len(WORDS) or all(one is not None and one.fits for one in found.values()):
         return found
-    return by_content(path, given) or found
+    return by_content(path, given) or alone(path, given) or (found if all(found.values()) else {})
 
 
 def by_names(path: Path) -> Found:
@@ -134,6 +135,22 @@ def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
     if found or (not given and any(_is_recording(series) for series in folders)):
         return found
     return _best(path, [*own, *(one for series in folders for one in series)], given or {})
+
+
+def alone(path: Path, given: dict[str, Series] | None = None) -> Found:
+    """Depth images without any images that may be colour; empty if there are none.
+
+    Raises:
+        DatasetError: Several series may be meant.
+    """
+    series = _everything(path)
+    if "color" in (given or {}) or any(
+        one.content in ("color", "gray") and one.kind in ("color", "") for one in series
+    ):
+        return {}
+    meant = [(given or {})["depth"]] if given else [one for one in series if one.may_be("depth")]
+    best = [one for one in meant if one.rank("depth") == min(other.rank("depth") for other in meant)]
+    return {"color": None, "depth": _only(path, "depth", best)} if best else {}
 
 
 def unknown(path: Path) -> str:
@@ -196,7 +213,12 @@ def _matching(path: Path, kind: str, pattern: str) -> Series:
 
 def _there(path: Path) -> str:
     """Numbered images in a folder and its folders, for messages; empty if there are none."""
-    return listed([*_series_in(path), *(one for _, below in _folders(path) for one in below)])
+    return listed(_everything(path))
+
+
+def _everything(path: Path) -> list[Series]:
+    """Series of a folder and its folders."""
+    return [*_series_in(path), *(one for _, below in _folders(path) for one in below)]
 
 
 def _surest(series: list[Series], kind: str) -> Series | None:
@@ -232,11 +254,17 @@ def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
             found.append(((color.rank("color"), depth.rank("depth"), -count), {"color": color, "depth": depth}))
     best = min((rank for rank, _ in found), default=None)
     alike = [pair for rank, pair in found if rank == best]
-    for kind in WORDS:
-        meant = {id(pair[kind]): pair[kind] for pair in alike}
-        if len(meant) > 1:
-            raise DatasetError(
-                f"{path} holds {len(meant)} sets of images that may be the {kind} images: "
-                f"{listed(list(meant.values()))}; name them with --{kind} PATTERN"
-            )
-    return {**alike[0]} if alike else {}
+    if not alike:
+        return {}
+    return {kind: _only(path, kind, [pair[kind] for pair in alike]) for kind in WORDS}
+
+
+def _only(path: Path, kind: str, meant: list[Series]) -> Series:
+    """The one series that may be of a kind; an error names all if there are several."""
+    different = list({id(one): one for one in meant}.values())
+    if len(different) > 1:
+        raise DatasetError(
+            f"{path} holds {len(different)} sets of images that may be the {kind} images: {listed(different)}; name "
+            f"them with --{kind} PATTERN"
+        )
+    return different[0]

@@ -56,15 +56,18 @@ class NumberedSequence(ImageFolder):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         found = image_series.find(self.path, self._patterns)
-        color, depth = found["color"], found["depth"]
-        if color is None or depth is None:
+        if not found or (depth := found["depth"]) is None:
             raise DatasetError(image_series.unknown(self.path))
+        color = found["color"] or depth
         numbers = keys(color.files, depth.files)
-        self._numbers = dict(zip((*color.files, *depth.files), (*numbers[0], *numbers[1]), strict=True))
+        self._numbers = dict(zip(color.files + depth.files, numbers[0] + numbers[1], strict=True))
         colors, depths = (dict(zip(n, one.files, strict=True)) for n, one in zip(numbers, (color, depth), strict=True))
-        if not are_times(numbers):
-            return self._pair_numbered({int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()})
-        return self._pair_timed(_timed(colors), _timed(depths))
+        if are_times(numbers):
+            pairs = self._pair_timed(_timed(colors), _timed(depths))
+        else:
+            first, second = ({int(n): file for n, file in files.items()} for files in (colors, depths))
+            pairs = self._pair_numbered(first, second)
+        return pairs if found["color"] else self._alone([depth for _, depth in pairs])
 
     def set_rate(self, fps: float) -> None:
         """As for ``ImageFolder``; groundtruth.txt has times of its own."""
