@@ -82,6 +82,7 @@ class FakeSlam:
         localize=False,
         max_blocks=None,
         timed=True,
+        ignore=None,
     ):
         type(self).timed = timed
         self.localize = localize

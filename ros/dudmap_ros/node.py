@@ -27,6 +27,7 @@ SETTINGS = {
     "saved_map": "",
     "localize": False,
     "watch": False,
+    "ignore": "",
     "save_to": "dudmap_run",
     "surface_period": 5.0,
     "mesh_triangles": 50_000,
@@ -68,8 +69,9 @@ class DudmapNode(LifecycleNode):
         try:
             config = config_of({key: self.setting(key) for key in self.keys})
             self.session = Session(
-                config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch")
-            )
+                config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch"),
+                self.setting("ignore") or None,
+            )  # fmt: skip
         except DudmapError as error:
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE

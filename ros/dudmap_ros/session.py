@@ -14,6 +14,7 @@ from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.fleet.change_watch import ChangeWatch
 from dudmap.io.exporting import ros_messages as ros
 from dudmap.io.sequences.bag_messages import color_of, depth_of
+from dudmap.io.sequences.images import read_ignored
 
 
 def default_parameters() -> dict[str, Any]:
@@ -53,6 +54,7 @@ class Session:
         saved_map: Run folder to go on in, None for a new map.
         localize: Only find the camera in the saved map.
         watch: Look for changes against the saved map.
+        ignore: Image, white at the pixels that never count; None counts all.
 
     Attributes:
         slam: The system; None before the first pair.
@@ -64,14 +66,19 @@ class Session:
     """
 
     def __init__(
-        self, config: Config, saved_map: str | None = None, localize: bool = False, watch: bool = False
+        self,
+        config: Config,
+        saved_map: str | None = None,
+        localize: bool = False,
+        watch: bool = False,
+        ignore: str | None = None,
     ) -> None:
         if watch and saved_map is None:
             raise ConfigError("there is no earlier visit to compare with; set the parameter saved_map to a run folder")
         if localize and saved_map is None:
             raise ConfigError("there is nothing to localise in; set the parameter saved_map to a run folder")
         self.config = config
-        self.saved_map = saved_map
+        self.saved_map, self.ignore = saved_map, ignore
         self.localize, self.watching = localize, watch
         self.reset()
 
@@ -153,10 +160,11 @@ class Session:
 
     def _started(self, info: Any) -> Slam:  # noqa: ANN401
         camera = ros.camera_of(info)
+        ignored = None if self.ignore is None else read_ignored(self.ignore, camera)
         if self.saved_map is None:
-            return Slam(camera, self.config, live=True)
+            return Slam(camera, self.config, live=True, ignore=ignored)
         saved = SavedMap.load(self.saved_map, self.config.volume.voxel_size)
-        slam = Slam(camera, self.config, live=True, saved_map=saved)
+        slam = Slam(camera, self.config, live=True, saved_map=saved, ignore=ignored)
         slam.localize = self.localize
         if self.watching:
             self.watch = ChangeWatch(SavedMap.load(self.saved_map))  # of its own: the run changes the other one

@@ -23,6 +23,7 @@ def calibrate(
     calibration: Annotated[
         Path | None, Option(help="Calibration to start from: TOML file of an earlier one.", metavar="FILE")
     ] = None,
+    ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
@@ -34,11 +35,15 @@ def calibrate(
     from dudmap.app.pipeline.calibration import calibrate_sequence, known_calibration
     from dudmap.app.terminal import counted, plain_console
     from dudmap.core.geometry.calibration import Calibration
+    from dudmap.io.sequences.images import read_ignored
 
     recording, notices = reading.open(sequence), list[str]()
     given = known_calibration(recording, notices.append) if calibration is None else Calibration.load(calibration)
+    ignored = None if ignore is None else read_ignored(ignore, recording.camera, given)
     with counted("calibrating", quiet=as_json) as progress:
-        estimate = calibrate_sequence(recording, parameters.read(), given, max_frames, progress=progress)
+        estimate = calibrate_sequence(
+            recording, parameters.read(), given, max_frames, progress=progress, ignore=ignored
+        )
     if out is not None:
         estimate.calibration.save(out)
     if as_json:

@@ -23,6 +23,7 @@ def clean(
         Option(help="Run over this recording with --save-masks; default: one is made in OUT/run.", metavar="RUN"),
     ] = None,
     passes: o.PassesOption = 2,
+    ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
@@ -40,7 +41,8 @@ def clean(
     if run is None:
         run_sequence(
             recording, parameters.read(), out / "run",
-            max_frames=max_frames, save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,
+            max_frames=max_frames, save_masks=True, passes=passes, ignore=ignore, calibrate=True,
+            progress=not (quiet or as_json),
         )  # fmt: skip
     with counted("cleaning", quiet=quiet or as_json) as progress:
         report = clean_recording(RunContent.load(run or out / "run"), recording, out, progress, max_frames)

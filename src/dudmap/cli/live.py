@@ -24,6 +24,7 @@ def live(
             autocompletion=o.camera_names,
         ),
     ] = None,
+    ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     record: Annotated[Path | None, Option(help="MCAP file for all frames that arrive.", metavar="FILE.mcap")] = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<camera>.")] = None,
@@ -50,8 +51,8 @@ def live(
     with observers(watching) as watchers, run_compiled_beside(live=True):
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),
-            max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,
-            saved_map=saved_map, localize=mapped.localize, max_memory=o.memory_size(mapped.max_memory),
-            observers=watchers,
+            max_frames=max_frames, save_masks=save_masks, ignore=ignore, record=record, calibration=given,
+            progress=not quiet, saved_map=saved_map, localize=mapped.localize,
+            max_memory=o.memory_size(mapped.max_memory), observers=watchers,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)

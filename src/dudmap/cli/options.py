@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Recording
 
 GROUPS = {
-    "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --run --trajectory "
-    "--reference --max-frames --every",
+    "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --ignore --run "
+    "--trajectory --reference --max-frames --every",
     "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
     "--resolution --heights --world",
@@ -112,6 +112,10 @@ JobsOption = Annotated[
     int, Option(min=1, help="Number of runs at a time; times per frame are reliable with 1 only.", metavar="N")
 ]
 
+IgnoreOption = Annotated[
+    Path | None,
+    Option(help="Image, white at pixels that never count, such as a robot's arm in view.", metavar="MASK.png"),
+]
 SaveMasksOption = Annotated[bool, Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")]
 HostOption = Annotated[
     str, Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")

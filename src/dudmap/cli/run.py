@@ -31,6 +31,7 @@ def run(
         Path | None,
         Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
     ] = None,
+    ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<recording>.")] = None,
     save_masks: o.SaveMasksOption = True,
@@ -111,8 +112,8 @@ def run(
             watchers += (ChangeWatch(SavedMap.load(mapped.saved), watchers),)
         done = run_sequence(
             recording, config, out,
-            max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            calibration=given, calibrate=calibration == "auto" and not live and ours,
+            max_frames=max_frames, save_masks=save_masks, masks=masks, ignore=ignore, progress=not quiet,
+            live=live, passes=passes, calibration=given, calibrate=calibration == "auto" and not live and ours,
             saved_map=saved_map, localize=mapped.localize, max_memory=o.memory_size(mapped.max_memory),
             observers=watchers, storing=storing, warnings=warnings,
         )  # fmt: skip

@@ -121,6 +121,7 @@ class SlamArguments:
     localize: bool
     max_blocks: int | MemoryLimit | None
     timed: bool
+    ignore: NDArray[np.bool_] | None
 
 
 class SlamResults:

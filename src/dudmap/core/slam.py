@@ -12,7 +12,7 @@ from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.frames.frame import Frame, FrameArrays
+from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
 from dudmap.core.frames.observation import Observation, Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
@@ -39,7 +39,6 @@ from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
-from dudmap.errors import ConfigError
 
 
 class Slam(SlamResults, Stateful):
@@ -51,8 +50,8 @@ class Slam(SlamResults, Stateful):
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
-        calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
-            as it is; another is where the estimation begins, with ``sensor.self_calibration``.
+        calibration: Of the colour camera; None for registered colour. One that was estimated is used as it is; another
+            is where the estimation begins, with ``sensor.self_calibration``.
         live: No frame waits for a calibration, and the first poses are not estimated a second time.
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
@@ -60,6 +59,7 @@ class Slam(SlamResults, Stateful):
         max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
             disk. It changes no result. None keeps all in memory.
         timed: Whether the times of the frames are those of a clock; False where they are invented.
+        ignore: (H, W) bool, pixels of the depth or colour image that never count: not used, not fused, never dynamic.
     """
 
     stream: Remembered[StreamCheck]
@@ -90,16 +90,17 @@ class Slam(SlamResults, Stateful):
         max_blocks: int | MemoryLimit | None = None,
         *,
         timed: bool = True,
+        ignore: NDArray[np.bool_] | None = None,
     ) -> None:
         self.config = config = config or Config()
-        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed)
+        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed, ignore)
         self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
         registered = start is None or start.is_registered(replace(camera, distortion=()))
         given = None if start is None or (registered and start.depth_readout == 0) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
-        self.preprocess = Preprocessor(camera, config.preprocess, None if registered else given)
+        self.preprocess = Preprocessor(camera, config.preprocess, None if registered else given, ignore)
         self.camera = self.preprocess.camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
@@ -110,7 +111,7 @@ class Slam(SlamResults, Stateful):
         self.monitor = QualityMonitor(config, self.motion)
         self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
         self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
-        self.atlas = Atlas.of(config, self.camera, self._make_volume, prior, keep_frames=not localize)
+        self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         self.bootstrap = Bootstrap(refines=prior is None and not live)  # a second pass has the map of the first
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
@@ -172,11 +173,7 @@ class Slam(SlamResults, Stateful):
             ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
             FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
-        if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (
-            frame is not None and arrays
-        ):
-            raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
-        view = self.prepare(frame or Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale), dynamic_mask)
+        view = self.prepare(given_frame(frame, arrays, self.camera.depth_scale), dynamic_mask)
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
         if rejection:
@@ -397,8 +394,6 @@ class Slam(SlamResults, Stateful):
             self._last = result.without_details()
         return result
 
-    def _make_volume(self) -> TsdfVolume:
-        config, backend = self.config, make_backend(self.device)
-        return make_volume(
-            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.arguments.max_blocks
-        )
+    def _volume(self) -> TsdfVolume:
+        config, backend, size = self.config, make_backend(self.device), self.arguments.max_blocks
+        return make_volume(self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, size)

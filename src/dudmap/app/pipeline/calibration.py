@@ -130,12 +130,13 @@ def calibrate_start(
     max_frames: int,
     notice: "Callable[[str], None]",
     progress: "Callable[[int, int], None]",
+    ignore: "NDArray[np.bool_] | None" = None,
 ) -> Calibration | None:
     """Calibration estimated from the first frames of a recording; None where none was made, with the reason as a
     notice.
 
     Short recordings are not calibrated. ``notice`` receives sentences on what is done and found, ``progress`` the
-    numbers of frames tracked and of all.
+    numbers of frames tracked and of all; the pixels ``ignore`` (H, W) never count.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
     if not has_color(sequence):
@@ -146,7 +147,7 @@ def calibrate_start(
         return given if given.estimated else None
     notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
     try:
-        estimate = calibrate_sequence(sequence, config, given, count, notice, progress)
+        estimate = calibrate_sequence(sequence, config, given, count, notice, progress, ignore)
     except DatasetError as error:
         notice(f"colour camera: {ASSUMED}: {error}")
         return None
@@ -174,11 +175,12 @@ def calibrate_sequence(
     max_frames: int | None = None,
     notice: "Callable[[str], None]" = lambda text: None,
     progress: "Callable[[int, int], None]" = lambda done, total: None,
+    ignore: "NDArray[np.bool_] | None" = None,
 ) -> Estimate:
     """Track a recording quickly with the calibration as given, and estimate a better one.
 
     The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do. For
-    ``notice`` and ``progress`` see ``calibrate_start``.
+    ``notice``, ``progress`` and ``ignore`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -187,7 +189,10 @@ def calibrate_sequence(
 
     halvings = halvings_to(WIDTH, sequence.camera)
     small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
-    slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence))
+    slam = Slam(
+        small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence),
+        ignore=None if ignore is None else _halved(ignore, halvings),
+    )  # fmt: skip
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
     collector, submap, keyframes = KeyframeCollector(small.calibration, GAP * small.interval), 0, list[ColorKeyframe]()
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
@@ -225,6 +230,14 @@ def _quick(config: Config, halvings: int) -> Config:
         f"preprocess.filter_sigma_px={preprocess.filter_sigma_px / (1 << halvings)}",
         f"preprocess.filter_radius={max(1, preprocess.filter_radius >> halvings)}",
     ])  # fmt: skip
+
+
+def _halved(mask: "NDArray[np.bool_]", halvings: int) -> "NDArray[np.bool_]":
+    """Mask of an image halved by 2x2 blocks: those of which a pixel is masked."""
+    for _ in range(halvings):
+        height, width = (size // 2 for size in mask.shape)
+        mask = np.asarray(mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2).any(axis=(1, 3)), np.bool_)
+    return mask
 
 
 class _Excerpt:

@@ -11,7 +11,7 @@ from dudmap.app.pipeline.frame_processing import process_source
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
+from dudmap.app.pipeline.run_folder import IGNORED, RunReport, locked, prepare_run_folder, save_mask, write_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
@@ -22,6 +22,7 @@ from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import has_color, is_timed
+from dudmap.io.sequences.images import read_ignored
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
@@ -44,6 +45,7 @@ def run(
     save_masks: bool = False,
     save_map: bool = True,
     masks: str | Path | None = None,
+    ignore: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
     live: bool = False,
@@ -82,6 +84,7 @@ def run(
         save_map: Write map.npz and keyframes.npz.
         masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
             ones. Frames with and without a mask are counted.
+        ignore: Image, white at the pixels of the depth or colour image that never count; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
         ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
             would distort the times. The result does not depend on it.
@@ -135,19 +138,22 @@ def run(
         raise ConfigError("only the frames of a camera are recorded; these are on the disk already")
     if config.system == "thesis":
         foreign = {"second pass": passes == 2, "saved map": saved_map, "memory limit": max_memory, "given masks": masks,
-                   "checkpoints": storing}  # fmt: skip
+                   "checkpoints": storing, "mask of ignored pixels": ignore}  # fmt: skip
         if found := [name for name, given in foreign.items() if given]:
             raise ConfigError(f"the thesis' system has no {found[0]}; leave the option out or choose the system dudmap")
+    ignored = None if ignore is None else read_ignored(ignore, sequence.camera, calibration or sequence.calibration)
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
         passes=passes, saved_map=_resolved(saved_map and saved_map.folder), localize=localize, max_memory=max_memory,
-        storing=storing,
+        storing=storing, ignore=None if ignored is None else (out / IGNORED).resolve(),
     )  # fmt: skip
     figures = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
     with locked(out), ExitStack() as files:
         display = RunProgress(count and count * passes, bar=progress)
         notice = display.note if progress else lambda text: None
         prepare_run_folder(out, masks, save_masks=save_masks)
+        if ignored is not None:
+            save_mask(out / IGNORED, ignored)
         recorder = store = None
         if record is not None:
             recorder = Recorder(Path(record), sequence.camera, sequence.calibration)
@@ -162,7 +168,7 @@ def run(
             display.announce_compilation()
         if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
-                calibration = calibrate_start(sequence, config, count, notice, counting)
+                calibration = calibrate_start(sequence, config, count, notice, counting, ignored)
         elif calibration is None and not live and has_color(sequence):
             notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
@@ -196,8 +202,10 @@ class Job:
         from dudmap.core.slam import Slam
 
         limit = None if self.options.max_memory is None else MemoryLimit(self.options.max_memory)
-        timed = is_timed(self.sequence)
-        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, **given)
+        timed, path = is_timed(self.sequence), self.options.ignore
+        calibration = given.get("calibration") or self.sequence.calibration
+        ignored = None if path is None else read_ignored(path, self.sequence.camera, calibration)
+        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, ignore=ignored, **given)
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""

@@ -40,8 +40,10 @@ LOCKED_BYTE = 1 << 20
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
     "timings.csv", "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
-    "merge.json", "report.html", "changes.jsonl",
+    "merge.json", "report.html", "changes.jsonl", "ignored.png",
 )  # fmt: skip
+IGNORED = "ignored.png"
+"""Copy of the mask of the pixels that never count."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",

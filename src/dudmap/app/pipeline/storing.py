@@ -86,6 +86,7 @@ class RunOptions(BaseModel):
     localize: bool = False
     max_memory: int | None = None
     storing: Storing | None = None
+    ignore: Path | None = None
 
 
 class StoredRun(BaseModel):

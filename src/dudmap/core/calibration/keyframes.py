@@ -199,6 +199,8 @@ class KeyframeCollector(Stateful):
         """Take note of a tracked frame, its pose (4, 4) and the pixels (H, W) that move; the one before may become a
         keyframe, since its velocity is now known."""
         now = observation.timestamp
+        if observation.ignored is not None:
+            dynamic_mask = dynamic_mask | observation.ignored
         if self._pending is not None:
             middle, T, mask = self._pending
             before, due = self._before, self._latest + self._interval - 1e-3

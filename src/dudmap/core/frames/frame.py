@@ -1,12 +1,12 @@
 """A frame of an RGB-D camera."""
 
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import FrameError
+from dudmap.errors import ConfigError, FrameError
 
 
 class FrameArrays(TypedDict, total=False):
@@ -95,3 +95,18 @@ class Frame:
         else:
             metres = np.where(np.isfinite(readings), readings, 0).astype(np.float32)
         return cls(float(timestamp), metres, color)
+
+
+_Prepared = TypeVar("_Prepared")
+
+
+def given_frame(frame: _Prepared | None, arrays: FrameArrays, depth_scale: float) -> "_Prepared | Frame":
+    """The frame, or that of the ``arrays`` (see ``Frame.from_arrays``) where these are given in place of it.
+
+    Raises:
+        ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
+        FrameError: As for ``Frame.from_arrays``.
+    """
+    if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+        raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
+    return Frame.from_arrays(**arrays, depth_scale=depth_scale) if frame is None else frame  # pyright: ignore

@@ -37,6 +37,7 @@ class Observation:
         color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
         has_color: Whether the frame has a colour image; ``rgb`` and ``intensity`` are of one grey otherwise.
+        ignored: (H, W) bool, pixels that never count, which have no depth; None for none.
         sources: (H, W) int32, number of the recorded pixel that each pixel shows then; None for its own.
     """
 
@@ -49,6 +50,7 @@ class Observation:
     color_offset: float = 0.0
     depth_readout: float = 0.0
     has_color: bool = True
+    ignored: NDArray[np.bool_] | None = None
     sources: NDArray[np.int32] | None = field(default=None, repr=False, metadata=CACHE)
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(

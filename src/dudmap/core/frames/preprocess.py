@@ -10,6 +10,7 @@ from dudmap.core.backends.cpu.filtering import filter_depth, intensity
 from dudmap.core.backends.parameters import FilterParameters
 from dudmap.core.frames.color_registration import color_projection, register_color
 from dudmap.core.frames.frame import NO_COLOR, Frame
+from dudmap.core.frames.ignored import IgnoredRegion
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
@@ -38,6 +39,9 @@ class Preprocessor:
     The camera is that of the depth images, and of the colour images without a ``calibration``. Colours that were not
     taken together with the depth are left as they were recorded, scaled to the size of the depth image. Readings that
     the colour camera does not see are left out: a map is registered by both.
+
+    ``ignore`` is a mask (H, W) bool of pixels that never count, see ``IgnoredRegion``: they get no depth, not that of a
+    filled hole either, and the colours at their border.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class Preprocessor:
         camera: Camera,
         config: PreprocessConfig | None = None,
         calibration: Calibration | None = None,
+        ignore: NDArray[np.bool_] | None = None,
     ) -> None:
         self.config = config or PreprocessConfig()
         self.calibration = calibration
@@ -52,6 +57,8 @@ class Preprocessor:
         self._maps = _undistortion(camera) if any(camera.distortion) else None
         self._inverse_map = _distortion(camera) if any(camera.distortion) else None
         self._unseen = None if calibration is None else _unseen(self.camera, calibration)
+        self._ignored = None if ignore is None else IgnoredRegion.of(ignore, camera, calibration)
+        self._ignored_depth = None if self._ignored is None else self.mask(self._ignored.depth)
         self._parameters = FilterParameters(
             depth_min=max(self.config.depth_min, DEPTH_MIN),
             depth_max=self.config.depth_max,
@@ -74,19 +81,25 @@ class Preprocessor:
         self._check(frame)
         depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
         rgb = np.ascontiguousarray(frame.rgb)
+        if self._ignored is not None:
+            depth = np.where(self._ignored.depth, np.float32(0), depth)
+            rgb = rgb if frame.color is None else self._ignored.filled(rgb)
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
         if self._unseen is not None and frame.color is not None:
             depth = np.where(self._unseen, np.float32(0), depth)
         depth = filter_depth(depth, self._parameters)
+        if self._ignored_depth is not None:  # holes are filled from their neighbours
+            depth[self._ignored_depth] = 0
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
         has_color = frame.color is not None
         if self.calibration is not None and has_color:
             recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
         return Observation(
-            frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset, has_color=has_color
-        )
+            frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset, has_color=has_color,
+            ignored=self._ignored_depth,
+        )  # fmt: skip
 
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
@@ -123,8 +136,10 @@ class Preprocessor:
     def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask (H, W) bool of an observation in the geometry of the recorded image: the inverse of ``mask``.
 
-        Pixels of the recorded image outside the observation are False.
+        Pixels of the recorded image outside the observation, and ignored ones, are False.
         """
+        if self._ignored is not None and self._ignored_depth is not None:
+            mask = mask & ~self._ignored_depth
         if self._inverse_map is None:
             return mask
         import cv2

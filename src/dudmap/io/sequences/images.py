@@ -7,7 +7,7 @@ is read before a decoder takes memory for it.
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import damaged, load_array, read_bytes
 from dudmap.io.sequences import exr
 from dudmap.io.sequences.image_headers import JPEG, PNG, check_size, content
+
+if TYPE_CHECKING:
+    from dudmap.core.geometry.calibration import Calibration
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
@@ -79,6 +82,28 @@ def read_depth_array(path: Path) -> NDArray[np.float32]:
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """Mask (H, W) of an 8-bit image; values above 127 are true."""
     return read_gray(path) > 127
+
+
+def read_ignored(path: str | Path, camera: Camera, calibration: "Calibration | None" = None) -> NDArray[np.bool_]:
+    """Mask (H, W) of the pixels that never count, from an image in which they are white (above 127).
+
+    Raises:
+        DatasetError: There is no such image, or it has the size of neither the depth nor the colour image.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DatasetError(f"there is no file {path}; expected a mask image, white where pixels never count (--ignore)")
+    mask = read_mask(path)
+    sizes = dict.fromkeys(c.shape for c in (camera, calibration and calibration.camera) if c is not None)
+    if mask.shape not in sizes:
+        expected = " or ".join(f"{w}x{h}" for h, w in sizes)
+        raise DatasetError(
+            f"the mask {path} is {mask.shape[1]}x{mask.shape[0]} pixels; expected {expected}, the size of the depth or "
+            "colour image"
+        )
+    if mask.all():
+        raise DatasetError(f"the mask {path} is white everywhere; expected white only where pixels never count")
+    return mask
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
