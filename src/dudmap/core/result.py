@@ -1,8 +1,10 @@
 """What a system gives: the result of each frame, and maps, trajectories and calibration so far."""
 
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,10 +106,18 @@ class FrameResult:
             unobservable=self.unobservable,
         )  # fmt: skip
 
-    @property
+    @cached_property
     def movers(self) -> tuple[Mover, ...]:
         """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""
-        return () if self.find_movers is None else self.find_movers()
+        return () if self.find_movers is None else deepcopy(self.find_movers())
+
+    def detached(self) -> "FrameResult":
+        """The same with copies of all arrays: a caller may keep and change them."""
+        return replace(deepcopy(replace(self, find_movers=None)), find_movers=self.find_movers)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied: the moving objects are found for it."""
+        return vars(self) | {"find_movers": partial(tuple, self.movers)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +200,7 @@ class SlamResults:
     @property
     def calibration(self) -> Calibration:
         """Calibration of the colour camera in use."""
-        return self.color_calibration.current
+        return replace(self.color_calibration.current)
 
     @property
     def rigid_objects(self) -> list[RigidObject]:

@@ -2,18 +2,17 @@
 
 import time
 from dataclasses import replace
-from functools import cache
 from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.arrays import copied
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
-from dudmap.core.frames.observation import Observation, Pyramid
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
 from dudmap.core.frames.stream_check import Rejection, StreamCheck
@@ -93,6 +92,7 @@ class Slam(SlamResults, Stateful):
         ignore: NDArray[np.bool_] | None = None,
     ) -> None:
         self.config = config = config or Config()
+        ignore = None if ignore is None else copied(ignore, "mask of ignored pixels", dtype=None)
         self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed, ignore)
         self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
@@ -144,7 +144,7 @@ class Slam(SlamResults, Stateful):
         """
         if isinstance(frame, Frame):
             start, now = time.perf_counter(), not self.color_motion.rectifies
-            frame = self._viewed(self.preprocess(frame), now=now)
+            frame = FrameView.of(self.preprocess(frame), self.config, self.detector, now=now)
             if now and self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
                 _ = frame.pyramid.corners  # cached there for the comparison with other images
             frame.timer.timings["preprocess"] = 1000 * (time.perf_counter() - start)
@@ -174,6 +174,12 @@ class Slam(SlamResults, Stateful):
             FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
         view = self.prepare(given_frame(frame, arrays, self.camera.depth_scale), dynamic_mask)
+        return self._processed(view).detached()
+
+    # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _processed(self, view: FrameView) -> FrameResult:
+        """``process`` of a prepared frame; the result shares memory with the state of the system."""
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
         if rejection:
@@ -217,16 +223,6 @@ class Slam(SlamResults, Stateful):
             calibrated=calibrated, checks=verdict.figures,
         )  # fmt: skip
 
-    # -- steps of process ---------------------------------------------------------------------------------------------
-
-    def _viewed(self, observation: Observation, *, now: bool = True) -> FrameView:
-        """A preprocessed frame with its pyramid and segments, computed now or when they are asked for."""
-        _ = observation.num_readings  # cached there for the result
-        levels = cache(lambda: Pyramid.of(observation, self.camera, self.config))
-        if now:
-            levels()
-        return FrameView(observation, levels, self.detector.segment(levels, self.config.volume.voxel_size, now=now))
-
     def _rectified(self, view: FrameView) -> FrameView:
         """The frame at the time of its middle row; itself where all rows are taken at once or the camera rests."""
         with view.timer("rectify"):
@@ -234,7 +230,7 @@ class Slam(SlamResults, Stateful):
             if observation is view.observation:
                 return view
             known = None if view.known_dynamic is None else view.known_dynamic.reshape(-1)[observation.sources]
-            return replace(self._viewed(observation), timer=view.timer, known_dynamic=known)
+            return replace(FrameView.of(observation, self.config, self.detector), timer=view.timer, known_dynamic=known)
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""

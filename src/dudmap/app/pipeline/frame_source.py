@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import ConfigError, FrameError
 from dudmap.io.cameras import MAX_WAIT
+from dudmap.io.sequences import read_frame
 from dudmap.io.sequences.images import MaskFolder
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def read_ahead(
     def read(index: int) -> SourceFrame:
         begin = time.perf_counter()
         try:
-            frame: Frame | FrameError = sequence[index]
+            frame: Frame | FrameError = read_frame(sequence, index)
         except FrameError as error:
             frame = error
         ms = 1000 * (time.perf_counter() - begin)
@@ -152,8 +153,10 @@ def arriving(
                     if arrived.frame.timestamp <= latest:  # a driver may deliver a depth image twice
                         continue
                     latest = arrived.frame.timestamp
+                    frame = arrived.frame.copy()  # a driver may fill the same images again
+                    arrived = arrived._replace(frame=frame)
                     if recorder is not None:
-                        recorder.put(arrived.frame)
+                        recorder.put(frame)
                 read = _with_masks(arrived.frame, arrived.number, camera, masks, slam)
                 queue.put(SourceFrame(arrived.number - first, read, arrival=arrived.time))
         finally:
@@ -206,6 +209,7 @@ def _with_masks(
 
 def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:
     try:
-        return read(index)
+        mask = read(index)
+        return None if mask is None else mask.copy()
     except FrameError as error:
         return error

@@ -11,7 +11,7 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.tracking.frame_view import TEXTURELESS
 from dudmap.errors import FrameError
-from dudmap.io.sequences import has_color
+from dudmap.io.sequences import has_color, read_frame
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -79,7 +79,8 @@ def focal_error(sequence: "Sequence") -> float | None:
     found, rng = [], np.random.default_rng(0)
     for index in np.unique(np.linspace(0, max(len(sequence) - 1 - GAP, 0), PAIRS).astype(int)):
         try:
-            frames = [sequence[int(index)], sequence[min(int(index) + GAP, len(sequence) - 1)]]
+            later = min(int(index) + GAP, len(sequence) - 1)
+            frames = [read_frame(sequence, int(index)), read_frame(sequence, later)]
         except FrameError:
             continue
         first, second = _matched(frames, sequence.camera)

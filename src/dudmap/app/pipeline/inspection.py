@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
-from dudmap.io.sequences import has_color
+from dudmap.io.sequences import has_color, read_frame
 from dudmap.io.sequences.intrinsics import BY_NAME
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int,
     frames, unreadable = [], []
     for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)):
         try:
-            frames.append((int(index), sequence[int(index)]))
+            frames.append((int(index), read_frame(sequence, int(index))))
         except FrameError as error:
             unreadable.append(str(error))
     return frames, unreadable
@@ -129,7 +129,7 @@ def repeats(sequence: "Sequence") -> dict[str, float]:
         before = None
         for index in range(start, min(start + RUN, len(sequence))):
             try:
-                frame = sequence[index]
+                frame = read_frame(sequence, index)
             except FrameError:
                 before = None
                 continue

@@ -1,6 +1,6 @@
 """A frame of an RGB-D camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict, TypeVar
 
 import numpy as np
@@ -28,7 +28,7 @@ GREY = 192
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Depth and colour image of about one instant.
+    """Depth and colour image of about one instant, which are not copied here; ``Slam`` copies what it keeps.
 
     Attributes:
         timestamp: Seconds, of the depth image.
@@ -48,6 +48,10 @@ class Frame:
         """The sizes without the images."""
         color = "no colour" if self.color is None else f"colour {self.color.shape}"
         return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
+
+    def copy(self) -> "Frame":
+        """The frame with copies of its images, which nobody else changes."""
+        return replace(self, depth=np.array(self.depth), color=None if self.color is None else np.array(self.color))
 
     @property
     def rgb(self) -> NDArray[np.uint8]:

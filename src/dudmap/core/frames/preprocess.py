@@ -80,7 +80,7 @@ class Preprocessor:
         """
         self._check(frame)
         depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
-        rgb = np.ascontiguousarray(frame.rgb)
+        rgb = np.array(frame.rgb, order="C")  # a copy: the caller may fill one image again and again
         if self._ignored is not None:
             depth = np.where(self._ignored.depth, np.float32(0), depth)
             rgb = rgb if frame.color is None else self._ignored.filled(rgb)
@@ -115,20 +115,18 @@ class Preprocessor:
         return np.asarray(cv2.resize(recorded, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Undistorted mask (H, W) bool of a frame.
+        """Undistorted mask (H, W) bool of a frame, in memory of its own.
 
         Raises:
             FrameError: The mask does not have the camera's size, or is not boolean.
         """
-        if mask.shape != self.camera.shape or mask.dtype != np.bool_:
+        if not isinstance(mask, np.ndarray) or mask.shape != self.camera.shape or mask.dtype != np.bool_:
             h, w = self.camera.shape
-            raise FrameError(
-                f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
-                "the size of the camera's image",
-                "type",
-            )
+            array = isinstance(mask, np.ndarray)
+            found = f"has the shape {mask.shape} and the type {mask.dtype}" if array else f"is a {type(mask).__name__}"
+            raise FrameError(f"the mask {found}; expected ({h}, {w}) bool, the size of the camera's image", "type")
         if self._maps is None:
-            return mask
+            return mask.copy()
         import cv2
 
         return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0

@@ -10,6 +10,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import write_text
+from dudmap.core.arrays import copied
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
@@ -67,7 +68,9 @@ class Calibration:
     depth_readout_sigma: float = float("nan")
 
     def __post_init__(self) -> None:
-        T = np.asarray(self.T_color_depth, dtype=np.float64)
+        T = copied(self.T_color_depth, "motion between depth and colour camera", shape=(4, 4))
+        object.__setattr__(self, "T_color_depth", T)
+        object.__setattr__(self, "sigma", copied(self.sigma, "standard deviations", shape=(NUM_PARAMETERS,)))
         if T.shape != (4, 4) or not (
             np.isfinite(T).all()
             and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() <= 1e-3

@@ -42,6 +42,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
         numbers = (self.fx, self.fy, self.cx, self.cy, self.depth_scale, *self.distortion)
         if not np.all(np.isfinite(numbers)) or min(self.fx, self.fy, self.depth_scale) <= 0:
             raise DatasetError(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file, atomic_path
+from dudmap.core.arrays import copied
 from dudmap.errors import MapError
 from dudmap.input_files import foreign, open_plain
 
@@ -33,6 +34,10 @@ class Mesh:
     faces: NDArray[np.int32]
     colors: NDArray[np.uint8]
     normals: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "faces", "colors", "normals"):
+            object.__setattr__(self, name, copied(getattr(self, name), f"{name} of a mesh", dtype=None))
 
     def __repr__(self) -> str:
         """The sizes without the arrays."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import write_text
+from dudmap.core.arrays import copied
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import read_rows
 from dudmap.core.geometry.times import SECONDS, time_unit
@@ -32,7 +33,9 @@ class Trajectory:
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.Ts_world_camera.shape != (len(self.timestamps), 4, 4):
+        for name, what in (("timestamps", "times of a trajectory"), ("Ts_world_camera", "poses of a trajectory")):
+            object.__setattr__(self, name, copied(getattr(self, name), what))
+        if self.timestamps.ndim != 1 or self.Ts_world_camera.shape != (len(self.timestamps), 4, 4):
             raise DatasetError(
                 f"trajectory has {len(self.timestamps)} timestamps but poses of shape {self.Ts_world_camera.shape}; "
                 "expected one 4x4 pose per timestamp"

@@ -2,12 +2,14 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.arrays import copied
 from dudmap.core.backends.cpu import meshing, raycasting
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.fusion import reading_weights
@@ -179,9 +181,10 @@ class TsdfVolume(PagedMap):
                 f"{rgb.shape[1]}x{rgb.shape[0]}"
             )
         used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else static_mask
-        self.look_at(T_world_camera)
+        T = copied(T_world_camera, "pose of a frame", shape=(4, 4))
+        self.look_at(T)
         self._frame_number += 1
-        self._fuse(self._view(frame, used, T_world_camera), count)
+        self._fuse(self._view(replace(frame, color=rgb), used, T), count)
 
     def _view(self, frame: Frame, used: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> DepthView:
         """A frame at a pose (4, 4), of which the readings ``used`` (H, W) are fused, for the back end."""
@@ -315,6 +318,7 @@ class TsdfVolume(PagedMap):
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
         """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera
+        T_world_camera = copied(T_world_camera, "pose of a view", shape=(4, 4))
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
         finer = two_levels(self.levels)

@@ -3,11 +3,14 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import Config
+from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask, full_size
 from dudmap.core.dynamics.segments import Segmentation
@@ -86,6 +89,17 @@ class FrameView:
     blind: bool = False
     color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     colors: Callable[[], Observation] | None = None
+
+    @classmethod
+    def of(
+        cls, observation: Observation, config: Config, detector: DynamicDetector, *, now: bool = True
+    ) -> "FrameView":
+        """A preprocessed frame with its pyramid and segments, computed ``now`` or when they are asked for."""
+        _ = observation.num_readings  # cached there for the result
+        levels = cache(lambda: Pyramid.of(observation, observation.camera, config))
+        if now:
+            levels()
+        return cls(observation, levels, detector.segment(levels, config.volume.voxel_size, now=now))
 
     @property
     def timestamp(self) -> float:

@@ -206,6 +206,16 @@ def has_color(sequence: object) -> bool:
     return getattr(sequence, "has_color", True)
 
 
+def read_frame(sequence: "Sequence", index: int) -> Frame:
+    """A frame of a sequence in memory of its own: a class of a user may fill the same images for every frame.
+
+    Raises:
+        FrameError: This frame cannot be read; the others may be valid.
+    """
+    frame = sequence[index]
+    return frame if isinstance(sequence, Recording) else frame.copy()
+
+
 def open_sequence(
     path: str | Path,
     camera: Camera | str | None = None,
