@@ -45,10 +45,25 @@ GapOption = Annotated[
 
 @app.command()
 def trajectory(
-    estimate: Annotated[Path, Argument(help="Run folder, or trajectory in TUM format.", metavar="RUN|TRAJECTORY")],
+    estimate: Annotated[
+        Path, Argument(help="Run folder, or trajectory (TUM, EuRoC or KITTI).", metavar="RUN|TRAJECTORY")
+    ],
     reference: Annotated[
-        Path | None, Option(help="True trajectory in TUM format, or the recording.", metavar="FILE|FOLDER")
+        Path | None, Option(help="True trajectory (TUM, EuRoC or KITTI), or the recording.", metavar="FILE|FOLDER")
     ] = None,
+    estimate_format: Annotated[
+        str | None,
+        Option("--format", help="Format of the estimate: tum, euroc or kitti; default: recognised.", metavar="NAME"),
+    ] = None,
+    reference_format: Annotated[
+        str | None,
+        Option(help="Format of the reference, also bonn (poses of the markers).", metavar="NAME"),
+    ] = None,
+    times: Annotated[
+        Path | None,
+        Option(help="File or recording with the times of poses without times (KITTI).", metavar="FILE|FOLDER"),
+    ] = None,
+    fps: Annotated[float | None, Option(min=0.001, help="Rate of poses without times (KITTI).", metavar="HZ")] = None,
     align: Annotated[
         str, Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
     ] = "se3",
@@ -68,8 +83,7 @@ def trajectory(
 
     The default reference is groundtruth.txt in the run folder. Without one, only path length and duration are given.
     """
-    from dudmap.core.geometry.trajectory import Trajectory
-    from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
+    from dudmap.evaluation.files import Clock, find_reference, find_trajectory, load_trajectories, tracked_share
     from dudmap.evaluation.hints import hints
     from dudmap.evaluation.time_offset import MotionComparison
     from dudmap.evaluation.trajectory import adjusted, fit_scale, path_figures, trajectory_figures
@@ -77,18 +91,20 @@ def trajectory(
     ending = _plot_ending(plots, plot_format)
     seconds = None if time_offset == "auto" else o.numbers(time_offset, 1, "--time-offset")[0]
     file, folder = find_trajectory(estimate)
-    found = Trajectory.load(file)
     truth = find_reference(reference, folder)
+    estimated, known = load_trajectories(file, truth, (estimate_format, reference_format), Clock(times, fps))
+    found = estimated.trajectory
+    for remark in (*found.remarks, *(known.trajectory.remarks if known else ())):
+        say(f"dudmap: {remark}", err=True)
     figures: Figures = {"estimate": str(file), "reference": str(truth) if truth else None}
+    figures |= {"estimate_format": estimated.format, "reference_format": known.format if known else None}
     figures |= path_figures(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
     alignment = cast("Align", align)  # checked by ate
     pictures: list[Path] = []
     shown: dict[str, str] = {}
     target = _output_folder(out, folder if folder is not None else file.parent)
-    if truth is not None:
-        true = load_reference(truth)
-        for remark in (*found.remarks, *true.remarks):
-            say(f"dudmap: {remark}", err=True)
+    if known is not None:
+        true = known.trajectory
         seconds = MotionComparison(found, true).best().seconds if seconds is None else seconds
         found = adjusted(found, seconds)
         factor = fit_scale(found, true, max_difference) if scale else 1.0

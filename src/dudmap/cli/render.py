@@ -15,7 +15,7 @@ def render(
     run: o.RunArgument,
     out: Annotated[Path, Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout.")],
     trajectory: Annotated[
-        Path | None, Option(help="Camera poses in TUM format, in the world of the run.", metavar="FILE")
+        Path | None, Option(help="Camera poses (TUM or EuRoC), in the world of the run.", metavar="FILE")
     ] = None,
     orbit: Annotated[bool, Option("--orbit", help="A camera that circles about the whole map.")] = False,
     sweep: Annotated[

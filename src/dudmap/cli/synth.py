@@ -18,7 +18,7 @@ def synth(
     camera_path: Annotated[
         str | None,
         Option(
-            help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file in TUM format.",
+            help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file (TUM or EuRoC).",
             metavar="FILE|NAME",
         ),
     ] = None,

@@ -9,14 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.geometry.association import read_list, read_pairs
+from dudmap.core.geometry.association import parse_stamp, read_list, read_pairs, read_rows
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.pose_files import FORMATS, PoseFile, read_poses
+from dudmap.core.geometry.times import time_unit
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import DatasetError, MapError
+from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.evaluation.trajectory import ate
 from dudmap.input_files import DAMAGE, read_json
 from dudmap.io.sequences import is_recording, open_sequence, reader_of
-from dudmap.io.sequences.tum import TumSequence
+from dudmap.io.sequences.tum import BonnSequence, TumSequence, bonn_camera_poses, holds_bonn_markers
 
 
 class TrajectoryFile(NamedTuple):
@@ -47,10 +49,28 @@ def find_reference(reference: Path | None, run: Path | None) -> Path | None:
         if not path.is_file() and is_recording(reference):
             return reference
         if not path.is_file():
-            raise DatasetError(f"there is no true trajectory {path}; name a file in TUM format or a recording's folder")
+            raise DatasetError(f"there is no true trajectory {path}; name a file of poses or a recording's folder")
         return path
     path = None if run is None else run / "groundtruth.txt"
     return path if path is not None and path.is_file() else None
+
+
+class Loaded(NamedTuple):
+    """A trajectory, and the format it was read in, for people."""
+
+    trajectory: Trajectory
+    format: str
+
+
+class Clock(NamedTuple):
+    """Times of poses that have none: a file with a time in each row or a recording, or a rate in 1/s."""
+
+    times: Path | None = None
+    fps: float | None = None
+
+
+BONN = "bonn"
+"""Name of the format of Bonn's groundtruth.txt, besides those of ``pose_files``."""
 
 
 def load_reference(path: Path) -> Trajectory:
@@ -59,16 +79,122 @@ def load_reference(path: Path) -> Trajectory:
     The groundtruth.txt of a recording is read as its format wants it: some data sets store the poses of markers, of a
     robot, or with other axes.
     """
-    inside = path.name == "groundtruth.txt" and reader_of(path.parent) not in (None, TumSequence)
-    if path.is_file() and not inside and not is_recording(path):
-        return Trajectory.load(path, optional=path.name == "groundtruth.txt")
-    recording = path.parent if inside else path
+    return _with_times(path, _read_reference(path, None), None, Clock()).trajectory
+
+
+def load_trajectories(
+    estimate: Path,
+    reference: Path | None,
+    formats: tuple[str | None, str | None],
+    clock: Clock,
+) -> tuple[Loaded, Loaded | None]:
+    """Estimate, and true camera poses of a path that ``find_reference`` returned.
+
+    Poses without times (KITTI) take those of ``clock``; else those of the frames of the reference's recording, or those
+    of the other trajectory, whichever are as many.
+
+    Args:
+        estimate: A file.
+        reference: A file or a recording, if there is one.
+        formats: Names of the formats of both, of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
+        clock: Times of poses that have none.
+
+    Raises:
+        ConfigError: The name of a format is unknown, or ``clock`` has two sources or is not needed.
+        DatasetError: A file or recording cannot be read, its format is not clear, or poses lack times.
+    """
+    found = _Read(*_poses(estimate, formats[0], "--format"), None)
+    true = None if reference is None else _read_reference(reference, formats[1])
+    timed = all(part.file.timestamps is not None for part in (found, true) if part)
+    given = [option for option, value in (("--times", clock.times), ("--fps", clock.fps)) if value is not None]
+    if given and (timed or len(given) > 1):
+        raise ConfigError(
+            f"found {' and '.join(given)}; expected one of both, for poses without times (KITTI)"
+            + ("; these trajectories have their own times" if timed else "")
+        )
+    loaded = _with_times(estimate, found, true, clock)
+    return loaded, _with_times(reference, true, found, clock) if reference and true else None
+
+
+class _Read(NamedTuple):
+    """Poses as read, their format for people, and the recording that they belong to, if there is one."""
+
+    file: PoseFile
+    format: str
+    recording: Path | None
+
+    def known_times(self) -> list[NDArray[np.float64]]:
+        """Times of the frames of the recording, and of the poses."""
+        try:
+            frames = None if self.recording is None else open_sequence(self.recording).timestamps
+        except DatasetError:  # its poses were read, and the frames are but one source of times
+            frames = None
+        return [times for times in (frames, self.file.timestamps) if times is not None]
+
+
+def _poses(path: Path, name: str | None, option: str, *, optional: bool = False) -> tuple[PoseFile, str]:
+    """Poses of a file and their format; poses of Bonn's markers become those of the camera."""
+    file = read_poses(path, "tum" if name == BONN else name, optional=optional, option=option)
+    if name != BONN:
+        return file, file.format.name
+    return file._replace(Ts_world_camera=bonn_camera_poses(file.Ts_world_camera)), f"Bonn, {BonnSequence.truth}"
+
+
+def _read_reference(path: Path, name: str | None) -> _Read:
+    beside = reader_of(path.parent) if path.name == "groundtruth.txt" else None
+    if path.is_file() and (name is not None or (beside in (None, TumSequence) and not is_recording(path))):
+        name = name or (BONN if holds_bonn_markers(path) else None)
+        file = _poses(path, name, "--reference-format", optional=path.name == "groundtruth.txt")
+        return _Read(*file, None if beside is None else path.parent)
+    recording = path if beside is None else path.parent
     opened = open_sequence(recording)
     truth = opened.ground_truth
     if truth is None:
         why = "; ".join(opened.remarks) or "it has no true poses"
-        raise DatasetError(f"the recording {recording} cannot be the reference: {why}; name a file in TUM format")
-    return truth
+        raise DatasetError(f"the recording {recording} cannot be the reference: {why}; name a file of poses")
+    file = PoseFile(FORMATS["tum"], truth.timestamps, truth.Ts_world_camera, truth.remarks)
+    return _Read(file, f"{opened.format}{f', {opened.truth}' if opened.truth else ''}", recording)
+
+
+def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> Loaded:
+    """Trajectory of poses with their own times, or else those that ``load_trajectories`` names."""
+    file, count = read.file, len(read.file.Ts_world_camera)
+    if file.timestamps is not None:
+        return Loaded(_trajectory(path, file.timestamps, file), read.format)
+    known = [times for part in (read, other) if part for times in part.known_times()]
+    if clock.times is not None:
+        times, source = _times(clock.times), f"times of {clock.times}"
+        if len(times) != count:
+            raise DatasetError(
+                f"{clock.times} gives {len(times)} times; expected one for each of {count} poses of {path}"
+            )
+    elif clock.fps is not None:
+        times, source = (known[0][0] if known else 0.0) + np.arange(count) / clock.fps, f"{clock.fps:g} poses a second"
+    else:
+        times, source = next((times for times in known if len(times) == count), None), "times of the other"
+    if times is None:
+        counts = " or ".join(str(len(times)) for times in known)
+        there = f", and {counts} times of the other trajectory do not fit" if counts else ""
+        raise DatasetError(
+            f"{path} holds {count} poses without times ({read.format}){there}; give --times FILE with {count} times, "
+            "or --fps HZ"
+        )
+    return Loaded(_trajectory(path, times, file), f"{read.format}, {source}")
+
+
+def _times(path: Path) -> NDArray[np.float64]:
+    """Times (N,) in seconds of the rows of a file, or of the frames of a recording."""
+    if is_recording(path):
+        return open_sequence(path).timestamps
+    stamps = [parse_stamp(path, number, fields[0]) for number, fields in read_rows(path, "timestamp")]
+    return np.array(stamps) / time_unit(stamps).per_second
+
+
+def _trajectory(path: Path, times: NDArray[np.float64], file: PoseFile) -> Trajectory:
+    try:
+        return Trajectory(times, file.Ts_world_camera, file.remarks)
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}") from None
 
 
 def load_mesh(path: Path) -> Mesh:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import write_text
 from dudmap.core.arrays import copied
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.association import read_rows
-from dudmap.core.geometry.times import SECONDS, time_unit
+from dudmap.core.geometry.pose_files import read_poses
 from dudmap.errors import DatasetError
 
+TUM_HEADER = "# timestamp tx ty tz qx qy qz qw"
 LARGEST_STEP = 0.15
 """Largest time between two poses, seconds, between which a camera is taken to move steadily."""
 
@@ -92,61 +92,42 @@ class Trajectory:
 
     def save(self, path: str | Path) -> None:
         """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""
-        lines = ["# timestamp tx ty tz qx qy qz qw"]
+        lines = [TUM_HEADER]
         for stamp, T in zip(self.timestamps, self.Ts_world_camera, strict=True):
             numbers = (*T[:3, 3], *se3.rotation_to_quat_xyzw(T[:3, :3]))
             lines.append(f"{stamp:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
         write_text(path, "\n".join(lines) + "\n")
 
     @classmethod
-    def load(cls, path: str | Path, *, optional: bool = False) -> "Trajectory":
-        """Read TUM text; comments and a header are left out, and times in another unit than seconds are converted.
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        format: str | None = None,
+        timestamps: NDArray[np.float64] | None = None,
+        optional: bool = False,
+    ) -> "Trajectory":
+        """Read a text file in the format of TUM, EuRoC or KITTI, as ``pose_files.pose_format`` recognises it.
 
         Args:
             path: The file.
-            optional: Leave out rows that are not eight finite numbers with a non-zero quaternion and a time after all
-                times before, and count them in ``remarks``.
+            format: ``tum``, ``euroc`` or ``kitti``, if it is not to be recognised.
+            timestamps: (N,) seconds of the poses of a file without times (KITTI).
+            optional: Leave out rows that are no pose, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing, it holds no such row, or, unless ``optional``, another row.
+            DatasetError: The file is missing, its format is not clear, it holds no pose or, unless ``optional``, a row
+                that is none, or it holds no times and none are given.
         """
         path = Path(path)
-        rows, latest, wrong = [], -np.inf, []
-        for number, fields in read_rows(path, COLUMNS, short=optional):
-            row = _finite(fields[:8])
-            if row is not None and not (optional and row[0] <= latest):
-                latest = row[0]
-                rows.append(row)
-                continue
-            wrong.append(
-                f"{path}, line {number}: expected eight finite numbers '{COLUMNS}' with a non-zero quaternion, found "
-                f"{' '.join(fields)!r}"
+        found = read_poses(path, format, optional=optional)
+        stamps = timestamps if found.timestamps is None else found.timestamps
+        if stamps is None:
+            raise DatasetError(
+                f"{path} holds {len(found.Ts_world_camera)} poses without times ({found.format.name}); expected times, "
+                "as in TUM or EuRoC files (dudmap evaluate takes --times and --fps)"
             )
-            if not optional:
-                raise DatasetError(wrong[0])
-        if not rows:
-            raise DatasetError(wrong[0])
-        table = np.array(rows)
-        unit = time_unit(table[:, 0])
-        remarks = [] if unit == SECONDS else [f"the times of {path.name} are taken as {unit.name}"]
-        if wrong:
-            remarks.append(f"{len(wrong)} of {len(wrong) + len(rows)} rows are left out; the first: {wrong[0]}")
-        Ts = np.tile(np.eye(4), (len(table), 1, 1))
-        Ts[:, :3, 3] = table[:, 1:4]
-        Ts[:, :3, :3] = [se3.quat_xyzw_to_rotation(quat) for quat in table[:, 4:8]]
         try:
-            return cls(table[:, 0] / unit.per_second, Ts, tuple(remarks))
+            return cls(stamps, found.Ts_world_camera, found.remarks)
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
-
-
-COLUMNS = "timestamp tx ty tz qx qy qz qw"
-
-
-def _finite(fields: list[str]) -> list[float] | None:
-    """Numbers of a row of a trajectory; None if they are no pose."""
-    try:
-        row = [float(field) for field in fields]
-    except ValueError:
-        return None
-    return row if len(row) == 8 and np.all(np.isfinite(row)) and any(row[4:]) else None

@@ -87,6 +87,8 @@ class Recording(ABC):
 
     format = ""
     options: tuple[str, ...] = ()
+    truth = ""
+    """Conversion of the published poses into the ground truth, if they are no camera poses in our axes."""
     suffix = ""
     """Suffix of the files of the format, where it is that of files."""
     layout: tuple[str, ...] = ()

@@ -280,6 +280,7 @@ class IclNuimSequence(ImageFolder):
     """
 
     format = "ICL-NUIM"
+    truth = "left-handed poses mirrored"
     depth_scale = ICL_NUIM["depth_scale"]
     published = "ICL-NUIM", ICL_NUIM
 
@@ -305,6 +306,7 @@ class IclNuimLoopSequence(ImageFolder):
     """
 
     format = "ICL-NUIM"
+    truth = "left-handed poses mirrored"
     published = "ICL-NUIM", ICL_NUIM
     layout = ("scene_*_*.depth",)
     color_files, depth_files = ("", SCENE_FILE + r"\.png"), ("", SCENE_FILE + r"\.depth")

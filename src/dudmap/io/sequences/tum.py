@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile, associate, read_list, read_pairs
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.geometry.trajectory import TUM_HEADER, Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
 from dudmap.io.sequences import images, intrinsics
@@ -128,28 +128,47 @@ T_MARKER_CAMERA = np.array(
 """T_m of the data set's page: camera to markers. Its rotation is scaled by 1.0593, which is removed for poses."""
 
 
+BONN_NAME = re.compile("rgbd_bonn", re.IGNORECASE)
+
+
+def holds_bonn_markers(path: Path) -> bool:
+    """Whether a file of true poses is the one of a Bonn recording as published, by its name and its folder's.
+
+    Camera poses that dudmap writes (for runs and cleaned recordings) have a header that the published files lack.
+    """
+    inside = path.name == "groundtruth.txt" and BONN_NAME.search(path.resolve().parent.name)
+    named = BONN_NAME.search(path.name) and re.search("gt|ground", path.name, re.IGNORECASE)
+    return bool(inside or named) and path.is_file() and not read_text(path).startswith(TUM_HEADER)
+
+
+def bonn_camera_poses(Ts_marker: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera poses ``T_ROS^-1 T T_ROS T_m`` (N, 4, 4) of marker poses T, in the frame of the data set's point cloud."""
+    T_marker_camera = T_MARKER_CAMERA.copy()
+    T_marker_camera[:3, :3] = se3.nearest_rotation(T_MARKER_CAMERA[:3, :3])
+    return T_ROS @ Ts_marker @ T_ROS @ T_marker_camera
+
+
 class BonnSequence(TumSequence):
     """Folder ``rgbd_bonn_*`` of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019).
 
-    groundtruth.txt holds poses T of the markers. The true camera poses are ``T_ROS^-1 T T_ROS T_m``, in the frame of
-    the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
+    groundtruth.txt holds poses of the markers; the ground truth is that of the camera (``bonn_camera_poses``), in the
+    frame of the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
     """
 
     format = "Bonn RGB-D Dynamic"
     published = "Bonn", camera_values(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)
+    truth = "marker poses converted to camera poses"
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether a folder has the layout and the name of this data set."""
-        return super().recognises(path) and re.search("rgbd_bonn", path.resolve().name, re.IGNORECASE) is not None
+        return super().recognises(path) and BONN_NAME.search(path.resolve().name) is not None
 
     def _find_ground_truth(self) -> Trajectory | None:
         truth = super()._find_ground_truth()
-        if truth is None:
-            return None
-        T_marker_camera = T_MARKER_CAMERA.copy()
-        T_marker_camera[:3, :3] = se3.nearest_rotation(T_MARKER_CAMERA[:3, :3])
-        return replace(truth, Ts_world_camera=T_ROS @ truth.Ts_world_camera @ T_ROS @ T_marker_camera)
+        if truth is None or not holds_bonn_markers(self.path / "groundtruth.txt"):
+            return truth
+        return replace(truth, Ts_world_camera=bonn_camera_poses(truth.Ts_world_camera))
 
 
 class CorbsSequence(TumSequence):
@@ -200,6 +219,7 @@ class OpenLorisSequence(ImageFolder):
     """
 
     format = "OpenLORIS-Scene"
+    truth = "robot poses converted to camera poses"
     layout = ("color.txt", "aligned_depth.txt", "sensors.yaml")
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
