@@ -46,10 +46,14 @@ def trajectory():
     return "# t x y z qx qy qz qw\n" + "".join(layout_images.tum_line(k, layout_images.pose(k)) for k in range(5))
 
 
+def matrices():
+    return "".join(" ".join(f"{x:.6f}" for x in layout_images.pose(k)[:3].ravel()) + "\n" for k in range(5))
+
+
 def load_trajectory(path):
     from dudmap.core.geometry.trajectory import Trajectory
 
-    loaded = Trajectory.load(path)
+    loaded = Trajectory.load(path, timestamps=np.arange(5.0))
     assert np.isfinite(loaded.Ts_world_camera).all()
 
 

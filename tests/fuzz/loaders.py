@@ -35,6 +35,7 @@ LOADERS = {
     "configuration": Loader(partial(files.text, "config.toml", files.configuration), files.load_config),
     "calibration": Loader(partial(files.text, "calibration.toml", files.calibration), files.load_calibration),
     "trajectory": Loader(partial(files.text, "trajectory.txt", files.trajectory), files.load_trajectory),
+    "trajectory without times": Loader(partial(files.text, "poses.txt", files.matrices), files.load_trajectory),
     "intrinsics": Loader(partial(files.text, "intrinsics.txt", files.INTRINSICS), files.load_intrinsics),
     "camera as JSON": Loader(files.camera_files, files.load_camera_file),
     **{f"image {kind}": Loader(partial(files.image, kind), files.load_image) for kind in files.IMAGES},

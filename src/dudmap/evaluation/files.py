@@ -70,7 +70,7 @@ class Clock(NamedTuple):
 
 
 BONN = "bonn"
-"""Name of the format of Bonn's groundtruth.txt, besides those of ``pose_files``."""
+"""Name of the format of Bonn's groundtruth.txt, a further one besides ``pose_files.FORMATS``."""
 
 
 def load_reference(path: Path) -> Trajectory:
@@ -90,8 +90,8 @@ def load_trajectories(
 ) -> tuple[Loaded, Loaded | None]:
     """Estimate, and true camera poses of a path that ``find_reference`` returned.
 
-    Poses without times (KITTI) take those of ``clock``; else those of the frames of the reference's recording, or those
-    of the other trajectory, whichever are as many.
+    Poses without times (KITTI) take the times of ``clock``. Without it they take the times of the frames of the
+    reference's recording, or else of the other trajectory, if there are as many.
 
     Args:
         estimate: A file.
@@ -133,7 +133,7 @@ class _Read(NamedTuple):
 
 
 def _poses(path: Path, name: str | None, option: str, *, optional: bool = False) -> tuple[PoseFile, str]:
-    """Poses of a file and their format; poses of Bonn's markers become those of the camera."""
+    """Poses of a file and their format; marker poses of Bonn become camera poses."""
     file = read_poses(path, "tum" if name == BONN else name, optional=optional, option=option)
     if name != BONN:
         return file, file.format.name
@@ -157,7 +157,7 @@ def _read_reference(path: Path, name: str | None) -> _Read:
 
 
 def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> Loaded:
-    """Trajectory of poses with their own times, or else those that ``load_trajectories`` names."""
+    """Trajectory of poses with their own times, or with the times that ``load_trajectories`` names."""
     file, count = read.file, len(read.file.Ts_world_camera)
     if file.timestamps is not None:
         return Loaded(_trajectory(path, file.timestamps, file), read.format)

@@ -1,5 +1,6 @@
 """Text files of camera poses in the formats of TUM, EuRoC and KITTI, and which of them a file has."""
 
+import math
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -76,7 +77,7 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     row, commas = rows[0], "," in "".join(lines)
     if len(row) in (12, 16) and _holds_rotation(row):
         return FORMATS["kitti"]
-    lengths = [float(np.linalg.norm(row[4:8])) for row in rows]
+    lengths = [math.hypot(*row[4:8]) for row in rows]
     quaternions = abs(float(np.median(lengths)) - 1) < LARGEST_ERROR and not _holds_rotation(row[1:])
     if order is None and (quaternions or len(row) < 8):
         if not commas:
@@ -115,7 +116,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
     rows, latest, wrong = [], -np.inf, []
     for number, fields in read_rows(path, known.columns, short=optional):
         row = _numbers(" ".join(fields[:8]))
-        if len(row) == 8 and any(row[4:]) and not (optional and row[0] <= latest):
+        if len(row) == 8 and 1e-9 < math.hypot(*row[4:]) < 1e9 and not (optional and row[0] <= latest):
             latest = row[0]
             rows.append(row)
             continue
@@ -177,4 +178,6 @@ def _holds_rotation(row: list[float]) -> bool:
 
 
 def _is_rotation(R: NDArray[np.float64]) -> bool:
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < LARGEST_ERROR and np.linalg.det(R) > 0)
+    """Whether a matrix (3, 3) is a rotation, within ``LARGEST_ERROR``."""
+    small = np.abs(R).max() <= 1 + LARGEST_ERROR  # products of larger numbers may overflow
+    return bool(small and np.abs(R @ R.T - np.eye(3)).max() < LARGEST_ERROR and np.linalg.det(R) > 0)

@@ -116,8 +116,8 @@ class Trajectory:
             optional: Leave out rows that are no pose, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing, its format is not clear, it holds no pose or, unless ``optional``, a row
-                that is none, or it holds no times and none are given.
+            DatasetError: The file is missing or its format is not clear; it holds no pose, no times, or, unless
+                ``optional``, a row that is no pose.
         """
         path = Path(path)
         found = read_poses(path, format, optional=optional)
