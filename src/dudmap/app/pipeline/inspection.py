@@ -11,6 +11,7 @@ from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
 from dudmap.io.sequences import has_color, read_frame
 from dudmap.io.sequences.intrinsics import BY_NAME
+from dudmap.io.sequences.rotated_depth import Rotated
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -177,7 +178,7 @@ def inspect(
     found.warnings = [
         *_focal_warnings(sequence, found.sources),
         *([] if colored else [DEPTH_ALONE]),
-        *_depth_warnings(found, readings, "depth_unit" in getattr(sequence, "options", ("depth_unit",))),
+        *_depth_warnings(found, readings, _unit_is_open(sequence)),
         *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
@@ -187,6 +188,12 @@ def inspect(
         *getattr(sequence, "remarks", ()),
     ]
     return found
+
+
+def _unit_is_open(sequence: "Sequence") -> bool:
+    """Whether another depth unit can be given, and no remark of the recording names it."""
+    rotated = getattr(sequence, "rotated", Rotated.NO)
+    return "depth_unit" in getattr(sequence, "options", ("depth_unit",)) and rotated is Rotated.NO
 
 
 def _numbers(camera: "Camera") -> dict[str, Any]:

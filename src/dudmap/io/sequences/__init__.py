@@ -132,6 +132,11 @@ class Recording(ABC):
         """True dynamic mask (H, W) of a frame, None if it is not known."""
         return None
 
+    def set_depth_unit(self, unit: float) -> None:
+        """Replace the metres per unit of the 16-bit depth images."""
+        self.camera = replace(self.camera, depth_scale=1.0 / unit)
+        self.sources["depth unit"] = f"--depth-unit {unit:g}"
+
     @abstractmethod
     def _frame(self, index: int, name: str) -> Frame:
         """A frame; ``name`` is used in messages."""
@@ -261,8 +266,7 @@ def open_sequence(
         make: Any = reader
         recording = make(place, camera, **given)
         if depth_unit is not None:
-            recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
-            recording.sources["depth unit"] = f"--depth-unit {depth_unit:g}"
+            recording.set_depth_unit(depth_unit)
         if fps is not None:
             recording.set_rate(fps)
         recording.name = printable(recording.name)

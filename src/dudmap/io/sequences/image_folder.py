@@ -20,7 +20,8 @@ from dudmap.core.geometry.times import SECONDS
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
-from dudmap.io.sequences import Recording, camera_files, images, intrinsics
+from dudmap.io.sequences import Recording, camera_files, images, intrinsics, rotated_depth
+from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""
@@ -63,6 +64,7 @@ class ImageFolder(Recording):
         super().__init__(path)
         self.name = self.path.resolve().name
         self._pairing, self.image_counts = "a list of pairs", None
+        self.rotated, self._unit_remark = Rotated.NO, ""
         self._pairs = self._find_pairs()
         self.timestamps = np.array([depth.timestamp for _, depth in self._pairs], dtype=np.float64)
         known = self._find_intrinsics() if camera is None else self._replaced(camera)
@@ -75,6 +77,23 @@ class ImageFolder(Recording):
         }
         self.calibration = known.calibration()
         self.camera = self._probe(known)
+        self._look_for_rotation(given=unit and not known.source.endswith(intrinsics.BY_NAME))
+        self._take_truth()
+
+    def _look_for_rotation(self, *, given: bool) -> None:
+        """Set the unit of depth images that are rotated by three bits; ``given`` is whether a file gives a unit."""
+        files, scale = [depth.path for _, depth in self._pairs], self.camera.depth_scale
+        self.rotated = rotated_depth.judge(files, lambda file: self._read_depth(file, 1.0), scale, given=given)
+        if self.rotated is Rotated.YES and not given:
+            self.camera = replace(self.camera, depth_scale=rotated_depth.UNITS_PER_METRE)
+            self.sources["depth unit"] = "recognised: 16-bit millimetres rotated left by three bits, as in SUN3D"
+        self._unit_remark = "" if given and self.rotated is Rotated.YES else self.rotated.value
+
+    def set_depth_unit(self, unit: float) -> None:
+        """As for ``Recording``; values that are rotated by three bits stay so if the unit is 0.125 mm."""
+        super().set_depth_unit(unit)
+        self._look_for_rotation(given=True)
+        self.rotated, self._unit_remark = self.rotated if self.rotated is Rotated.YES else Rotated.NO, ""
         self._take_truth()
 
     def _time_source(self) -> str:
@@ -87,9 +106,10 @@ class ImageFolder(Recording):
         try:
             self.ground_truth = self._find_ground_truth()
             said = self.ground_truth.remarks if self.ground_truth is not None else ()
-            self.remarks = [f"ground truth: {remark}" for remark in said]
+            remarks = [f"ground truth: {remark}" for remark in said]
         except DatasetError as error:
-            self.ground_truth, self.remarks = None, [f"the ground truth is not used: {error}"]
+            self.ground_truth, remarks = None, [f"the ground truth is not used: {error}"]
+        self.remarks = [*filter(None, [self._unit_remark]), *remarks]
 
     @property
     def color_timestamps(self) -> NDArray[np.float64]:
@@ -245,7 +265,9 @@ class ImageFolder(Recording):
     def _read(self, index: int, depth_scale: float) -> Frame:
         color_file, depth_file = self._pairs[index]
         try:
-            depth = self._read_depth(depth_file.path, depth_scale)
+            rotated = self.rotated is Rotated.YES
+            depth = self._read_depth(depth_file.path, 1.0 if rotated else depth_scale)
+            depth = rotated_depth.metres(depth, depth_scale) if rotated else depth
             color = self._read_color(color_file.path) if self.has_color else None
         except FrameError as error:
             raise FrameError(f"frame {index}: {error}") from error

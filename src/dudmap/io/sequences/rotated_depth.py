@@ -1,0 +1,99 @@
+"""Depth images whose 16-bit millimetres are rotated left by three bits, as SUN3D (Xiao et al. 2013) stores them.
+
+The values are ``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, and small numbers beyond. SUN RGB-D and
+the images of the Amazon Picking Challenge have them too. Values in units of 1/8 mm look and are read the same.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import FrameError
+
+UNITS_PER_METRE = 8000.0
+LEAST_READINGS, LEAST_VALUES = 1000, 32
+"""Fewest readings, and fewest different values, that are judged."""
+MOST = 0.95
+"""Share of the readings from which a property is one of the images: the others may be damaged."""
+NEAR_SHARE = 0.8
+"""Least share of the readings below 8.19 m; their low three bits are 0."""
+FARTHEST = 10000
+"""Distance, mm, beyond which depth cameras for rooms hardly measure. Readings with low bits must be nearer: low bits
+that number persons, as in Microsoft's first driver, give farther ones. A unit is wrong if a twentieth is beyond it."""
+FACTORS = (2, 3, 5, 7, 11, 13)
+"""Factors of which the millimetres may not all be multiples: such images have another unit."""
+PLAUSIBLE = (256, 8000)
+"""Median distance, mm: from the last one that 8-bit depth times 8 can be, to the farthest of a camera for rooms."""
+DENSE = 0.9
+"""Share of the millimetres of a range that occur, up to which the steps between the values grow with the distance, as
+those of a depth camera do, and are not those of a coarse unit."""
+SAMPLED = 5
+"""Number of evenly spread frames that are judged."""
+SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"
+
+
+class Rotated(Enum):
+    """Whether depth images are rotated: both readings may be distances in a room, and a file may give the unit."""
+
+    NO = ""
+    POSSIBLY = f"{SAID}; if distances come out eight times too large, give --depth-unit 0.000125"
+    YES = f"{SAID}: they are read as 0.125 mm per unit; --depth-unit METRES says otherwise"
+
+
+def unrotated(values: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """Millimetres of rotated 16-bit values."""
+    stored = values.astype(np.uint16)
+    return (stored >> np.uint16(3)) | (stored << np.uint16(13))
+
+
+def metres(values: NDArray[np.floating], units_per_metre: float) -> NDArray[np.float32]:
+    """Depth in metres of rotated 16-bit values."""
+    return unrotated(values).astype(np.float32) / np.float32(units_per_metre / 8)
+
+
+def judge(
+    files: list[Path], read: Callable[[Path], NDArray[np.floating]], units_per_metre: float, *, given: bool
+) -> Rotated:
+    """Whether the 16-bit values of the depth images of a recording are rotated.
+
+    Args:
+        files: The images.
+        read: Reads one: the values as stored, 0 for no reading; values that are not whole are none of 16 bits.
+        units_per_metre: Of the values if they are not rotated.
+        given: Whether a file or the user gives that number.
+    """
+    images = []
+    for index in np.unique(np.linspace(0, len(files) - 1, SAMPLED).astype(int)).tolist():
+        with suppress(FrameError):
+            image = read(files[index])
+            images.append(image[image > 0])
+            if not _has_eighths(images[-1]):
+                return Rotated.NO
+    values = np.concatenate([*images, np.zeros(0)])
+    if len(values) < LEAST_READINGS:
+        return Rotated.NO
+    millimetres = unrotated(values)
+    seen = np.unique(millimetres)
+    divided = any(np.mean(millimetres % factor == 0) > MOST for factor in FACTORS)
+    if divided or len(seen) < LEAST_VALUES or not PLAUSIBLE[0] <= np.median(millimetres) <= PLAUSIBLE[1]:
+        return Rotated.NO
+    if given:
+        return Rotated.YES if np.isclose(units_per_metre, UNITS_PER_METRE) else Rotated.POSSIBLY
+    near, far = np.percentile(millimetres, (5, 95))
+    dense = np.count_nonzero((seen >= near) & (seen <= far)) / (far - near + 1)
+    too_far = 1000 * np.percentile(values, 95) / units_per_metre > FARTHEST
+    return Rotated.YES if too_far or dense < DENSE else Rotated.POSSIBLY
+
+
+def _has_eighths(values: NDArray[np.floating]) -> bool:
+    """Whether whole numbers are multiples of 8, but for those far away."""
+    if len(values) == 0:
+        return True
+    far = values[values % 8 != 0]
+    if np.any(values != np.floor(values)) or len(far) > (1 - NEAR_SHARE) * len(values):
+        return False
+    return len(far) == 0 or float(np.mean(unrotated(far) < FARTHEST)) > MOST
