@@ -59,6 +59,8 @@ def test_recordings_are_found_one_folder_down(data):
     assert len(suite.missing) == 11
     assert len(find_suite("local", data / "tum").entries) == 1
     assert find_suite("tum-dynamic", data, quick=True).entries[0].max_frames == 60
+    (one,) = find_suite("tum-dynamic", suite.entries[0].path).entries  # the recording itself
+    assert one.path == suite.entries[0].path
 
 
 def test_recordings_are_found_as_downloaded(tmp_path, monkeypatch):

@@ -151,8 +151,8 @@ def bonn_camera_poses(Ts_marker: NDArray[np.float64]) -> NDArray[np.float64]:
 class BonnSequence(TumSequence):
     """Folder ``rgbd_bonn_*`` of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019).
 
-    groundtruth.txt holds poses of the markers. The ground truth holds camera poses (``bonn_camera_poses``), in the frame
-    of the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
+    groundtruth.txt holds poses of the markers. The ground truth holds camera poses (``bonn_camera_poses``), in the
+    frame of the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
     """
 
     format = "Bonn RGB-D Dynamic"

@@ -142,7 +142,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     """Find the recordings of one of ``SUITES``.
 
     Args:
-        data: Folder that is searched, two levels deep; synthetic worlds need none.
+        data: Folder that is searched, two levels deep, or one recording; synthetic worlds need none.
         quick: A few synthetic worlds, in images of 320x240, and at most 60 frames of every recording.
     """
     find(name, SUITES, "suite")
@@ -160,8 +160,8 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
         raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")
     elif name == "local":
         found = local_entries(data)
-    elif not data.is_dir():
-        raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
+    elif not (data.is_dir() or is_archive(data)):
+        raise DatasetError(f"there is no folder {data}; expected one that holds recordings, or a recording")
     else:
         entries = [
             Entry(key, address=DATA["address"][page]) for page, keys in DATA["recordings"][name].items() for key in keys
@@ -171,11 +171,11 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder or archive is found in ``data`` or one level below, and the others.
+    """Entries whose folder or archive is ``data``, in it or one level below, and the others.
 
     The images of a CoRBS scene are in ``<name>_pre_registereddata``, as downloaded.
     """
-    places = [path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern))]
+    places = [*(path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern))), data.absolute()]
     found = {stem(path): path for path in places if is_archive(path)} | {p.name: p for p in places if p.is_dir()}
     for name in list(found):
         found.setdefault(name.removesuffix("_pre_registereddata"), found[name])
