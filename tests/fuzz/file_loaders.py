@@ -76,6 +76,19 @@ def load_intrinsics(path):
     found.calibration()
 
 
+def load_any_camera(path):
+    from dudmap.io.sequences import camera_search
+
+    found = camera_search.search(path.parent, (64, 48), (64, 48))
+    if found is not None:
+        found.camera(64, 48)
+
+
+ANY_CAMERA = (
+    "K:\n60 0 31\n0 61 23\n0 0 1\nresolution: 128x96\nfx_depth = 60\nP0: 60 0 31 0 0 61 23 0 0 0 1 0\nfx,fy\n60,61\n"
+)
+
+
 INTRINSICS = (
     "fx 60\nfy 61\ncx 31\ncy 23\nwidth 64\nheight 48\nk1 0.1\ncolor_fx 60\ncolor_fy 60\ncolor_cx 31\ncolor_cy 23\n"
     "color_width 64\ncolor_height 48\nT_depth_color 1 0 0 0.02 0 1 0 0 0 0 1 0\n"

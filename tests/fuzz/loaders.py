@@ -37,6 +37,7 @@ LOADERS = {
     "trajectory": Loader(partial(files.text, "trajectory.txt", files.trajectory), files.load_trajectory),
     "trajectory without times": Loader(partial(files.text, "poses.txt", files.matrices), files.load_trajectory),
     "intrinsics": Loader(partial(files.text, "intrinsics.txt", files.INTRINSICS), files.load_intrinsics),
+    "camera of any name": Loader(partial(files.text, "calib.txt", files.ANY_CAMERA), files.load_any_camera),
     "camera as JSON": Loader(files.camera_files, files.load_camera_file),
     **{f"image {kind}": Loader(partial(files.image, kind), files.load_image) for kind in files.IMAGES},
     "array": Loader(files.array, files.load_array),

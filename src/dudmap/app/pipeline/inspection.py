@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
 from dudmap.errors import FrameError
 from dudmap.io.sequences import has_color, read_frame
+from dudmap.io.sequences.camera_search import FIELD_OF_VIEW, OFF_CENTER, SCALED, UNEQUAL_FOCAL
 from dudmap.io.sequences.intrinsics import BY_NAME
 from dudmap.io.sequences.rotated_depth import Rotated
 
@@ -31,12 +32,6 @@ SEEN = (0.4, 4.0)
 """Medians, metres, within which the scale is not doubted."""
 FEW_READINGS = 0.2
 """Share of pixels with a reading below which the depth is called sparse."""
-FIELD_OF_VIEW = (20.0, 130.0)
-"""Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
-OFF_CENTER = 0.25
-"""Largest plausible distance of the principal point from the middle of the image, share of its size."""
-UNEQUAL_FOCAL = 0.1
-"""Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
 GAP = 3.0
 """Time between frames that counts as a gap, as a multiple of the median."""
 LEFT_OVER = 0.02
@@ -265,6 +260,8 @@ def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | Non
 
 def _focal_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[str]:
     intrinsics = sources.get("intrinsics", "")
+    if SCALED in intrinsics:
+        yield f"the camera is that of {intrinsics}; if the images are cut out of larger ones, give --camera"
     if not intrinsics.endswith(BY_NAME) or sequence.calibration is not None:
         return
     if "TUM" in intrinsics and sequence.timestamps[0] > TUM_ENDED:

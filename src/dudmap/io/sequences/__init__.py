@@ -180,6 +180,8 @@ READERS = (
 )
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
 NUMBERED = READERS.index("numbered:NumberedSequence")
+MOST_NAMES = 5
+"""Recordings that a message names."""
 DEPTH_OF_SEARCH = 3
 """Levels of folders below the given one in which a recording is looked for."""
 
@@ -299,8 +301,8 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
     if not found and path.is_dir():
         found = [(place, readers()[NUMBERED]) for place in _places_by_content(path)]
     if len(found) > 1:
-        names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
-        more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+        names = ", ".join(str(place.relative_to(path)) for place, _ in found[:MOST_NAMES])
+        more = f" and {len(found) - MOST_NAMES} more" if len(found) > MOST_NAMES else ""
         raise DatasetError(f"{path} contains {len(found)} recordings; name one of {names}{more}")
     if not found:
         raise DatasetError(_unknown(path))

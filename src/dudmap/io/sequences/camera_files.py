@@ -31,7 +31,7 @@ SETTINGS = "Camera.", "Camera1."
 """What keys of cameras begin with in settings files of ORB-SLAM, which have any name: they hold "Camera.fx: "."""
 LARGEST_SETTINGS = 1 << 16
 """Characters in which they are looked for."""
-LARGEST_LIST = 10
+LARGEST_LIST = 5
 """Kinds of files that a message lists."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".webp")
 NAMES = {
@@ -42,7 +42,8 @@ NAMES = {
 """Our key and the names it has in JSON and YAML files."""
 SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor", "DepthMapFactor", "RGBD.DepthMapFactor")
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
-LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "D", "d")
+LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs",
+          "dist_coeff", "dist", "D", "d")  # fmt: skip
 """Names of the intrinsic matrix and of the coefficients of the lens: a list, or a ``data`` list as OpenCV writes it."""
 OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
 MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
@@ -57,14 +58,34 @@ def find(folder: Path) -> Intrinsics | None:
                 with damaged(DatasetError, f"the array {file}"):
                     return from_matrix(np.asarray(load_array(file), dtype=np.float64).ravel(), file)
             if file.is_file():
-                return from_file(file)
+                return _of_file(file)
         files = [place / name for name in TREES if (place / name).is_file()]
         if place is folder:
             files = [file for file in sorted(place.iterdir()) if re.fullmatch(NAMED, file.name.lower())]
             files = files or [file for file in sorted(place.glob("*.yaml")) if _are_settings(file)]
         if files:
-            return load(files)
+            try:
+                return load(files)
+            except DatasetError as error:
+                raise UnclearFilesError(str(error)) from error
     return None
+
+
+class UnclearFilesError(DatasetError):
+    """Files of a usual name are no JSON or YAML of one or two cameras."""
+
+
+def _of_file(file: Path) -> Intrinsics:
+    """Intrinsics of a text file: as ``from_file`` expects them, else the only camera in it."""
+    from dudmap.io.sequences.camera_content import cameras_in
+
+    try:
+        return from_file(file)
+    except DatasetError:
+        cameras = [values for _, values in cameras_in(file)]
+        if not cameras or any(values != cameras[0] for values in cameras):
+            raise
+        return Intrinsics(cameras[0], str(file))
 
 
 def unknown(folder: Path, why: str = "") -> DatasetError:
@@ -97,14 +118,19 @@ def load(paths: Iterable[Path]) -> Intrinsics:
     for path in files:
         tree = _read(path)
         cameras += _cameras(tree, path.stem.lower())
-        unit = _depth_scale(tree)
+        unit = depth_scale(tree)
         scale = {"depth_scale": unit} if unit else scale
         found = (_numbers(tree.get(name), 16) for name in MOTIONS) if isinstance(tree, dict) else ()
         motion = next((numbers.reshape(4, 4) for numbers in found if numbers is not None), motion)
     source = " and ".join(path.name for path in files)
     depths = [values for name, values in cameras if "depth" in name]
     colors = [values for name, values in cameras if "depth" not in name and "right" not in name]
-    if len(depths) > 1 or len(colors) > 1 or not cameras:
+    if not cameras:
+        raise DatasetError(
+            f"{source} gives no camera; expected fx, fy, cx and cy, or a 3x3 matrix: give --camera "
+            "fx,fy,cx,cy[,w,h[,depth_scale]]"
+        )
+    if len(depths) > 1 or len(colors) > 1:
         raise DatasetError(
             f"{source} gives {len(depths)} depth and {len(colors)} other cameras; expected one of each at most: "
             "give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
@@ -135,7 +161,9 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     if four is not None:
         values |= camera_values(*four)
     lens = _first(tree, LENSES)
-    if isinstance(lens, list) and lens and all(map(_is_finite, lens)):
+    rows = lens if isinstance(lens, list) else []
+    lens = [number for row in rows for number in (row if isinstance(row, list) else [row])]
+    if lens and all(map(_is_finite, lens)):
         model = str(tree.get("distortion_model", tree.get("model", "")))
         if any(lens) and (any(lens[5:]) or model.lower() in OTHER_LENSES):
             raise DatasetError(
@@ -188,7 +216,7 @@ def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  #
             yield from _cameras(below, f"{name}/{key.lower()}")
 
 
-def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
+def depth_scale(tree: Any) -> float | None:  # noqa: ANN401
     """Depth units per metre anywhere in a JSON value."""
     if not isinstance(tree, dict | list):
         return None
@@ -196,7 +224,7 @@ def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
         if _is_finite(value) and value > 0:
             return float(value) if value >= 1 else 1.0 / value
     parts = tree.values() if isinstance(tree, dict) else tree
-    return next((scale for below in parts if (scale := _depth_scale(below))), None)
+    return next((scale for below in parts if (scale := depth_scale(below))), None)
 
 
 def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:  # noqa: ANN401

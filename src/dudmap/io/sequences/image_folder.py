@@ -20,7 +20,7 @@ from dudmap.core.geometry.times import SECONDS
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
-from dudmap.io.sequences import Recording, camera_files, images, intrinsics, rotated_depth
+from dudmap.io.sequences import Recording, camera_search, images, intrinsics, rotated_depth
 from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
@@ -162,11 +162,19 @@ class ImageFolder(Recording):
         return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics of a file that lies there, else those of the data set."""
-        known = camera_files.find(self.path) or self._published()
-        if known is None:
-            raise camera_files.unknown(self.path)
-        return known
+        """Intrinsics of a file of a usual name, else those of the data set, else of a file of any name that fits."""
+        return camera_search.known(self.path, self._published(), self._sizes)
+
+    def _sizes(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """Width and height of the depth and the colour images, of the first pair that can be read."""
+        for color, depth in self._pairs[:PROBES]:
+            try:
+                height, width = self._read_depth(depth.path, 1.0).shape
+                rows, columns = self._read_color(color.path).shape[:2] if self.has_color else (height, width)
+            except FrameError:
+                continue
+            return (width, height), (columns, rows)
+        return None
 
     def _published(self) -> intrinsics.Intrinsics | None:
         """Intrinsics of the data set, where the layout or a name tells which one it is."""

@@ -13,7 +13,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
-from dudmap.io.sequences import camera_files, images, intrinsics
+from dudmap.io.sequences import camera_files, camera_search, images, intrinsics
 from dudmap.io.sequences.image_folder import (
     FRAME_RATE,
     ImageFolder,
@@ -141,12 +141,11 @@ class SharedFrameFiles(FrameFiles):
         super().__init__(path, camera)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        if self.format != "7-Scenes":
+            why = ", since 7-Scenes, 3DMatch and others share this layout and the path does not name 7-Scenes"
+            return camera_search.known(self.path, None, self._sizes, why)
         known = camera_files.find(self.path)
-        if self.format != "7-Scenes" and known is None:
-            raise camera_files.unknown(
-                self.path, ", since 7-Scenes, 3DMatch and others share this layout and the path does not name 7-Scenes"
-            )
-        if known is not None and (self.format != "7-Scenes" or Path(known.source).name != "camera-intrinsics.txt"):
+        if known is not None and Path(known.source).name != "camera-intrinsics.txt":
             return known
         values, source = SEVEN_SCENES_DEPTH, f"the 7-Scenes cameras{intrinsics.BY_NAME}"
         if known is not None:

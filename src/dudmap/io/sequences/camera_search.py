@@ -1,0 +1,233 @@
+"""Intrinsics in files of any name: accepted is the only camera, for each kind of images, that fits their size."""
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError
+from dudmap.io.sequences import camera_files
+from dudmap.io.sequences.camera_content import LARGEST_CONTENT, Values, cameras_in
+from dudmap.io.sequences.intrinsics import SAME_SHAPE, Intrinsics
+
+NAMED = re.compile(r".*(cam|intrin|calib|param).*|k([._-].*)?", re.IGNORECASE)
+"""Names of files, without their suffix, that may hold intrinsics."""
+SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".csv", ".npy", ".npz", ".cfg", ".ini", ".conf", ".toml", "")
+FOLDERS = re.compile(r"config|.*(intrin|calib).*", re.IGNORECASE)
+"""Names of folders in which such files, under any name, are looked for, too."""
+MOST_NAMES = 5
+"""Files that a message names."""
+SAME = 0.5
+"""Largest difference of the numbers of one camera in two files, pixels: below what shifts an edge by a pixel."""
+FIELD_OF_VIEW = (20.0, 130.0)
+"""Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
+OFF_CENTER = 0.25
+"""Largest plausible distance of the principal point from the middle of the image, share of its size."""
+UNEQUAL_FOCAL = 0.1
+"""Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
+SCALED = ", scaled from "
+"""In a source of intrinsics, before the size that its file gives."""
+COLOR_WORDS, OTHER_WORDS = r"colou?r|rgb(?!_?d)|left", r"right|infra"
+
+Size = tuple[int, int]
+
+
+class Found(NamedTuple):
+    """A camera of a file, for the images of a kind, with the size that the file gives where it is scaled."""
+
+    file: Path
+    kind: str
+    values: Values
+    scaled: Size | None = None
+
+
+def known(
+    folder: Path, published: Intrinsics | None, sizes: Callable[[], tuple[Size, Size] | None], why: str = ""
+) -> Intrinsics:
+    """Intrinsics of a recording: of a file of a usual name, else the published ones, else of any file that fits.
+
+    Args:
+        folder: The folder of the recording.
+        published: Intrinsics of the data set, if it is known.
+        sizes: Width and height of the depth and of the colour images, None if no image can be read.
+        why: For the message: why those of the data set are not known.
+
+    Raises:
+        DatasetError: No file gives one camera.
+    """
+    problem = None
+    try:
+        found = camera_files.find(folder) or published
+    except camera_files.UnclearFilesError as error:
+        found, problem = None, error
+    given = found and tuple(int(found.values.get(key, 0)) for key in ("width", "height"))
+    if found is not None and (found is published or given == (0, 0)):
+        return found
+    both = sizes()
+    if both is not None and given != both[0]:
+        found = search(folder, *both) or found
+    if found is None:
+        raise problem or camera_files.unknown(folder, why)
+    return found
+
+
+def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
+    """Intrinsics in a folder, in the one above, or in their folders for configurations; None without any.
+
+    Args:
+        folder: The folder of the recording.
+        depth, color: Width and height of the images.
+
+    Raises:
+        DatasetError: Files contradict each other, or none fits the images.
+    """
+    misfits: list[str] = []
+    for place in (folder, folder.resolve().parent):
+        found: list[Found] = []
+        for file in _candidates(place):
+            for name, values in cameras_in(file):
+                fitting = _fitting(file, name, values, depth, color)
+                if fitting is not None:
+                    found.append(fitting)
+                elif not re.search(OTHER_WORDS, name):
+                    misfits.append(f"{_shown(file, folder)} ({_numbers(values)})")
+        if found:
+            return _decided(found, folder, depth, color)
+    if misfits:
+        images = f"{depth[0]}x{depth[1]}" + (f" (depth) and {color[0]}x{color[1]} (colour)" if color != depth else "")
+        raise DatasetError(
+            f"no camera that lies at {folder} fits its images of {images} pixels: {_listed(misfits)}; give --camera "
+            "fx,fy,cx,cy[,w,h[,depth_scale]]"
+        )
+    return None
+
+
+def _candidates(place: Path) -> Iterator[Path]:
+    """Files at a place that may hold intrinsics."""
+    for path in sorted(place.iterdir()):
+        if path.is_dir() and FOLDERS.fullmatch(path.name):
+            yield from (file for file in sorted(path.iterdir()) if _is_small(file))
+        elif NAMED.fullmatch(path.stem) and _is_small(path):
+            yield path
+
+
+def _is_small(file: Path) -> bool:
+    return file.suffix.lower() in SUFFIXES and file.is_file() and file.stat().st_size <= LARGEST_CONTENT
+
+
+def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) -> Found | None:
+    """A camera for the images that it fits, depth where it fits both; None if it fits none."""
+    if re.search(OTHER_WORDS, name):
+        return None
+    kinds = {"depth": depth, "color": color}
+    if "depth" in name:
+        kinds = {"depth": depth}
+    elif re.search(COLOR_WORDS, name):
+        kinds = {"color": color}
+    elif depth == color:
+        kinds = {"color": color}  # of both
+    given = int(values.get("width", 0)), int(values.get("height", 0))
+    for kind, size in kinds.items():
+        if given in (size, size[::-1]) and _is_plausible(values, size):
+            return Found(file, kind, values | {"width": size[0], "height": size[1]})
+    scaled = [kind for kind, size in kinds.items() if _is_multiple(given, size) and _is_plausible(values, given)]
+    if len(scaled) == 1:
+        size = kinds[scaled[0]]
+        camera = Camera(values["fx"], values["fy"], values["cx"], values["cy"], *given).resized(*size)
+        numbers = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
+        return Found(file, scaled[0], values | numbers, given)
+    if all(given):
+        return None
+    kind = next((kind for kind, size in kinds.items() if _is_plausible(values, size)), None)
+    return None if kind is None else Found(file, kind, values)
+
+
+def _is_multiple(given: Size, size: Size) -> bool:
+    """Whether the larger of two sizes of one shape is 1.5, 2, 2.5, 3, ... times the smaller one."""
+    if not all(given) or abs(given[0] * size[1] / (given[1] * size[0]) - 1) > SAME_SHAPE:
+        return False
+    factor = max(given[0] / size[0], size[0] / given[0])
+    return abs(2 * factor - round(2 * factor)) < SAME_SHAPE
+
+
+def _is_plausible(values: Values, size: Size) -> bool:
+    """Whether numbers can be those of a camera of images of a size."""
+    focal, center = np.array([values["fx"], values["fy"]]), np.array([values["cx"], values["cy"]])
+    if not (focal > 0).all():
+        return False
+    angles = np.degrees(2 * np.arctan(np.array(size) / 2 / focal))
+    centered = np.abs(center + 0.5 - np.array(size) / 2) <= OFF_CENTER * np.array(size)
+    square = abs(focal[0] - focal[1]) <= UNEQUAL_FOCAL * focal.max()
+    return bool(FIELD_OF_VIEW[0] <= angles.min() and angles.max() <= FIELD_OF_VIEW[1] and centered.all() and square)
+
+
+def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intrinsics:
+    """Intrinsics of the cameras that were found."""
+    cameras: dict[str, Values] = {}
+    for kind in ("depth", "color"):
+        known = [camera for camera in found if camera.kind == kind]
+        distinct = _distinct(known)
+        if len(distinct) > 1:
+            named = [f"{_shown(camera.file, folder)} ({_numbers(camera.values)})" for camera in distinct]
+            raise DatasetError(
+                f"{len(named)} different cameras lie at {folder}: {_listed(named)}; give the right one with --camera "
+                "fx,fy,cx,cy[,w,h[,depth_scale]]"
+            )
+        if distinct:
+            cameras[kind] = distinct[0].values
+    source = _source(found, folder)
+    if "depth" not in cameras and depth != color:
+        raise DatasetError(
+            f"{source} gives the camera of the colour images of {color[0]}x{color[1]} pixels, but the depth images "
+            f"are {depth[0]}x{depth[1]}; give their camera with --camera fx,fy,cx,cy"
+        )
+    scale = {key: values[key] for values in cameras.values() for key in ("depth_scale",) if key in values}
+    own = cameras.get("depth") or cameras["color"]
+    other = cameras.get("color", own)
+    if _is_same(own, other):
+        return Intrinsics(own | scale, source)
+    return Intrinsics(own | scale, source, other | {"width": color[0], "height": color[1]})
+
+
+def _distinct(cameras: list[Found]) -> list[Found]:
+    """Cameras that differ, each with the most that is known of it."""
+    kept: list[Found] = []
+    for camera in sorted(cameras, key=lambda camera: -len(camera.values)):
+        if not any(_is_same(camera.values, other.values) for other in kept):
+            kept.append(camera)
+    return kept
+
+
+def _is_same(one: Values, other: Values) -> bool:
+    """Whether numbers agree; coefficients of a lens that only one of them has do not count."""
+    near = all(abs(one[key] - other[key]) <= SAME for key in ("fx", "fy", "cx", "cy"))
+    return near and all(one[key] == other[key] for key in one.keys() & other.keys() & {"k1", "k2", "p1", "p2", "k3"})
+
+
+def _source(found: list[Found], folder: Path) -> str:
+    """Files of cameras for people, and how their numbers were scaled."""
+    names = list(dict.fromkeys(_shown(camera.file, folder) for camera in found))
+    scaled = next((camera for camera in found if camera.scaled), None)
+    text = _listed(names)
+    if scaled is not None:
+        to = f"{scaled.values['width']:g}x{scaled.values['height']:g}"
+        text += f"{SCALED}{scaled.scaled[0]}x{scaled.scaled[1]} to {to} pixels" if scaled.scaled else ""
+    return text
+
+
+def _shown(file: Path, folder: Path) -> str:
+    return os.path.relpath(file.resolve(), folder.resolve())
+
+
+def _numbers(values: Values) -> str:
+    size = f" for {values['width']:g}x{values['height']:g}" if {"width", "height"} <= values.keys() else ""
+    return ",".join(f"{values[key]:.6g}" for key in ("fx", "fy", "cx", "cy")) + size
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
