@@ -105,7 +105,7 @@ def masks(folder):
 
 def load_masks(path):
     from dudmap.core.geometry.camera import Camera
-    from dudmap.io.sequences.images import MaskFolder
+    from dudmap.io.sequences.masks import MaskFolder
 
     folder = MaskFolder(path, np.array([100.0, 100.1, 100.2]), Camera(60, 60, 31.5, 23.5, 64, 48))
     for index in range(3):

@@ -15,7 +15,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.images import MaskFolder
+from dudmap.io.sequences.masks import MaskFolder
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 CAMERA = Camera(fx=80, fy=80, cx=31.5, cy=23.5, width=64, height=48)
@@ -104,6 +104,7 @@ def test_run_reads_masks_and_counts_frames_without(tmp_path):
     assert result.exit_code == 0, result.output
     metrics = json.loads(result.stdout)
     assert (metrics["frames_with_mask"], metrics["frames_without_mask"]) == (3, 1)
+    assert f"masks: 3 of {len(sequence)} frames have one (3 by time)" in metrics["warnings"]
     written = sorted((tmp_path / "out" / "masks").iterdir())
     corners = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[:100, :100].mean() for path in written]
     assert corners[0] == corners[1] == corners[3] == 255

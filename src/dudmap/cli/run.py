@@ -29,7 +29,7 @@ def run(
     ] = None,
     masks: Annotated[
         Path | None,
-        Option(help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic.", metavar="FOLDER"),
+        Option(help="Folder of dynamic masks, named like the images or by time, 255 = dynamic.", metavar="FOLDER"),
     ] = None,
     ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,

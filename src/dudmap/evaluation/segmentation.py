@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry.association import associate, read_list, read_pairs
-from dudmap.errors import DatasetError
-from dudmap.io.sequences.images import read_mask, stamped_masks
+from dudmap.errors import DatasetError, DudmapError
+from dudmap.input_files import DAMAGE, describe, read_json
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.images import read_mask
+from dudmap.io.sequences.masks import MaskFolder, are_counts, stamped_masks
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -118,7 +121,8 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
 
     Args:
         estimate: Run folder with masks/, or a folder of PNG files named by their time stamp.
-        reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by their time stamp.
+        reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by their time stamp, or by the
+            numbers of the images of the run's recording.
 
     Returns:
         The pairs, and the number of true masks without an estimated one.
@@ -127,6 +131,8 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
         DatasetError: A folder holds no masks, or no two masks are close enough in time.
     """
     found, true = _estimated_masks(estimate), _true_masks(reference)
+    if are_counts([mask for _, mask in true]) and not are_counts([mask for _, mask in found]):
+        true = _numbered_masks(reference, estimate)
     pairs = associate(np.array([stamp for stamp, _ in found]), np.array([stamp for stamp, _ in true]))
     if not pairs:
         raise DatasetError(
@@ -148,6 +154,19 @@ def _true_masks(folder: Path) -> list[tuple[float, Path]]:
     colors = np.array([color.timestamp for color, _ in frames])
     pairs = associate(np.array([mask.timestamp for mask in masks]), colors)
     return sorted((frames[j][1].timestamp, masks[i].path) for i, j in pairs)
+
+
+def _numbered_masks(folder: Path, run: Path) -> list[tuple[float, Path]]:
+    """Timestamps and files of masks that are named by the numbers of the images of a run's recording."""
+    try:
+        recording = open_sequence(**read_json(run / "metrics.json")["recording"])
+    except (DudmapError, *DAMAGE) as error:
+        raise DatasetError(
+            f"the masks in {folder} are named by numbers, the masks of {run} by times, and the recording of the run "
+            f"cannot be opened ({describe(error)}); expected masks named <timestamp>.png"
+        ) from error
+    masks = MaskFolder(folder, recording.timestamps, recording.camera, getattr(recording, "image_files", ()))
+    return [(float(recording.timestamps[index]), file) for index, file in masks.files().items()]
 
 
 def _estimated_masks(folder: Path) -> list[tuple[float, Path]]:

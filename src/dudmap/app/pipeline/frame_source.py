@@ -15,7 +15,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.errors import ConfigError, FrameError
 from dudmap.io.cameras import MAX_WAIT
 from dudmap.io.sequences import read_frame
-from dudmap.io.sequences.images import MaskFolder
+from dudmap.io.sequences.masks import MaskFolder
 
 if TYPE_CHECKING:
     from dudmap.core.slam import Slam
@@ -185,7 +185,7 @@ def open_masks(folder: str | Path | None, sequence: "Sequence | LiveCamera") -> 
     times = getattr(sequence, "timestamps", None)
     if times is None:
         raise ConfigError("masks belong to the frames of a recording; a camera has none")
-    return MaskFolder(folder, times, sequence.camera)
+    return MaskFolder(folder, times, sequence.camera, getattr(sequence, "image_files", ()))
 
 
 def _with_masks(

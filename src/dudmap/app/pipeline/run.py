@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from dudmap.core.places.saved_map import SavedMap
     from dudmap.core.slam import Slam
     from dudmap.io.sequences import Sequence
-    from dudmap.io.sequences.images import MaskFolder
+    from dudmap.io.sequences.masks import MaskFolder
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream of a camera begins."""
@@ -82,8 +82,8 @@ def run(
         max_frames: Process only this many frames.
         save_masks: Write the dynamic mask of every frame.
         save_map: Write map.npz and keyframes.npz.
-        masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
-            ones. Frames with and without a mask are counted.
+        masks: Folder of external dynamic masks, named like the images or <timestamp>.png, with 255 = dynamic, which are
+            added to the estimated ones. Frames with and without a mask are counted.
         ignore: Image, white at the pixels of the depth or colour image that never count; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
         ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
@@ -160,7 +160,11 @@ def run(
             files.callback(_finish_recording, recorder, display)
         if isinstance(sequence, LiveCamera):
             files.callback(sequence.close)
-        job = Job(sequence, out, options, display, open_masks(masks, sequence), observers, recorder)
+        folder = open_masks(masks, sequence)
+        if folder is not None:
+            notice(folder.said)
+            figures.warnings += [] if folder.complete else [folder.said]
+        job = Job(sequence, out, options, display, folder, observers, recorder)
         if storing is not None and not isinstance(sequence, LiveCamera):
             store = RunStore(out, storing.every, display.note)
             store.order(sequence, options)

@@ -129,7 +129,7 @@ class RunContent:
 
     def mask_files(self) -> dict[float, Path]:
         """Masks of what moves by time stamp of the depth image."""
-        from dudmap.io.sequences.images import stamped_masks
+        from dudmap.io.sequences.masks import stamped_masks
 
         folder = self.folder / "masks"
         masks = dict(stamped_masks(folder)) if folder.is_dir() else {}

@@ -18,9 +18,9 @@ from dudmap.errors import ConfigError, DatasetError
 from dudmap.input_files import damaged
 from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
-from dudmap.io.sequences.image_folder import OPENGL_AXES
 from dudmap.io.sequences.images import read_mask
 from dudmap.io.sequences.intrinsics import DISTORTION_KEYS
+from dudmap.io.sequences.pose_matrices import OPENGL_AXES
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence

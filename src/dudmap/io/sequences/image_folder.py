@@ -1,7 +1,4 @@
-"""Recordings of pairs of image files: what all folder formats share, and files of poses as 4x4 matrices.
-
-A file of poses that cannot be read or holds something else is a ``DatasetError``.
-"""
+"""Recordings of pairs of image files: what all folder formats share."""
 
 import re
 from collections.abc import Iterable, Sized
@@ -12,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.frame import Frame
-from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile, associate
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.times import SECONDS
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
-from dudmap.input_files import read_text
 from dudmap.io.sequences import Recording, camera_search, images, intrinsics, rotated_depth
+from dudmap.io.sequences.pose_matrices import read_matrices, read_matrix, rigid_trajectory
 from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
@@ -110,6 +106,11 @@ class ImageFolder(Recording):
         except DatasetError as error:
             self.ground_truth, remarks = None, [f"the ground truth is not used: {error}"]
         self.remarks = [*filter(None, [self._unit_remark]), *remarks]
+
+    @property
+    def image_files(self) -> list[tuple[Path, Path]]:
+        """Files of the colour and the depth image of all frames."""
+        return [(color.path, depth.path) for color, depth in self._pairs]
 
     @property
     def color_timestamps(self) -> NDArray[np.float64]:
@@ -335,74 +336,3 @@ def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
     """Files by the number that the first group of a pattern of the whole file name holds; others are left out."""
     matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
     return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}
-
-
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between the camera axes of OpenGL (y up, z backward) and ours (y down, z forward)."""
-
-
-def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float64]:
-    """Matrix (rows, columns) of a text file; commas count as blanks. Numbers need not be finite."""
-    numbers = _numbers(path)
-    if numbers.size != rows * columns:
-        raise DatasetError(f"{path} holds {numbers.size} numbers; expected a {rows}x{columns} matrix")
-    return numbers.reshape(rows, columns)
-
-
-def read_matrices(path: Path) -> NDArray[np.float64]:
-    """Matrices (N, 4, 4) of a text file with 16 numbers a pose, row by row, or 12 a line, without the row 0 0 0 1."""
-    numbers = _numbers(path)
-    counts = [(n, len(line.replace(",", " ").split())) for n, line in enumerate(read_text(path).splitlines(), start=1)]
-    counts = [(line, count) for line, count in counts if count]
-    usual = counts[0][1] if counts and counts[0][1] in (4, 12, 16) else 16
-    wrong = next(((line, count) for line, count in counts if count != usual), None)
-    if wrong is not None or not counts or (usual == 4 and len(counts) % 4):
-        line, count = wrong or (counts[-1] if counts else (1, 0))
-        raise DatasetError(
-            f"{path}, line {line}: {count} numbers; expected the 16 of a 4x4 matrix for every pose, in one line or "
-            "four, or 12 in one line"
-        )
-    if usual != 12:
-        return numbers.reshape(-1, 4, 4)
-    poses = np.tile(np.eye(4), (len(counts), 1, 1))
-    poses[:, :3] = numbers.reshape(-1, 3, 4)
-    return poses
-
-
-def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
-    """Poses by frame number of a ``.log`` file: a line of three integers, then four rows of T_world_camera.
-
-    The format is that of the Redwood data sets and of Open3D's reconstruction system. The first integer is the number
-    of the frame.
-    """
-    numbers = _numbers(path)
-    if numbers.size == 0 or numbers.size % 19:
-        raise DatasetError(f"{path} holds {numbers.size} numbers; expected 3 integers and a 4x4 matrix for every pose")
-    table = numbers.reshape(-1, 19)
-    return {int(row[0]): row[3:].reshape(4, 4) for row in table}
-
-
-def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Trajectory | None:
-    """Trajectory of (timestamp, T_world_camera) pairs; frames whose pose is not a rigid motion are left out.
-
-    Data sets mark frames without a pose by infinite numbers or zeros. Rotations are projected onto the nearest one,
-    as they were written with few digits. None if there is no pose.
-    """
-    kept = []
-    for stamp, T in poses:
-        R = T[:3, :3]
-        if np.all(np.isfinite(T)) and np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0:
-            rigid = np.eye(4)
-            rigid[:3, :3], rigid[:3, 3] = se3.nearest_rotation(R), T[:3, 3]
-            kept.append((stamp, rigid))
-    return Trajectory.from_poses(kept) if kept else None
-
-
-def _numbers(path: Path) -> NDArray[np.float64]:
-    try:
-        fields = read_text(path).replace(",", " ").split()
-        return np.array([float(field) for field in fields])
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"cannot read {path}: {error}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} holds something that is no number: {error}") from error

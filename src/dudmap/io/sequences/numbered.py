@@ -16,8 +16,9 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, read_json, read_text
 from dudmap.io.sequences import image_series, intrinsics
-from dudmap.io.sequences.image_folder import ImageFolder, read_matrices, rigid_trajectory
+from dudmap.io.sequences.image_folder import ImageFolder
 from dudmap.io.sequences.image_numbers import are_times, keys, last_number
+from dudmap.io.sequences.pose_matrices import read_matrices, rigid_trajectory
 
 POSES = ("poses.txt", "pose.txt", "poses", "pose")
 """Files and folders of true poses."""

@@ -14,15 +14,9 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
 from dudmap.io.sequences import camera_files, camera_search, images, intrinsics
-from dudmap.io.sequences.image_folder import (
-    FRAME_RATE,
-    ImageFolder,
-    numbered_files,
-    read_log,
-    read_matrix,
-    rigid_trajectory,
-)
+from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.io.sequences.intrinsics import camera_values
+from dudmap.io.sequences.pose_matrices import read_log, read_matrix, rigid_trajectory
 
 
 class EpflSequence(ImageFolder):

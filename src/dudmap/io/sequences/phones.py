@@ -22,16 +22,9 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import open_plain, read_json, read_text
 from dudmap.io.sequences import images
 from dudmap.io.sequences.camera_files import values_of
-from dudmap.io.sequences.image_folder import (
-    FRAME_RATE,
-    OPENGL_AXES,
-    ImageFolder,
-    numbered_files,
-    read_matrix,
-    rigid_trajectory,
-    size,
-)
+from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, size
 from dudmap.io.sequences.intrinsics import Intrinsics, camera_values
+from dudmap.io.sequences.pose_matrices import OPENGL_AXES, read_matrix, rigid_trajectory
 
 
 class ArkitFolder(ImageFolder):
