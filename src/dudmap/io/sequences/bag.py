@@ -31,7 +31,7 @@ from dudmap.io.sequences.intrinsics import Lens
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-MAGIC = {".bag": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
+MAGIC = {".bag": b"#ROSBAG V2.0", ".active": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
 """First bytes of the files by their suffix."""
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
@@ -80,6 +80,11 @@ class RosBag(Recording):
         self._color_stamps = color.stamps[[k for k, _ in self._pairs]]
         self._recorded = [(int(color.recorded[i]), int(depth.recorded[j])) for i, j in self._pairs]
         self._find_cameras(camera)
+        if self._bag.unclosed:
+            self.remarks = [
+                f"{self.path} was not closed by its recorder, or is cut off: {len(self)} frames are found, up to "
+                f"{self.timestamps[-1] - self.timestamps[0]:.1f} s after the first one"
+            ]
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_RATIO, RATIO_FREE_BYTES, open_plain, read_text
+from dudmap.io.sequences.unclosed import LARGEST_CHUNK, CompletedFile, completed
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-LARGEST_CHUNK = 2**28
-"""Largest chunk or message of a bag after decompression, bytes; recorders write chunks of up to 4 MB, and one raw image
-of ``LARGEST_PIXELS`` has 200 MB."""
 LARGEST_METADATA = 2**19
 """Largest metadata.yaml, bytes; one with 100 topics has 60 kB, and its parser takes 20 seconds for a megabyte."""
 SAMPLES = 30
@@ -71,6 +69,7 @@ class BagFile:
 
     Attributes:
         connections: Topics, each with its type and number of messages.
+        unclosed: Whether the file was not closed, so that its end may be missing.
 
     Raises:
         MissingExtraError: The package rosbags is missing.
@@ -81,13 +80,13 @@ class BagFile:
         with extra("ros-bags", f"the ROS bag {path}"):
             from rosbags import rosbag1, rosbag2
             from rosbags.typesys import Stores, get_typestore
-        self._ros1 = path.suffix == ".bag"
+        self._ros1, self.unclosed = path.suffix in (".bag", ".active"), False
         try:
             _check(path)
             limit_rosbags()
             with without_definitions():
-                self._reader: Any = (rosbag1 if self._ros1 else rosbag2).Reader(path)
-                self._reader.open()
+                make: Any = (rosbag1 if self._ros1 else rosbag2).Reader
+                self._reader, self.unclosed = _opened(make, path)
         except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
             raise DatasetError(f"cannot open the bag {path}: {error}") from error
         self.connections: list[Connection] = self._reader.connections
@@ -105,6 +104,7 @@ class BagFile:
     def messages(self, connections: "list[Connection]", count: int | None = None) -> Generator[tuple[int, Any]]:
         """Times of recording and content of the first ``count`` messages of some topics, None for all."""
         with self._stream.lock, closing(self._reader.messages(connections)) as found:
+            self._stream.close()  # without chunks, two passes would move one place in the file
             for connection, time, raw in islice(found, count):
                 yield time, self._decoded(raw, connection)
 
@@ -158,7 +158,7 @@ class BagFile:
         """Time of recording and first bytes of every message; None for bytes that would have to be decompressed."""
         from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_uint32
 
-        with open_plain(self._reader.path) as file:
+        with _open(self._reader.path) as file:
             for entry in self._reader.indexes[connection.id]:
                 chunk = self._reader.chunks[entry.chunk_pos]
                 if chunk.decompressor is not decompressors["none"]:
@@ -192,7 +192,7 @@ def _mcap_entries(part: Any, connection: "Connection") -> Iterable[tuple[int, by
     if not part.chunks:
         yield from ((time, bytes(data[:HEAD])) for _, time, data in part.messages([connection]))
         return
-    with open_plain(part.path) as file:
+    with _open(part.path) as file:
         for chunk in (chunk for chunk in part.chunks if connection.id in chunk.message_index_offsets):
             file.seek(chunk.message_index_offsets[connection.id])
             index = file.read(struct.unpack_from("<Q", file.read(MCAP_RECORD), 1)[0])
@@ -204,6 +204,28 @@ def _mcap_entries(part: Any, connection: "Connection") -> Iterable[tuple[int, by
                 yield time, file.read(HEAD)
 
 
+def _opened(make: Callable[[Any], Any], path: Path) -> tuple[Any, bool]:
+    """An open reader of rosbags, and whether the file was not closed and has an index made anew."""
+    reader = make(path)
+    try:
+        reader.open()
+    except Exception as error:  # see above
+        whole = completed(path) if path.is_file() else None
+        if whole is None:
+            raise
+        reader = make(whole)
+        try:
+            reader.open()
+        except Exception:
+            raise error from None
+        return reader, True
+    return reader, False
+
+
+def _open(path: Any) -> IO[bytes]:  # noqa: ANN401 - a path, or a file that stands for one
+    return path.open() if isinstance(path, CompletedFile) else open_plain(path)
+
+
 def _check(path: Path) -> None:
     """Check that a bag has plain files only, and that an SQLite file is nothing but tables.
 
@@ -212,7 +234,7 @@ def _check(path: Path) -> None:
     if path.is_dir():
         read_text(path / "metadata.yaml", LARGEST_METADATA)
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-        if file.suffix in (".db3", ".mcap", ".bag"):
+        if file.suffix in (".db3", ".mcap", ".bag", ".active"):
             open_plain(file).close()
         if file.suffix == ".db3":
             with closing(sqlite3.connect(_sqlite_uri(file), uri=True)) as database:
