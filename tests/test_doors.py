@@ -14,6 +14,7 @@ FOUNDATION = {
     "errors",
     "extras",
     "input_files",
+    "interruption",
     "own_folder",
     "config_section",
     "thesis_config",

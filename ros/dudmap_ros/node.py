@@ -182,6 +182,15 @@ class DudmapNode(LifecycleNode):
         mode = "localising, the map is kept" if request.data else "mapping"
         return self.answer(response, lambda: self.session.set_localize(request.data) or mode)
 
+    def end(self) -> None:
+        """Save a map that was not saved, as the node is stopped; a run folder that is there is kept."""
+        try:
+            folder = self.session.save_rest(self.setting("save_to")) if self.session is not None else None
+            if folder is not None:
+                self.get_logger().info(f"saved to {folder.resolve()}")
+        except DudmapError as error:
+            self.get_logger().error(str(error))
+
     def answer(self, response: Any, act: Any) -> Any:  # noqa: ANN401
         """Fill a response with what an action says, or with the sentence of its error."""
         try:
@@ -203,5 +212,6 @@ def main(args: list[str] | None = None) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
+        node.end()
         node.destroy_node()
         rclpy.try_shutdown()

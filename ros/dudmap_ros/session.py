@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dudmap.cli.output import free_folder
 from dudmap.config import Config, keys
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.mesh import Mesh
@@ -87,7 +88,7 @@ class Session:
         self.localize = self.localize and self.saved_map is not None
         self.slam: Slam | None = None
         self.watch: ChangeWatch | None = None
-        self.processed = self.stale = 0
+        self.processed = self.stale = self._saved = 0
         self._last = float("-inf")
 
     def set_localize(self, localize: bool) -> None:
@@ -156,7 +157,18 @@ class Session:
             self.slam.saved_map.save_keyframes(folder / KEYFRAME_FILE)
         except OSError as error:
             raise MapError(f"cannot write into {folder}: {error.strerror or error}") from error
+        self._saved = self.processed
         return folder
+
+    def save_rest(self, folder: str | Path) -> Path | None:
+        """Save a map that has grown since it was saved as the first of ``folder``, ``folder-2``, ... that is new.
+
+        Raises:
+            MapError: A file cannot be written.
+        """
+        if self.localize or self.processed == self._saved or self.slam is None or self.slam.maps[0][1].is_empty:
+            return None
+        return self.save(free_folder(Path(folder)))
 
     def _started(self, info: Any) -> Slam:  # noqa: ANN401
         camera = ros.camera_of(info)

@@ -54,7 +54,7 @@ class StandIn:
         def say(text, **options):
             self.log.append(text)
 
-        return SimpleNamespace(error=say, warning=say)
+        return SimpleNamespace(error=say, warning=say, info=say)
 
     def on_activate(self, state):
         return SUCCESS
@@ -184,6 +184,39 @@ def test_what_appeared_since_the_saved_map_is_published(node_class, recording, t
         node.process(depth, color, info)
     shown = [len(message.markers) - 1 for message in node.published["changes"]]  # the first marker removes old ones
     assert shown == [1]
+
+
+def test_a_node_that_is_stopped_saves_what_was_not_saved(node_class, recording, tmp_path, monkeypatch):  # noqa: F811
+    """rclpy ends ``spin`` by an exception of its own when SIGTERM comes, or SIGINT of a launch."""
+    nodes = sys.modules[node_class.__module__]
+    made = []
+
+    def spin(node):
+        made.append(node)
+        node.process(*messages(recording, 0))
+        raise nodes.ExternalShutdownException
+
+    monkeypatch.setattr(nodes, "DudmapNode", lambda: prepared(node_class, tmp_path / "run"))
+    for name in ("init", "try_shutdown"):
+        monkeypatch.setattr(nodes.rclpy, name, lambda **_: None, raising=False)
+    monkeypatch.setattr(nodes.rclpy, "spin", spin, raising=False)
+    nodes.main()
+    assert (tmp_path / "run" / "map.npz").is_file()
+    nodes.main()  # of the next start in this folder, which keeps the run before
+    assert (tmp_path / "run-2" / "mesh.ply").is_file()
+    assert "run-2" in made[-1].log[-1]
+    made[-1].session.save(tmp_path / "run-2")
+    made[-1].end()
+    assert not (tmp_path / "run-3").exists()
+
+
+def prepared(node_class, folder):
+    node = node_class()
+    node.parameters |= {"volume.voxel_size": 0.04, "save_to": str(folder)}
+    node.trigger_configure = lambda: node.on_configure(None)
+    node.trigger_activate = lambda: node.on_activate(None)
+    node.destroy_node = lambda: None
+    return node
 
 
 def test_a_wrong_parameter_is_said_and_refused(node_class):

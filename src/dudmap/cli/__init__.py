@@ -2,7 +2,7 @@
 
 Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` with commands of its own
 there, which is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
-sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C.
+sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
 """
 
 import ctypes
@@ -18,7 +18,7 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
-from dudmap import __version__
+from dudmap import __version__, interruption
 from dudmap.cli.options import arranged, grouped
 from dudmap.errors import DudmapError
 
@@ -72,7 +72,8 @@ class CommandGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command; print errors without a traceback."""
         try:
-            return super().invoke(ctx)
+            with interruption.recognised():
+                return super().invoke(ctx)
         except DudmapError as error:
             fail(str(error))
         except BrokenPipeError:
@@ -151,7 +152,11 @@ def main() -> None:
     _share_one_heap()
     warnings.showwarning = _show_warning
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # that it keeps its list of fonts in a temporary folder
-    app()
+    interruption.listen()
+    try:
+        app()
+    except SystemExit as end:
+        sys.exit(interruption.exit_code(end.code if isinstance(end.code, int) else int(end.code is not None)))
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from dudmap import interruption
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.errors import DudmapError
@@ -66,7 +67,7 @@ def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
             raise
         except Exception as error:  # a defect of ours, whatever it is
             raise report_crash(error, events.out or Path.cwd(), events.recent) from error
-        if wanted.view and sys.stdin.isatty():
+        if wanted.view and sys.stdin.isatty() and not interruption.must_end():
             say("the page stays open; ctrl-C ends it", err=True)
             _wait()
 

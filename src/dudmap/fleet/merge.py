@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap import interruption
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.app.pipeline.run_folder import locked, prepare_run_folder
 from dudmap.atomic_file import write_bytes, write_text
@@ -68,7 +69,7 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
     if pair.T_a_b is None:
         raise MapError(f"{a} and {b} are not merged: {pair.reason}")
     merged = merged_map(*maps, pair.T_a_b)
-    with locked(out):
+    with interruption.postponed(), locked(out):
         prepare_run_folder(out, None, save_masks=False)
         of_a, of_b = save_trajectories(out, [(a, np.eye(4)), (b, pair.T_a_b)])
         merged.volume.save(out / MAP_FILE)

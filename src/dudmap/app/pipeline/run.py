@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from dudmap import interruption
 from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.frame_processing import process_source
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
@@ -114,6 +115,7 @@ def run(
     """
     from dudmap.app.pipeline.calibration import ASSUMED, calibrate_start
 
+    interruption.check()
     out = Path(out)
     if live and not isinstance(sequence, LiveCamera):
         sequence = ReplayCamera(sequence)
@@ -172,7 +174,12 @@ def run(
             display.announce_compilation()
         if calibrate and count is not None and not isinstance(sequence, LiveCamera):
             with counted("calibrating", quiet=not progress, console=display.console) as counting:
-                calibration = calibrate_start(sequence, config, count, notice, counting, ignored)
+                try:
+                    with interruption.recognised():
+                        calibration = calibrate_start(sequence, config, count, notice, counting, ignored)
+                except KeyboardInterrupt:
+                    resume = "" if store is None else f"; dudmap run --resume {out} begins again"
+                    raise KeyboardInterrupt(f"interrupted while it calibrated{resume}") from None
         elif calibration is None and not live and has_color(sequence):
             notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
@@ -222,7 +229,8 @@ class Job:
         with ExitStack() as files, display:
             try:
                 try:
-                    self._process(state, store)
+                    with interruption.recognised():
+                        self._process(state, store)
                 except DeviceError as error:
                     if store is None:
                         raise
@@ -242,8 +250,9 @@ class Job:
                 count, of_pass = len(state.record.rows), " of the second pass" if state.number else ""
                 if not isinstance(self.sequence, LiveCamera):
                     stopped = f"interrupted after {count} frames{of_pass}"
-                    raise KeyboardInterrupt(f"{stopped}; {_saved(state)} in {out}") from None
-                display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
+                    resume = "" if store is None else f"; dudmap run --resume {out} goes on"
+                    raise KeyboardInterrupt(f"{stopped}; {_saved(state)} in {out}{resume}") from None
+                display.note(f"stopped by {interruption.name()} after {count} frames")  # as a stream without an end is
             except DudmapError as error:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state)} in {out}") from error
@@ -251,7 +260,8 @@ class Job:
                 stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
                 raise
             finally:
-                report = self._finish(state, store, stopped, defect=defect)
+                with interruption.postponed():
+                    report = self._finish(state, store, stopped, defect=defect)
         record, count = state.record, self.options.max_frames or len(state.record.rows)
         if record.rows and not len(report.trajectory):
             raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
@@ -281,12 +291,14 @@ class Job:
             live = isinstance(self.sequence, LiveCamera)
             with Background(postponed=live) as background, closing(self._frames(state, background)) as frames:
                 for frame in frames:
-                    process_source(
-                        frame, state.slam, state.record, self.display, mask_folder, background, self.observers
-                    )
-                    state.next = frame.number + 1
-                    if store is not None:
-                        store.frame(state, frame.read.frame, background)
+                    with interruption.postponed():
+                        process_source(
+                            frame, state.slam, state.record, self.display, mask_folder, background, self.observers
+                        )
+                        state.next = frame.number + 1
+                        if store is not None:
+                            store.frame(state, frame.read.frame, background)
+                    interruption.check()
                     if len(state.record.rows) == options.max_frames:
                         break
         if store is not None:
@@ -363,7 +375,8 @@ def _saved(state: RunState) -> str:
 
 def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
     """Complete the recording and say what is in it."""
-    recorder.close()
+    with interruption.postponed():
+        recorder.close()
     display.note(f"recorded {recorder.written} frames to {recorder.path}")
     if recorder.dropped:
         display.note(f"{recorder.dropped} frames are missing in the recording: the disk is too slow for the camera")

@@ -1,9 +1,10 @@
-"""Recording of live frames into an MCAP file of ROS 2 messages, in a thread of its own."""
+"""Recording of live frames into an MCAP file of ROS 2 messages, in threads of its own."""
 
+import os
 import shutil
 from pathlib import Path
 from queue import Full, Queue
-from threading import Thread
+from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 AHEAD = 60
 """Frames that wait for the disk at most: two seconds of a camera, about 130 MB at 640x480."""
+UNSAVED = 0.5
+"""Seconds after which a frame is on the disk, if that is fast enough."""
 COLOR, ALIGNED, DEPTH = "/camera/color", "/camera/aligned_depth_to_color", "/camera/depth"
 """Namespaces of the topics ``image_raw`` and ``camera_info``; depth that is registered to colour is ``ALIGNED``."""
 COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
@@ -31,7 +34,8 @@ class Recorder:
     """Writes frames without loss to an MCAP file that ``dudmap run`` and ROS 2 read.
 
     ``put`` never waits: if the disk is too slow for the camera, frames are left out and counted. The file is written
-    beside its final place and moved there when it is complete.
+    beside its final place and moved there when it is complete. Until then it lies in ``<name>.recording``, where all
+    but the last ``UNSAVED`` seconds can be read if the process is killed or the power fails.
 
     Args:
         path: The file; it must not exist and end in .mcap.
@@ -57,14 +61,21 @@ class Recorder:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if self._folder.exists():
-                raise CameraError(f"{self._folder} is left from a recording that was cut off; remove it")
+                raise CameraError(
+                    f"{self._folder} holds a recording that was not closed, which dudmap reads; rename the folder to "
+                    "keep it, or remove it"
+                )
             self._writer = McapWriter(self._folder, "recording", compressed=False)
         except OSError as error:
             raise CameraError(f"cannot record to {path.parent}: {error.strerror or error}") from error
         self._error: Exception | None = None
         self._queue: Queue[Frame | None] = Queue(AHEAD)
-        self._thread = Thread(target=self._run, name="dudmap-recorder", daemon=True)
-        self._thread.start()
+        self._lock, self._closed = Lock(), Event()
+        self._threads = [
+            Thread(target=work, name="dudmap-recorder", daemon=True) for work in (self._run, self._bring_to_disk)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def put(self, frame: "Frame") -> None:
         """Record a frame, or count it as dropped if too many wait already; never blocks."""
@@ -80,7 +91,9 @@ class Recorder:
             CameraError: The disk is full or the file cannot be written.
         """
         self._queue.put(None)
-        self._thread.join()
+        self._closed.set()
+        for thread in self._threads:
+            thread.join()
         try:
             self._writer.close()
             if self._error is None and self.written:
@@ -98,11 +111,22 @@ class Recorder:
                 self.dropped += 1
                 continue
             try:
-                self._write(frame)
+                with self._lock:
+                    self._write(frame)
                 self.written += 1
             except Exception as error:  # reported by close
                 self._error = error
                 self.dropped += 1
+
+    def _bring_to_disk(self) -> None:
+        """Complete a chunk and wait for the disk, again and again."""
+        while not self._closed.wait(UNSAVED) and self._error is None:
+            try:
+                with self._lock:
+                    handle = self._writer.flush()
+                os.fsync(handle)
+            except OSError as error:  # reported by close
+                self._error = error
 
     def _write(self, frame: "Frame") -> None:
         """Write images and camera_info of a frame; with the first one the place of the colour camera."""

@@ -289,6 +289,15 @@ class McapWriter:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
         self._writer.write(self._connections[topic], nanoseconds, self._store.serialize_cdr(message, kind))
 
+    def flush(self) -> int:
+        """Complete the chunk that is begun and write it, so that it can be read if the file is never closed; returns
+        the handle of the file."""
+        storage: Any = self._writer.storage
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        storage.bio.flush()
+        return storage.bio.fileno()
+
     def close(self) -> None:
         """Complete the file."""
         self._writer.close()

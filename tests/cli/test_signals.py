@@ -1,0 +1,214 @@
+"""SIGTERM and SIGHUP end the program as Ctrl-C does: results are written, recordings can be read."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from dudmap.io.sequences import open_sequence
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="Windows has no such signals")
+DUDMAP = [sys.executable, "-c", "from dudmap.cli import main; main()"]
+FAST = ["--set", "volume.voxel_size=0.04"]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    place = tmp_path_factory.mktemp("room") / "room"
+    command = [*DUDMAP, "synth", place, "--max-frames", "300", "--size", "96x72"]
+    subprocess.run(command, check=True, capture_output=True)
+    return place
+
+
+def started(*arguments, wait_for, **options):
+    """The program, as soon as it has written something to a file or folder."""
+    process = subprocess.Popen([*DUDMAP, *map(str, arguments)], stderr=subprocess.PIPE, text=True, **options)
+    deadline = time.monotonic() + 240
+    while not (wait_for.exists() and wait_for.stat().st_size) and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return process
+
+
+def live_recording(room, folder, wait):
+    """A live run that records, ``wait`` seconds after its first recorded frame."""
+    command = "live", f"replay:{room}", "--out", folder / "out", "--record", folder / "walk.mcap", *FAST
+    process = started(*command, wait_for=folder / "walk.recording" / "walk.recording.mcap")
+    time.sleep(wait)
+    return process
+
+
+def check_run_folder(out, said):
+    for name in ("trajectory.txt", "mesh.ply", "map.npz", "report.html", "metrics.json"):
+        assert (out / name).stat().st_size > 0, (name, said)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["tracked"] >= 1, said
+    assert metrics["complete"]
+    return metrics
+
+
+def end_live(room, folder, wait):
+    """Send SIGTERM to a live run and check what it leaves."""
+    process = live_recording(room, folder, wait)
+    process.terminate()
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == 143, said
+    assert "defect" not in said
+    if "no frame of the camera" not in said:
+        check_run_folder(folder / "out", said)
+    full, found = open_sequence(room), open_sequence(folder / "walk.mcap")
+    assert not found.remarks
+    first = int(np.argmin(abs(full.timestamps - found.timestamps[0])))
+    np.testing.assert_array_equal(found[0].color, full[first].color)
+
+
+def kill_live(room, folder, wait):
+    """Kill a live run and check its recording."""
+    begin = time.monotonic()
+    process = live_recording(room, folder, wait)
+    process.kill()
+    process.communicate()
+    file = folder / "walk.recording" / "walk.recording.mcap"
+    found = open_sequence(file)
+    assert "not closed" in found.remarks[0]
+    full = open_sequence(room)
+    for index in range(len(found)):
+        np.testing.assert_array_equal(found[index].color, full[index_of(full, found.timestamps[index])].color)
+    recorded = found.timestamps[-1] - found.timestamps[0]
+    assert wait - 1.5 <= recorded <= time.monotonic() - begin  # the first byte was written up to half a second late
+
+
+def index_of(full, stamp):
+    return int(np.argmin(abs(full.timestamps - stamp)))
+
+
+def test_sigterm_ends_a_live_run_with_its_results_and_its_recording(room, tmp_path):
+    end_live(room, tmp_path, 4.0)
+
+
+def test_a_recording_is_readable_up_to_the_last_second_when_its_process_is_killed(room, tmp_path):
+    kill_live(room, tmp_path, 3.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(20))
+def test_sigterm_at_random_moments(room, tmp_path, number):
+    end_live(room, tmp_path, np.random.default_rng([52, number]).uniform(0, 12))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(10))
+def test_killed_at_random_moments(room, tmp_path, number):
+    kill_live(room, tmp_path, np.random.default_rng([53, number]).uniform(1, 8))
+
+
+def test_a_closed_terminal_ends_a_run_which_can_be_resumed(room, tmp_path):
+    """SIGHUP comes twice, of the kernel and of the shell, and all that is printed then fails."""
+    out, (ours, theirs) = tmp_path / "out", os.openpty()
+    command = ["run", str(room), "--out", str(out), "--calibration", "given", *FAST]
+    process = subprocess.Popen([*DUDMAP, *command], stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
+    os.close(theirs)
+    while not list((out / "thumbnails").glob("*")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.close(ours)
+    for _ in range(2):
+        process.send_signal(signal.SIGHUP)
+    assert process.wait(timeout=240) == 129
+    frames = json.loads((out / "metrics.json").read_text())["frames"]
+    assert 0 < frames < 300
+    assert (out / "mesh.ply").is_file()
+    subprocess.run([*DUDMAP, "run", "--resume", out], check=True, capture_output=True)
+    assert json.loads((out / "metrics.json").read_text())["frames"] == 300
+
+
+def test_sigterm_ends_a_run_and_names_how_to_go_on(room, tmp_path):
+    out = tmp_path / "out"
+    command = "run", room, "--out", out, "--calibration", "given", *FAST
+    process = started(*command, wait_for=out / "thumbnails")
+    time.sleep(2)
+    process.terminate()
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == 143, said
+    assert f"dudmap run --resume {out} goes on" in said
+    assert json.loads((out / "metrics.json").read_text())["frames"] > 0
+
+
+PROGRAM = """
+import os, signal, sys, time
+from dudmap import interruption
+interruption.listen()
+print("ready", flush=True)
+try:
+    with interruption.postponed():
+        time.sleep(float(sys.argv[1]))
+        print("written", flush=True)
+except KeyboardInterrupt:
+    print("asked", interruption.name(), flush=True)
+sys.exit(interruption.exit_code(0))
+"""
+
+
+def program(seconds, *signals, pause=0.0):
+    """Exit code and output of a program that writes for so many seconds and is sent signals meanwhile."""
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM, str(seconds)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(pause)
+    out, _ = process.communicate(timeout=60)
+    return process.returncode, out.split("\n")[:-1]
+
+
+def test_what_is_written_is_completed():
+    assert program(1.5) == (0, ["written"])
+    assert program(1.5, signal.SIGTERM) == (143, ["written", "asked SIGTERM"])
+    assert program(1.5, signal.SIGHUP) == (129, ["written", "asked SIGHUP"])
+    assert program(1.5, signal.SIGINT) == (0, ["written", "asked Ctrl-C"])
+
+
+def test_a_second_signal_ends_at_once_unless_it_is_the_echo_of_the_first():
+    assert program(20, signal.SIGTERM, signal.SIGTERM, pause=1.5) == (-signal.SIGTERM, [])
+    assert program(20, signal.SIGTERM, signal.SIGINT, pause=1.5) == (143, ["asked SIGTERM"])
+    assert program(1.5, signal.SIGTERM, signal.SIGTERM) == (143, ["written", "asked SIGTERM"])  # as timeout sends them
+    assert program(3, signal.SIGTERM, signal.SIGHUP, pause=1.2) == (143, ["written", "asked SIGTERM"])
+
+
+def test_what_is_ignored_stays_ignored():
+    """As by nohup."""
+    command = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n{PROGRAM}"
+    process = subprocess.Popen([sys.executable, "-c", command, "1"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGHUP)
+    assert process.communicate(timeout=60)[0] == "written\n"
+    assert process.returncode == 0
+
+
+def test_a_program_that_uses_the_library_keeps_its_handlers(slam, tmp_path):
+    from dudmap import Config, run
+    from recordings import write_recording
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    run(open_sequence(write_recording(tmp_path / "desk", 3)), Config(), tmp_path / "out", progress=False)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
+
+
+def test_a_request_that_numba_turns_into_an_error_of_its_own_is_recognised():
+    from dudmap import interruption
+
+    def kernel():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as interrupt:
+            raise SystemError("returned a result with an exception set") from interrupt
+
+    with pytest.raises(KeyboardInterrupt), interruption.recognised():
+        kernel()
+    with pytest.raises(SystemError), interruption.recognised():
+        raise SystemError("another one")
