@@ -295,7 +295,7 @@ class McapWriter:
         storage: Any = self._writer.storage
         if storage.chunk.msgs:
             storage.close_chunk()
-        storage.bio.flush()
+            storage.bio.flush()
         return storage.bio.fileno()
 
     def close(self) -> None:
