@@ -66,6 +66,34 @@ def test_a_wall_before_a_camera_that_rests_or_moves_is_no_fault():
     assert "the same plane at 2 m" in warning
 
 
+def near_wall(seed):
+    """Frames of a near wall with a step in the depth and a picture on it, which have no edge in common, at rest."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:120, :160]
+
+    def blob():
+        cx, cy, rx, ry = rng.uniform(0, 160), rng.uniform(0, 120), *rng.uniform(2, 30, 2)
+        return ((x - cx) / rx) ** 2 + ((y - cy) / ry) ** 2 < 1
+
+    step, picture = 0.6 * (1 + 0.3 * (blob() | blob())), 150 + 60.0 * blob() - 70.0 * blob()
+    for number in range(4):
+        depth = (step + rng.normal(0, 0.001, step.shape)).astype(np.float32)
+        gray = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+        yield Frame(number / 30, depth, np.repeat(gray[..., None], 3, axis=2))
+
+
+def test_a_near_wall_without_common_edges_is_not_called_turned():
+    said = [text for seed in range(60) for text in image_warnings(list(near_wall(seed)))]
+    assert said == []
+
+
+def test_frames_that_show_the_same_count_as_one():
+    sequence = open_sequence(EXCERPT)
+    frame = replace(sequence[0], color=np.ascontiguousarray(sequence[0].color[:, ::-1]))
+    (warning,) = image_warnings([frame] * 12)
+    assert image_warnings([frame] * 4) == [warning]
+
+
 @pytest.mark.parametrize("name", SPOILT)
 def test_wrong_input_of_a_synthetic_recording_is_said(name):
     scene = "room" if name == LARGE else "desk"  # too small a scale shows at a desk, too large a one in a room

@@ -36,6 +36,7 @@ LAYOUTS = {
     "a constant last": ("f_{k}_cam1.jpg", "f_{k}_cam1_depth.png"),
     "date and time": ("rgb/2024-01-31-23-59-{s}.jpg", "depth/2024-01-31-23-59-{s}.png"),
     "pictures of the depth beside": ("rgb/{k}.png", "raw/{k}.png", "depth/{k}.png"),
+    "a picture beside the folder": ("query/rgb/{k}.jpg", "depth/{k}.png", "query/1.png"),
     "webp": ("color/{k}.webp", "depth/{k}.png"),
     "floats": ("frames/{k}.png", "z/{k}.exr"),
     "files of a Mac": ("RGB/{k}.png", "D/{k}.png", "RGB/._{k}.png"),

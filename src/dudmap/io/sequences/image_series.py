@@ -130,7 +130,7 @@ def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
     Raises:
         DatasetError: Several series may be meant.
     """
-    own, folders = _series_in(path), [series for _, series in _folders(path)]
+    own, folders = _series_in(path), [_below(path / name, f"{name}/") for name in _folder_names(path)]
     found = _best(path, own, given or {})
     if found or (not given and any(_is_recording(series) for series in folders)):
         return found
@@ -196,6 +196,12 @@ def _folders(path: Path) -> list[tuple[str, list[Series]]]:
     return found
 
 
+def _below(folder: Path, name: str) -> list[Series]:
+    """Series in a folder and its folders."""
+    further = [_series_in(folder / inner, f"{name}{inner}/") for inner in _folder_names(folder)]
+    return [*_series_in(folder, name), *(one for series in further for one in series)]
+
+
 def _folder_names(path: Path) -> list[str]:
     with os.scandir(path) as entries:
         return sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
@@ -218,7 +224,7 @@ def _there(path: Path) -> str:
 
 def _everything(path: Path) -> list[Series]:
     """Series of a folder and its folders."""
-    return [*_series_in(path), *(one for _, below in _folders(path) for one in below)]
+    return [*_series_in(path), *(one for name in _folder_names(path) for one in _below(path / name, f"{name}/"))]
 
 
 def _surest(series: list[Series], kind: str) -> Series | None:
