@@ -149,12 +149,12 @@ def test_pictures(folders):
 def test_mistakes_are_one_sentence(folders, tmp_path):
     run, recording = folders
     (tmp_path / "empty").mkdir()
-    (tmp_path / "nan.txt").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
+    (tmp_path / "nan.txt").write_text("0 nan 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
     (tmp_path / "broken.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n")
     cases = [
         ((tmp_path / "empty", "--reference", recording), "holds no trajectory.txt"),
         ((tmp_path / "none.txt", "--reference", recording), "cannot read"),
-        ((tmp_path / "nan.txt", "--reference", recording), "line 2: expected eight finite numbers"),
+        ((tmp_path / "nan.txt", "--reference", recording), "line 1: expected eight finite numbers"),
         ((run, "--reference", tmp_path / "empty"), "there is no true trajectory"),
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
         ((run, "--plots"), "name one with --reference"),

@@ -162,6 +162,21 @@ def test_what_is_not_clear_is_refused_with_the_option_that_mends_it(tmp_path):
         Trajectory.load(true, format="kitti")
 
 
+def test_rows_that_are_no_pose_are_left_out_and_counted(tmp_path):
+    """As in the published ground truth of TUM fr2_desk, and as other systems mark lost frames."""
+    rows = lines(hand_held()).splitlines(keepends=True)
+    (tmp_path / "true.txt").write_text("".join(rows))
+    (tmp_path / "doubled.txt").write_text("".join([*rows[:60], rows[59], *rows[60:]]))
+    lost = "1403636581.77 nan nan nan nan nan nan nan\n"
+    (tmp_path / "lost.txt").write_text("".join([*rows[:60], lost, *rows[62:]]))
+    outcome = evaluate(tmp_path / "true.txt", "--reference", tmp_path / "doubled.txt")
+    assert re.search(r"1 of 151 rows are left out; .* line 61: expected a time after 1403636581\.73", outcome.stderr)
+    assert "150 of 150 estimated and 150 true" in outcome.stdout
+    outcome = evaluate(tmp_path / "lost.txt", "--reference", tmp_path / "true.txt")
+    assert "1 of 149 rows are left out; the first: " in outcome.stderr
+    assert "148 of 148 estimated and 150 true" in outcome.stdout
+
+
 @pytest.mark.parametrize(
     "ending", [name for name, known in EXPORTERS.items() if known.summary.startswith("trajectory")]
 )

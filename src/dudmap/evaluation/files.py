@@ -132,9 +132,9 @@ class _Read(NamedTuple):
         return [times for times in (frames, self.file.timestamps) if times is not None]
 
 
-def _poses(path: Path, name: str | None, option: str, *, optional: bool = False) -> tuple[PoseFile, str]:
-    """Poses of a file and their format; marker poses of Bonn become camera poses."""
-    file = read_poses(path, "tum" if name == BONN else name, optional=optional, option=option)
+def _poses(path: Path, name: str | None, option: str) -> tuple[PoseFile, str]:
+    """Poses of a file without rows that are none, and their format; marker poses of Bonn become camera poses."""
+    file = read_poses(path, "tum" if name == BONN else name, optional=True, option=option)
     if name != BONN:
         return file, file.format.name
     return file._replace(Ts_world_camera=bonn_camera_poses(file.Ts_world_camera)), f"Bonn, {BonnSequence.truth}"
@@ -144,7 +144,7 @@ def _read_reference(path: Path, name: str | None) -> _Read:
     beside = reader_of(path.parent) if path.name == "groundtruth.txt" else None
     if path.is_file() and (name is not None or (beside in (None, TumSequence) and not is_recording(path))):
         name = name or (BONN if holds_bonn_markers(path) else None)
-        file = _poses(path, name, "--reference-format", optional=path.name == "groundtruth.txt")
+        file = _poses(path, name, "--reference-format")
         return _Read(*file, None if beside is None else path.parent)
     recording = path if beside is None else path.parent
     opened = open_sequence(recording)

@@ -116,14 +116,14 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
     rows, latest, wrong = [], -np.inf, []
     for number, fields in read_rows(path, known.columns, short=optional):
         row = _numbers(" ".join(fields[:8]))
-        if len(row) == 8 and 1e-9 < math.hypot(*row[4:]) < 1e9 and not (optional and row[0] <= latest):
+        pose = len(row) == 8 and 1e-9 < math.hypot(*row[4:]) < 1e9
+        if pose and not (optional and row[0] <= latest):
             latest = row[0]
             rows.append(row)
             continue
-        wrong.append(
-            f"{path}, line {number}: expected eight finite numbers '{known.columns}' with a non-zero quaternion, found "
-            f"{' '.join(fields)!r}"
-        )
+        numbers = f"eight finite numbers '{known.columns}' with a non-zero quaternion"
+        expected = f"a time after {latest:.6f}" if pose else numbers
+        wrong.append(f"{path}, line {number}: expected {expected}, found {' '.join(fields)!r}")
         if not optional:
             raise DatasetError(wrong[0])
     if not rows:
