@@ -259,6 +259,13 @@ def test_depth_and_colour_of_their_own(folder):
         open_sequence(folder)
 
 
+def test_two_cameras_of_images_of_one_size_are_not_guessed_at(folder):
+    other = {"fx": 45.0, "fy": 45.0, "cx": 32.0, "cy": 24.0}
+    (folder / "sensor_params.json").write_text(json.dumps({"depth": SCALARS, "color": other}))
+    with pytest.raises(DatasetError, match=r"60,61,31,23 for depth and 45,45,32,24 for colour, .* with --camera"):
+        open_sequence(folder)
+
+
 def test_the_nearest_folder_counts_and_usual_names_come_first(folder):
     np.savetxt(folder.parent / "calib.txt", K + 9 * (K > 40))
     np.savetxt(folder / "calib.txt", K)

@@ -190,6 +190,12 @@ def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intr
     other = cameras.get("color", own)
     if _is_same(own, other):
         return Intrinsics(own | scale, source)
+    if depth == color:
+        raise DatasetError(
+            f"{source} gives two cameras of images of one size, {_numbers(own)} for depth and {_numbers(other)} for "
+            "colour, and depth may be registered to colour: give the camera of the depth images with --camera "
+            "fx,fy,cx,cy, the colour camera if depth is registered to it"
+        )
     return Intrinsics(own | scale, source, other | {"width": color[0], "height": color[1]})
 
 
