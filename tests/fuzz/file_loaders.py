@@ -85,7 +85,7 @@ def load_any_camera(path):
 
 
 ANY_CAMERA = (
-    "K:\n60 0 31\n0 61 23\n0 0 1\nresolution: 128x96\nfx_depth = 60\nP0: 60 0 31 0 0 61 23 0 0 0 1 0\nfx,fy\n60,61\n"
+    "K:\n60 0 31\n0 61 23\n0 0 1\nresolution: 64x48\nfx_depth = 60\nP0: 60 0 31 0 0 61 23 0 0 0 1 0\nfx,fy\n60,61\n"
 )
 
 
