@@ -202,6 +202,20 @@ def test_coefficients_of_the_lens_are_kept(folder):
         open_sequence(folder)
 
 
+@pytest.mark.parametrize("name", ["camera_intrinsics.json", "lens_params.json"])
+def test_the_inverse_lens_of_realsense_is_inverted(folder, name):
+    inverse = k1, k2, p1, p2, _ = [-0.06, 0.04, 0.002, -0.001, 0.0]
+    tree = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "ppx": 31.0, "ppy": 23.0, "coeffs": inverse}
+    (folder / name).write_text(json.dumps(tree | {"model": "distortion.inverse_brown_conrady"}))
+    camera = open_sequence(folder).camera
+    x, y = (8 - 31) / 60, (40 - 23) / 61  # a pixel near a corner, as librealsense deprojects it
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    ray = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1.0
+    pixel = cv2.projectPoints(np.array([ray]), np.zeros(3), np.zeros(3), camera.K, np.array(camera.distortion))[0]
+    np.testing.assert_allclose(pixel.ravel(), [8, 40], atol=0.02)
+
+
 # -- what does not fit, and what contradicts ---------------------------------------------------------------------------
 
 

@@ -15,9 +15,19 @@ import yaml
 from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
 from dudmap.input_files import LARGEST_TREE, damaged, load_array, read_json, read_text
-from dudmap.io.sequences.intrinsics import DISTORTION_KEYS, KEYS, Intrinsics, camera_values, from_file, from_matrix
+from dudmap.io.sequences.intrinsics import (
+    DISTORTION_KEYS,
+    INVERSE,
+    KEYS,
+    Intrinsics,
+    brown_of_inverse,
+    camera_values,
+    from_file,
+    from_matrix,
+)
 
 FILES = (
     "intrinsics.txt", "intrinsics.K.txt", "K.txt", "cam_K.txt", "camera-intrinsics.txt", "camera_intrinsics.txt",
@@ -170,6 +180,9 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
                 f"the lens {lens} of the model {model or 'that is not named'} is not read; expected k1 k2 p1 p2 [k3]: "
                 "rectify the images, or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
             )
+        if model.rpartition(".")[2].lower() == INVERSE and any(lens) and {*KEYS[:6]} <= values.keys():
+            fx, fy, cx, cy, width, height = (values[key] for key in KEYS[:6])
+            lens = brown_of_inverse(Camera(fx, fy, cx, cy, int(width), int(height)), tuple(lens[:5]))
         values |= dict(zip(DISTORTION_KEYS, map(float, lens[:5]), strict=False))
     return values if all(key in values for key in KEYS[:4]) else None
 

@@ -109,7 +109,7 @@ def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
 def _candidates(place: Path) -> Iterator[Path]:
     """Files at a place that may hold intrinsics."""
     for path in sorted(place.iterdir()):
-        if path.is_dir() and FOLDERS.fullmatch(path.name):
+        if FOLDERS.fullmatch(path.name) and path.is_dir():
             yield from (file for file in sorted(path.iterdir()) if _is_small(file))
         elif NAMED.fullmatch(path.stem) and _is_small(path):
             yield path
