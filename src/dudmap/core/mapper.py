@@ -16,7 +16,7 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
-from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer, initial_weights
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
 
@@ -82,6 +82,7 @@ class Bootstrap(Stateful):
 
     Args:
         refines: Whether they are; else they are not remembered for it.
+        second_pass: The map of the first pass tells what moves: frames are held back for the end of the stream alone.
 
     Attributes:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
@@ -92,8 +93,8 @@ class Bootstrap(Stateful):
     _window: Remembered[list[FusedFrame]]
     _num_fused: Remembered[int] = 0
 
-    def __init__(self, *, refines: bool) -> None:
-        self._refines = refines
+    def __init__(self, *, refines: bool, second_pass: bool = False) -> None:
+        self._refines, self._second_pass = refines, second_pass
         self._frames = []
         self._window = []
 
@@ -129,13 +130,13 @@ class Bootstrap(Stateful):
 
     def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
         """Remember another frame of the first moments."""
-        if self._frames:
+        if self._frames or self._second_pass:
             self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
 
     @property
     def first(self) -> FrameView | None:
         """The first frame; None if it is no longer remembered."""
-        return self._frames[0].view if self._frames else None
+        return self._frames[0].view if self._frames and not self._second_pass else None
 
     def recolored(self, view: FrameView) -> StartFrame:
         """The first frame, which is remembered, with other colours."""
@@ -151,7 +152,7 @@ class Bootstrap(Stateful):
             moving_before: (h, w) bool, label resolution, what a later image shows to have moved in the first; None if
                 that is not known.
         """
-        if not self._frames or moving_before is None:
+        if self.first is None or moving_before is None:
             return None
         first = self._frames[0]
         labelled = first.view.labelled
@@ -162,11 +163,14 @@ class Bootstrap(Stateful):
         self._frames = [first, *(replace(frame, fused=False) for frame in self._frames[1:])]
         return first
 
-    def released(self) -> list[StartFrame]:
+    def released(self, *, ended: bool = False) -> list[StartFrame]:
         """The frames that are still to be fused, without what has moved until the last of them; they are forgotten.
 
-        A frame that follows no common motion with the last one is left out.
+        A frame that follows no common motion with the last one is left out. Depth without colour cannot be compared: it
+        is left out, too, unless the stream has ``ended`` and no later frame will show the same.
         """
+        if self._second_pass and not ended:
+            self._frames = []
         if not self._frames:
             return []
         last, frames = self._frames[-1], [frame for frame in self._frames[:-1] if not frame.fused]
@@ -175,6 +179,9 @@ class Bootstrap(Stateful):
         self._frames = []
         out = []
         for frame in frames:
+            if ended and frame.view.without_image:
+                out.append(frame)
+                continue
             older = frame.view.tracked_at(frame.estimate.T_world_camera)
             motion = older.motion_to(now, (now.timestamp - older.timestamp) / interval)
             if motion is not None and older.moving is not None:
@@ -222,8 +229,17 @@ class Mapper:
         can be seen, fuse the frames that were held back until then."""
         self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
         if not self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
-            for frame in self._bootstrap.released():
-                self.integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
+            self._fuse_held(self._bootstrap.released(), view.timer)
+
+    def finish(self) -> int:
+        """Fuse the frames that are held back until slow motion can be seen: no later frame will show it."""
+        return self._fuse_held(self._bootstrap.released(ended=True), StageTimer())
+
+    def _fuse_held(self, frames: list[StartFrame], timer: StageTimer) -> int:
+        """Fuse frames of the first moments; their number."""
+        for frame in frames:
+            self.integrate(replace(frame.view, timer=timer), frame.estimate, frame.dynamic_mask)
+        return len(frames)
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""

@@ -19,6 +19,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.mapper import Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover
@@ -140,6 +141,7 @@ class SlamResults:
     Attributes:
         config, camera: Of the system; the camera is that of the images without lens distortion.
         atlas: Submaps, keyframes, stored frames and poses.
+        mapper: Fuses frames into it.
         monitor: How well frames fit the map.
         color_calibration: Calibration of the colour camera.
         objects: The moving objects.
@@ -150,6 +152,7 @@ class SlamResults:
     config: Config
     camera: Camera
     atlas: Atlas
+    mapper: Mapper
     monitor: QualityMonitor
     color_calibration: ColorCalibration
     objects: MovingObjects
@@ -207,8 +210,19 @@ class SlamResults:
         """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
+    def finish(self) -> int:
+        """Fuse the frames that a young map holds back: the stream has ended, and no later one shows slow motion.
+
+        Only a map that is younger than 0.4 s holds frames back. Frames may follow.
+
+        Returns:
+            Number of frames that were fused.
+        """
+        return self.mapper.finish()
+
     def as_prior_map(self) -> PriorMap:
-        """The largest submap and what else a second pass over the same recording needs."""
+        """The largest submap and what else a second pass over the same recording needs, which has ended."""
+        self.finish()
         self.atlas.complete()
         self.atlas.keyframes.settle()
         main = self.atlas.by_size()[0]

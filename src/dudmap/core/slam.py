@@ -113,7 +113,7 @@ class Slam(SlamResults, Stateful):
         self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
-        self.bootstrap = Bootstrap(refines=prior is None and not live)  # a second pass has the map of the first
+        self.bootstrap = Bootstrap(refines=prior is None and not live, second_pass=prior is not None)
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)

@@ -44,6 +44,7 @@ class RunRecord:
             directions of motion are observable.
         warnings: Sentences on what looked wrong in the recording before the run.
         masked: Number of frames with an external mask, None without external masks.
+        fused_at_end: Number of frames that a young map held back until the end, and that were fused then.
         dropped: Number of frames dropped by a live run, None otherwise.
         spent: Seconds, and seconds of processor time, of what belongs to the run and came before this process or pass.
     """
@@ -60,6 +61,7 @@ class RunRecord:
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
+    fused_at_end: int = 0
     dropped: int | None = None
     spent: tuple[float, float] = (0.0, 0.0)
     _since: tuple[float, float] = field(
@@ -165,6 +167,8 @@ class RunRecord:
             "tracked": sum(row["state"] == "tracked" for row in self.rows),
             "repeated": sum(row["state"] == "repeated" for row in self.rows),
             **self.counts,
+            "fused": self.counts["fused"] + self.fused_at_end,
+            "fused_at_end": self.fused_at_end,
             "lost": len(self.lost),
             "unreadable": len(self.unreadable),
             "frames_rejected": dict(sorted(self.rejected.items())),

@@ -1,5 +1,6 @@
 """Processing of a recording or of a camera: reads frames, runs the system, records metrics, writes the run folder."""
 
+import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -301,6 +302,7 @@ class Job:
                     interruption.check()
                     if len(state.record.rows) == options.max_frames:
                         break
+            self._fuse_held(state)
         if store is not None:
             store.end(state)
 
@@ -338,6 +340,8 @@ class Job:
             slam, record = slam.first_pass or slam, state.first_record or record
         complete = False
         try:
+            if not defect and not isinstance(sys.exception(), DeviceError):
+                self._fuse_held(state)  # of a run that was stopped
             config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
                 self.out, slam, record, self.sequence, config, stopped, save_map=save_map, defect=defect
@@ -349,6 +353,19 @@ class Job:
             if store is not None:
                 store.close(finished=complete)
         return report
+
+    def _fuse_held(self, state: RunState) -> None:
+        """Fuse the frames that are held back, since no other comes, and say so."""
+        held, stamps = state.slam.finish(), [float(row["timestamp"]) for row in state.record.rows]
+        state.record.fused_at_end += held
+        if held:
+            from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
+
+            self.display.note(
+                f"{held} frames were fused at the end, in which something may move that shows only after "
+                f"{LONGEST_BASELINE:g} s; the recording has {len(stamps)} frames in {stamps[-1] - stamps[0]:.2f} s: "
+                f"expected {LONGEST_BASELINE:g} s or more"
+            )
 
 
 def _unmerged_submaps(slam: "Slam") -> str:

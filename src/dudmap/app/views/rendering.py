@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import atomic_path, write_image, write_text
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import ConfigError, DatasetError, printable
+from dudmap.errors import ConfigError, DatasetError, MapError, printable
 from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
@@ -101,7 +101,10 @@ def orbit(
     The middle of the arc is where the cameras were, and it is ``sweep_deg`` wide, there and back; from 360 on it is a
     circle. ``up`` (3,) is a unit vector against gravity.
     """
-    points = without_small_pieces(run.surface).vertices.astype(np.float64)
+    large = without_small_pieces(run.surface)
+    points = (large if len(large.faces) else run.surface).vertices.astype(np.float64)
+    if len(points) == 0:
+        raise MapError(f"the mesh of {run.folder} is empty: there is nothing to render")
     Ts = run.trajectory.Ts_world_camera
     arm = Ts[:, :3, 3].mean(axis=0) - np.median(points, axis=0)
     choices = [arm, -Ts[:, :3, 2].mean(axis=0), Ts[:, :3, 1].mean(axis=0)]

@@ -42,7 +42,7 @@ class VolumeMirror:
         slots = self._copy(0, source, target, limit)
         for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "fused"):
             setattr(target, name, getattr(source, name).copy())
-        target.num_entries = source.num_entries
+        target.num_entries, self.volume.num_frames = source.num_entries, self._source.num_frames
         for number, (theirs, ours) in enumerate(zip(self._source.levels, self.volume.levels, strict=True), start=1):
             self._copy(number, theirs.blocks, ours.blocks, None)
             ours.blocks.entry_of, ours.blocks.slot_coords = (

@@ -49,6 +49,7 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
         "config": volume.config.model_dump_json(),
         "sensor": volume.sensor.model_dump_json(),
         "depth_max": volume.depth_max,
+        "frames": volume.num_frames,
         "coords": np.concatenate(coords),
         "free_count": np.concatenate(free_count),
         "entries": np.concatenate(entries),
@@ -95,10 +96,11 @@ def read_map(path: str | Path) -> "TsdfVolume":
             parameters = read_parameters(data, path)
             blocks = VoxelBlocks.restored(*(data[name] for name in ("coords", "free_count", "entries", *VOXELS)))
             finer = _read_levels(data)
+            frames = int(data["frames"]) if "frames" in set(data) else 0
     except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error
     volume = make_volume(*parameters)
-    volume.blocks = blocks
+    volume.blocks, volume.num_frames = blocks, max(frames, 0)
     if len(finer) > len(volume.levels):
         raise MapError(
             f"the map is damaged: it has {len(finer)} levels of smaller voxels, its configuration allows "

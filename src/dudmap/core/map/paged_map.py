@@ -26,6 +26,7 @@ class PagedMap(Stateful):
     window: Remembered[BlockWindow]
     pager: Remembered[BlockPager | None]
     _frame_number: Remembered[int]
+    num_frames: Remembered[int] = 0
     _left: Remembered[NDArray[np.int64] | None]  # where the window was when all blocks left the memory
 
     def restore(self, state: dict[str, Any]) -> None:

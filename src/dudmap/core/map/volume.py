@@ -103,6 +103,7 @@ class TsdfVolume(PagedMap):
         band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
         sdf_unit: Metres per step of a stored distance.
         map_id: Number of the map in this process; ``clear`` gives a new one.
+        num_frames: Number of frames that were integrated, each as often as it counted; 0 where it is not known.
         levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser levels first; none here.
 
     Raises:
@@ -150,7 +151,7 @@ class TsdfVolume(PagedMap):
         if self.pager is not None:
             self.pager.clear()
         self._left = None
-        self._frame_number = 0
+        self._frame_number = self.num_frames = 0
         self.map_id = next(_MAP_IDS)
 
     # -- writing -----------------------------------------------------------------------------------------------------
@@ -184,6 +185,7 @@ class TsdfVolume(PagedMap):
         T = copied(T_world_camera, "pose of a frame", shape=(4, 4))
         self.look_at(T)
         self._frame_number += 1
+        self.num_frames += count
         self._fuse(self._view(replace(frame, color=rgb), used, T), count)
 
     def _view(self, frame: Frame, used: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> DepthView:
@@ -226,7 +228,7 @@ class TsdfVolume(PagedMap):
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
-        self.levels = other.levels
+        self.levels, self.num_frames = other.levels, other.num_frames
 
     def for_camera(
         self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
@@ -235,7 +237,7 @@ class TsdfVolume(PagedMap):
         volume must not be used afterwards."""
         other = type(self)(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.pager, other._frame_number = self.pager or other.pager, self._frame_number
-        other.blocks, other.levels = self.blocks, self.levels
+        other.blocks, other.levels, other.num_frames = self.blocks, self.levels, self.num_frames
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
@@ -320,7 +322,7 @@ class TsdfVolume(PagedMap):
         camera = camera or self.camera
         T_world_camera = copied(T_world_camera, "pose of a view", shape=(4, 4))
         self.look_at(T_world_camera)
-        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.min_weight)
         finer = two_levels(self.levels)
         return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, finer)
 
@@ -351,8 +353,14 @@ class TsdfVolume(PagedMap):
             if np.any(exists & inner):
                 yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1), min_weight)
 
+    @property
+    def min_weight(self) -> int:
+        """Smallest weight of a voxel that mesh and views use: that of the configuration; in a map of few frames one for
+        every second frame, since a reading counts at least once."""
+        return min(self.config.min_weight, (self.num_frames + 1) // 2 or self.config.min_weight)
+
     def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
-        min_weight = self.config.min_weight if min_weight is None else min_weight
+        min_weight = self.min_weight if min_weight is None else min_weight
         return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
 
     def extract_chunks(
