@@ -1,4 +1,4 @@
-"""Recordings of a few frames: the mesh holds all that they show, what was held back is fused at the end."""
+"""Recordings of a few frames: the mesh holds everything in view; frames held back are fused at the end."""
 
 import numpy as np
 import pytest

@@ -82,7 +82,7 @@ class Bootstrap(Stateful):
 
     Args:
         refines: Whether they are; else they are not remembered for it.
-        second_pass: The map of the first pass tells what moves: frames are held back for the end of the stream alone.
+        second_pass: The map of the first pass shows motion: frames are held back only until the stream ends.
 
     Attributes:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.

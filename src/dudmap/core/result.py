@@ -221,7 +221,7 @@ class SlamResults:
         return self.mapper.finish()
 
     def as_prior_map(self) -> PriorMap:
-        """The largest submap and what else a second pass over the same recording needs, which has ended."""
+        """The largest submap and the memory that a second pass over the same recording needs."""
         self.finish()
         self.atlas.complete()
         self.atlas.keyframes.settle()

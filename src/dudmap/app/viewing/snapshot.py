@@ -119,6 +119,11 @@ class FrameImages:
         return {kind: jpeg(picture) for kind, picture in self.pictures().items()}
 
 
+def shading(normals: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Brightness (H, W), 0..1, of a view with these normals (H, W, 3), world frame, in the light beside the camera."""
+    return (0.25 + 0.7 * np.clip(normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)).astype(np.float32)
+
+
 def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArray[np.uint8]:
     """Depth (h, w) in the colours of the turbo scale (h, w, 3) up to ``far``, dark where there is no reading."""
     import cv2
@@ -183,7 +188,7 @@ def save_sheet(
         outline, _ = cv2.findContours(true_mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(overlay, outline, -1, (0, 255, 0), 1)
         title += ", true (green outline)"
-    brightness = 0.25 + 0.7 * np.clip(view.normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)
+    brightness = shading(view.normals, T_world_camera)
     known, limit = view.depth[..., None] > 0, f"{100 * RESIDUAL_RANGE:.0f} cm"
     pictures = [
         ("colour", frame.rgb),

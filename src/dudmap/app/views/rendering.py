@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.app.viewing.snapshot import shading
 from dudmap.atomic_file import atomic_path, write_image, write_text
+from dudmap.core.frames.frame import GREY
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError, printable
@@ -222,6 +224,9 @@ def _farthest(run: RunContent, trajectory: Trajectory) -> float:
 
 
 def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour (H, W, 3) and depth (H, W) in metres of the map."""
+    """Colour (H, W, 3) and depth (H, W) in metres of the map; shaded where the map has no colours."""
     seen = run.volume.raycast(T, camera)
-    return np.where(seen.depth[..., None] > 0, seen.color, np.uint8(EMPTY)), seen.depth
+    color, known = seen.color, seen.depth > 0
+    if known.any() and np.median(color[known].reshape(-1, 3), axis=0).tolist() == [GREY] * 3:
+        color = (255 * shading(seen.normals, T)[..., None]).astype(np.uint8).repeat(3, axis=2)
+    return np.where(known[..., None], color, np.uint8(EMPTY)), seen.depth

@@ -103,7 +103,7 @@ class TsdfVolume(PagedMap):
         band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
         sdf_unit: Metres per step of a stored distance.
         map_id: Number of the map in this process; ``clear`` gives a new one.
-        num_frames: Number of frames that were integrated, each as often as it counted; 0 where it is not known.
+        num_frames: Number of integrated frames, each counted ``count`` times; 0 if unknown.
         levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser levels first; none here.
 
     Raises:

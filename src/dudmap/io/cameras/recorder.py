@@ -140,10 +140,12 @@ class Recorder:
         self._last = recorded
         color_stamp = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
         color_camera = self._camera if calibration is None else calibration.camera
-        for space, name, camera, stamp, (pixels, encoding) in (
-            (depth_space, depth_frame, self._camera, frame.timestamp, self._depth(frame.depth)),
-            (COLOR, COLOR_FRAME, color_camera, color_stamp, (frame.color, "rgb8")),
-        ):
+        images: list[tuple[str, str, Camera, float, tuple[NDArray[Any], str]]] = [
+            (depth_space, depth_frame, self._camera, frame.timestamp, self._depth(frame.depth))
+        ]
+        if frame.color is not None:
+            images.append((COLOR, COLOR_FRAME, color_camera, color_stamp, (frame.color, "rgb8")))
+        for space, name, camera, stamp, (pixels, encoding) in images:
             writer.write(f"{space}/camera_info", recorded, ros.camera_info(types, stamp, camera, name))
             writer.write(f"{space}/image_raw", recorded, ros.image(types, stamp, pixels, encoding, name))
 

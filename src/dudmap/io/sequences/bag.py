@@ -43,9 +43,9 @@ class RosBag(Recording):
     """Recording in a ROS bag, opened through its index: neither images nor poses are read before they are asked for.
 
     The time of a frame is that in the header of its depth message; colour is associated one to one, nearest first, at
-    most 20 ms apart. In compressed bags the times are those of recording less the median delay of the first messages.
-    Where headers hold no increasing times, the times of recording are taken. A message that was recorded at the very
-    time of another one of its topic is left out.
+    most 20 ms apart. A bag without colour topics is a recording of depth alone. In compressed bags the times are those
+    of recording less the median delay of the first messages. Where headers hold no increasing times, the times of
+    recording are taken. A message that was recorded at the very time of another one of its topic is left out.
 
     Intrinsics come from the camera_info beside the image topics. Depth and colour of one frame of reference and equal
     intrinsics are registered; else ``calibration`` holds the colour camera and the motion between both from /tf_static.
@@ -73,6 +73,7 @@ class RosBag(Recording):
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
         """Set topics, times and pairs of messages, and the cameras."""
         self._topics = bag_messages.find_topics(self._bag.connections, chosen, str(self.path))
+        self.has_color = self._topics.color is not self._topics.depth
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
         self._pairs = self._associated(depth, color)
@@ -107,6 +108,8 @@ class RosBag(Recording):
                     f"{camera.width}x{camera.height}"
                 )
         values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
+        if not self.has_color:
+            return Frame(float(self.timestamps[index]) if self._exact else seconds_of(depth), values)
         if self._exact:
             return Frame(float(self.timestamps[index]), values, image, float(self._color_stamps[index]))
         return Frame(seconds_of(depth), values, image, seconds_of(color))
@@ -115,9 +118,12 @@ class RosBag(Recording):
         """Depth and colour message of a frame, each with its image."""
         topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
         with foreign(FrameError, name):
-            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
+            wanted = [(topics.color, color_time)] if self.has_color else []
+            *colors, depth = self._bag.read([*wanted, (topics.depth, depth_time)])
             values = bag_messages.depth_of(depth, depth_scale, f"the depth image of {name}")
-            return depth, values, color, bag_messages.color_of(color, f"the colour image of {name}")
+            if not colors:
+                return depth, values, depth, Frame(0.0, values).rgb
+            return depth, values, colors[0], bag_messages.color_of(colors[0], f"the colour image of {name}")
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -33,7 +33,10 @@ REGISTERED_NAME = re.compile(r"aligned|depth_registered|depth_to_(rgb|color)|hw_
 
 
 class Topics(NamedTuple):
-    """Connections of the two images and, where there are any, of their camera_info; and the world frame of /tf."""
+    """Connections of the two images and, where there are any, of their camera_info; and the world frame of /tf.
+
+    Without colour both images are the depth image.
+    """
 
     color: "Connection"
     depth: "Connection"
@@ -68,13 +71,16 @@ def find_topics(connections: "Sequence[Connection]", chosen: dict[str, str], bag
     images = [connection for connection in filled if connection.msgtype in IMAGES]
     depths = [_named(images, chosen["depth"], bag)] if "depth" in chosen else [c for c in images if _is_depth(c)]
     colors = [_named(images, chosen["color"], bag)] if "color" in chosen else [c for c in images if _is_color(c)]
-    for wanted, found in (("depth", depths), ("colour", colors)):
+    others = (c for c in images if c not in depths and not _is_depth(c) and not OTHER_NAME.search(c.topic.lower()))
+    alone = "color" not in chosen and not colors and next(others, None) is None
+    for wanted, found in (("depth", depths), ("colour", depths if alone else colors)):
         if not found:
             raise DatasetError(
                 f"no topic of {bag} is recognised as {wanted} images; it holds {_listed(images or filled)}; choose "
                 "with --topics color=/...,depth=/..."
             )
-    color, depth = _best([(color, depth) for color in colors for depth in depths if color is not depth], images, bag)
+    pairs = [(color, depth) for color in colors for depth in depths if color is not depth]
+    color, depth = _best([(depth, depth) for depth in depths] if alone else pairs, images, bag)
     infos = [connection for connection in filled if connection.msgtype == INFO]
     return Topics(
         color,
