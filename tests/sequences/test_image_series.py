@@ -136,6 +136,18 @@ def test_depth_beside_images_that_may_be_colour_is_not_alone(tmp_path):
     assert not open_sequence(tmp_path / "depth", CAMERA).has_color  # named as such
 
 
+def test_a_few_images_that_fit_do_not_stand_for_many_that_do_not(tmp_path):
+    for k in range(20):
+        write_color(tmp_path / "rgb" / f"{k}.png", k % 3)
+        write_color(tmp_path / "depth" / f"{k}.png", k % 3)
+    for k in range(3):
+        write_depth(tmp_path / "depth_of_others" / f"{k}.png", k)
+    with pytest.raises(
+        DatasetError, match=r"depth/N\.png \(20 with 8-bit colours\).*expected colour images of 8 bit and"
+    ):
+        open_sequence(tmp_path, CAMERA)
+
+
 def test_recordings_below_are_not_mixed(tmp_path):
     for name in ("one", "two"):
         write(tmp_path / name, ("{k}.jpg", "{k}.png"))

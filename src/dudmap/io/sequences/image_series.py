@@ -31,8 +31,9 @@ CONTENTS = {
 }  # fmt: skip
 PROBED = 3
 """Images of a series whose headers are read."""
-LEAST_SHARE = 0.5
-"""Share of the shorter of two series that must have a partner where names do not tell that both belong together."""
+LEAST_SHARE = 0.25
+"""Share of the longer of two series that must have a partner if content tells that both belong together; and share of
+the images of its kind that a series needs to replace others, which are called alike but hold something else."""
 LARGEST_LIST = 5
 """Series that a message names."""
 Found = dict[str, "Series | None"]
@@ -105,7 +106,7 @@ def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
     found = by_names(path) | given
     if len(given) == len(WORDS) or all(one is not None and one.fits for one in found.values()):
         return found
-    return by_content(path, given) or alone(path, given) or (found if all(found.values()) else {})
+    return by_content(path, given) or alone(path, given)
 
 
 def by_names(path: Path) -> Found:
@@ -230,7 +231,15 @@ def _everything(path: Path) -> list[Series]:
 def _surest(series: list[Series], kind: str) -> Series | None:
     """The surest series of a kind, with the others of its folder and kind that have other numbers."""
     known = [one for one in series if one.kind == kind]
-    known.sort(key=lambda one: (not one.fits, one.rank(kind)[1], one.files[0].parent, -len(one.files)))
+    enough = LEAST_SHARE * max((len(one.files) for one in known), default=0)
+    known.sort(
+        key=lambda one: (
+            not one.fits or len(one.files) < enough,
+            one.rank(kind)[1],
+            one.files[0].parent,
+            -len(one.files),
+        )
+    )
     if not known:
         return None
     files, taken = list(known[0].files), {last_number(file) for file in known[0].files}
@@ -256,7 +265,7 @@ def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
     found: list[tuple[tuple, dict[str, Series]]] = []
     for color, depth in product(*candidates):
         count = count_pairs(color.files, depth.files)
-        if count >= max(1, LEAST_SHARE * min(len(color.files), len(depth.files))):
+        if count >= LEAST_SHARE * max(len(color.files), len(depth.files)):
             found.append(((color.rank("color"), depth.rank("depth"), -count), {"color": color, "depth": depth}))
     best = min((rank for rank, _ in found), default=None)
     alike = [pair for rank, pair in found if rank == best]
