@@ -83,6 +83,7 @@ class FakeSlam:
         max_blocks=None,
         timed=True,
         ignore=None,
+        poses="estimated",
     ):
         type(self).timed = timed
         self.localize = localize

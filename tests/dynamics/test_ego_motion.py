@@ -19,7 +19,7 @@ from dudmap.core.mapper import Mapper
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import RELATIVE, first_failure
 from dudmap.core.tracking.frame_view import PoseEstimate
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.lab import synthetic

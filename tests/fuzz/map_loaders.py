@@ -60,7 +60,7 @@ def parts():
     from dudmap.core.map.volume import TsdfVolume
     from dudmap.core.places.atlas import TimedPose
     from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
-    from dudmap.core.tracking.pose_prediction import MotionModel
+    from dudmap.core.tracking.motion_model import MotionModel
 
     rng = np.random.default_rng(0)
     features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))

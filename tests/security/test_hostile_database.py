@@ -29,7 +29,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.state import Stateful, remembered
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.errors import StateError
 
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x AS key, 'a' AS value FROM n"

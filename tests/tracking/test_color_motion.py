@@ -12,7 +12,7 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.faults import SensorFaults
 

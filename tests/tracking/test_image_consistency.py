@@ -10,7 +10,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.tracking.checks import MAX_IMAGE_SHIFT
 from dudmap.core.tracking.frame_view import PoseEstimate
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import ImageComparison, ImageConsistency
 from dudmap.lab import synthetic
 

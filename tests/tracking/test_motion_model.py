@@ -4,7 +4,7 @@ import numpy as np
 
 from dudmap.config import TrackerConfig
 from dudmap.core.geometry import se3
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 
 VELOCITY = np.array([0.3, -0.1, 0.2, 0.1, 0.4, -0.2])
 

@@ -13,8 +13,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import MAX_DRIFT
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, unobserved_motion
-from dudmap.core.tracking.pose_prediction import MotionModel
 from dudmap.core.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)

@@ -8,7 +8,8 @@ from dudmap.config import Config
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import FREE, SURFACE
-from dudmap.core.tracking.pose_prediction import MotionModel, PosePredictor
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.pose_prediction import PosePredictor
 
 CAMERA = Camera(20.0, 20.0, 15.5, 11.5, 32, 24)
 PLAIN = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.zeros(CAMERA.shape, np.float32))

@@ -17,7 +17,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import retract
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.tracking.checks import RELATIVE, first_failure
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones

@@ -83,7 +83,10 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
         *((f"{what} from", source) for what, source in found.sources.items()),
         ("depth", _depth(found)),
-        ("ground truth", f"{found.ground_truth} poses" if found.ground_truth else "none"),
+        (
+            "ground truth",
+            f"{found.ground_truth} poses; run --poses recording fuses with them" if found.ground_truth else "none",
+        ),
         ("gaps", _gaps(found)),
     ]
 

@@ -31,6 +31,25 @@ def run(
         Path | None,
         Option(help="Folder of dynamic masks, named like the images or by time, 255 = dynamic.", metavar="FOLDER"),
     ] = None,
+    poses: Annotated[
+        str | None,
+        Option(
+            help="Known poses of the frames, with which they are fused without registration: a file (TUM, EuRoC, KITTI "
+            "or 4x4), a folder with one 4x4 file per frame, or 'recording' for those that the recording brings.",
+            metavar="FILE|recording",
+        ),
+    ] = None,
+    refine: Annotated[
+        bool, Option("--refine", help="Register from --poses on, in place of constant velocity; they may drift.")
+    ] = False,
+    poses_as: Annotated[
+        str | None,
+        Option(
+            help="How --poses is written, if not camera-to-world, x right, y down, z forward: tum, euroc, kitti, "
+            "world-to-camera, opengl, ros, wxyz, millimetres.",
+            metavar="NAMES",
+        ),
+    ] = None,
     ignore: o.IgnoreOption = None,
     max_frames: o.MaxFramesOption = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<recording>.")] = None,
@@ -71,6 +90,7 @@ def run(
     into the run folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid
     moving object.
     """
+    from dudmap.app.pipeline.given_poses import checked_options, given_poses
     from dudmap.app.pipeline.inspection import inspect
     from dudmap.app.pipeline.resume import resume as resume_run
     from dudmap.app.pipeline.run import run as run_sequence
@@ -87,6 +107,7 @@ def run(
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
+    checked_options(has_poses=poses is not None, refine=refine, saved_map=mapped.saved is not None)
     config, saved_map = run_parameters(parameters, mapped, out)
     recording = reading.open(sequence)
     warnings = inspect(recording).warnings
@@ -97,6 +118,7 @@ def run(
     ours = config.system == "dudmap"
     if ours and (calibration != "auto" or not live):  # what has been estimated beforehand is not estimated again
         config = config.override(["sensor.self_calibration=false"])
+    given_by = None if poses is None else given_poses(poses, recording, poses_as, refine=refine)
     storing = (
         None
         if live or checkpoint_every == 0 or not ours
@@ -112,10 +134,10 @@ def run(
             watchers += (ChangeWatch(SavedMap.load(mapped.saved), watchers),)
         done = run_sequence(
             recording, config, out,
-            max_frames=max_frames, save_masks=save_masks, masks=masks, ignore=ignore, progress=not quiet,
-            live=live, passes=passes, calibration=given, calibrate=calibration == "auto" and not live and ours,
-            saved_map=saved_map, localize=mapped.localize, max_memory=o.memory_size(mapped.max_memory),
-            observers=watchers, storing=storing, warnings=warnings,
+            max_frames=max_frames, save_masks=save_masks, masks=masks, ignore=ignore, poses=given_by,
+            progress=not quiet, live=live, passes=passes, calibration=given,
+            calibrate=calibration == "auto" and not live and ours, saved_map=saved_map, localize=mapped.localize,
+            max_memory=o.memory_size(mapped.max_memory), observers=watchers, storing=storing, warnings=warnings,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 

@@ -25,6 +25,7 @@ from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.saved_map import PriorMap, SavedMap
+from dudmap.core.tracking.motion_model import GivenRole
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
 
@@ -133,6 +134,7 @@ class SlamArguments:
     max_blocks: int | MemoryLimit | None
     timed: bool
     ignore: NDArray[np.bool_] | None
+    poses: GivenRole
 
 
 class SlamResults:
@@ -151,6 +153,7 @@ class SlamResults:
 
     config: Config
     camera: Camera
+    arguments: SlamArguments
     atlas: Atlas
     mapper: Mapper
     monitor: QualityMonitor
@@ -182,7 +185,12 @@ class SlamResults:
     def trajectory(self) -> Trajectory:
         """Poses, at the time stamps of all frames tracked so far in the submap with the most frames, after all
         corrections."""
-        return self.atlas.trajectory(self.atlas.by_size()[0])
+        return self._trajectory(self.atlas.by_size()[0])
+
+    def _trajectory(self, number: int) -> Trajectory:
+        """Trajectory of a submap; given poses are those of the stamps, whenever the images were taken."""
+        given = self.arguments.poses == "given"
+        return self.atlas.image_poses(number) if given else self.atlas.trajectory(number)
 
     @property
     def image_poses(self) -> Trajectory:
@@ -193,7 +201,7 @@ class SlamResults:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and complete map of each submap, that with the most frames first; each has its own world."""
         self.atlas.complete()
-        return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+        return [(self._trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
     @property
     def saved_map(self) -> SavedMap:

@@ -35,7 +35,8 @@ from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.front_end import FrontEnd
-from dudmap.core.tracking.pose_prediction import MotionModel, PosePrediction, PosePredictor
+from dudmap.core.tracking.motion_model import GivenRole, MotionModel
+from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 
@@ -55,9 +56,9 @@ class Slam(SlamResults, Stateful):
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
-        max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
-            disk. It changes no result. None keeps all in memory.
+        max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results stay.
         timed: Whether the times of the frames are those of a clock; False where they are invented.
+        poses: Role of poses that come with frames: the result (``given``), or where registration starts (``refined``).
         ignore: (H, W) bool, pixels of the depth or colour image that never count: not used, not fused, never dynamic.
     """
 
@@ -90,10 +91,11 @@ class Slam(SlamResults, Stateful):
         *,
         timed: bool = True,
         ignore: NDArray[np.bool_] | None = None,
+        poses: GivenRole = "estimated",
     ) -> None:
         self.config = config = config or Config()
         ignore = None if ignore is None else copied(ignore, "mask of ignored pixels", dtype=None)
-        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed, ignore)
+        self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed, ignore, poses)
         self.first_pass = first_pass
         start = calibration if first_pass is None else first_pass.calibration
         registered = start is None or start.is_registered(replace(camera, distortion=()))
@@ -105,7 +107,7 @@ class Slam(SlamResults, Stateful):
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
-        self.motion = MotionModel(config.tracker, timed=timed)
+        self.motion = MotionModel(config.tracker, timed=timed, poses=poses)
         self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
@@ -113,16 +115,15 @@ class Slam(SlamResults, Stateful):
         self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
-        self.bootstrap = Bootstrap(refines=prior is None and not live, second_pass=prior is not None)
+        refines = prior is None and not live and poses != "given"
+        self.bootstrap = Bootstrap(refines=refines, second_pass=prior is not None)
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live
-        self.mapper = Mapper(
-            config, self.camera, self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy,
-            localize=localize,
-        )  # fmt: skip
+        parts = self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy
+        self.mapper = Mapper(config, self.camera, *parts, localize=localize)
         if prior is not None:
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
@@ -156,6 +157,7 @@ class Slam(SlamResults, Stateful):
         self,
         frame: Frame | FrameView | None = None,
         dynamic_mask: NDArray[np.bool_] | None = None,
+        T_world_camera: NDArray[np.float64] | None = None,
         **arrays: Unpack[FrameArrays],
     ) -> FrameResult:
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
@@ -163,8 +165,8 @@ class Slam(SlamResults, Stateful):
         Args:
             frame: Depth and colour, in the order of arrival; prepared or not, the result is the same. A frame whose
                 stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
-            dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
-                from the first registration on.
+            dynamic_mask: (H, W) bool, pixels known to be dynamic, which are left out from the first registration on.
+            T_world_camera: (4, 4) pose of the depth camera from elsewhere, see ``poses``; metres.
             arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
                 per metre (1000 unless set: millimetres), 0 = no reading; ``timestamp`` in s; ``rgb`` (H, W, 3) uint8,
                 if there is colour. They may be changed afterwards.
@@ -174,6 +176,7 @@ class Slam(SlamResults, Stateful):
             FrameError: The arrays have another shape or type, or do not fit the camera or each other; nothing changed.
         """
         view = self.prepare(given_frame(frame, arrays, self.camera.depth_scale), dynamic_mask)
+        self.motion.give(T_world_camera)
         return self._processed(view).detached()
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -181,7 +184,7 @@ class Slam(SlamResults, Stateful):
     def _processed(self, view: FrameView) -> FrameResult:
         """``process`` of a prepared frame; the result shares memory with the state of the system."""
         with view.timer("check"):
-            rejection = self.stream.rejection(view.observation)
+            rejection = self.stream.rejection(view.observation) or self.motion.missing
         if rejection:
             return self._reject(view, rejection)
         view = self._resumed(view)
@@ -234,14 +237,14 @@ class Slam(SlamResults, Stateful):
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""
-        mask = np.zeros(view.observation.depth.shape, dtype=bool)
-        return self._result(view, None, mask, reason=rejection.reason, rejected=rejection.kind)
+        nothing = np.zeros_like(view.observation.readings)
+        return self._result(view, None, nothing, reason=rejection.reason, rejected=rejection.kind)
 
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the one before, or its depth.
 
-        It has the pose of the frame it repeats, or with new colours the predicted one, which is interpolated in the
-        trajectory once the next frame is tracked. Neither is believed for longer than a prediction can be trusted.
+        It has the pose of the frame it repeats, or with new colours the predicted one, which is interpolated once the
+        next frame is tracked. Neither is used for longer than a prediction can be trusted.
         """
         repeats, time = self.stream.repeats, view.timestamp
         result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
@@ -250,7 +253,7 @@ class Slam(SlamResults, Stateful):
             reason = f"{what} repeated for {time - self.motion.timestamp:.2f} s: the sensor hangs"
             result = replace(result, state="lost", lost_reason=reason, T_world_camera=None)
         elif last.T_world_camera is not None:
-            T_world_camera = self.motion.predict(time) if repeats == "depth" else last.T_world_camera
+            T_world_camera = self.motion.repeated(time, last.T_world_camera, depth_only=repeats == "depth")
             result = replace(result, state="repeated", T_world_camera=T_world_camera)
             self.atlas.add_pose(time, T_world_camera, "depth" if "depth" in (repeats, last.repeats) else "frame")
         self._last = result
@@ -266,7 +269,7 @@ class Slam(SlamResults, Stateful):
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
-        estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0)
+        estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, self.motion.start)
         mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
         if reason := self.bootstrap.rejection_reason(view, mask):
@@ -336,7 +339,7 @@ class Slam(SlamResults, Stateful):
     ) -> tuple[NDArray[np.float64], bool]:
         """Pose of the frame after a loop closure, and whether there was one."""
         T_world_camera = estimate.T_world_camera
-        if self.atlas.history is None or view.without_image:
+        if self.atlas.history is None or view.without_image or self.motion.is_given:
             return T_world_camera, False
         with view.timer("loops"):
             levels, unverified = view.pyramid.tracked, estimate.unverified_mask

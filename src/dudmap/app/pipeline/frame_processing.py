@@ -3,7 +3,7 @@
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.frame_source import SourceFrame
@@ -13,6 +13,7 @@ from dudmap.app.pipeline.run_folder import save_mask
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
+    from dudmap.app.pipeline.given_poses import GivenPoses
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.slam import Slam
 
@@ -27,6 +28,7 @@ def process_source(
     mask_folder: Path | None,
     background: Background,
     observers: "tuple[RunObserver, ...]" = (),
+    poses: "GivenPoses | None" = None,
 ) -> None:
     """Process one frame, count it, save its mask, and report it; what no later frame waits for is done in the
     background."""
@@ -49,7 +51,10 @@ def process_source(
     start = time.perf_counter()
     frame = read.prepared or read.frame
     try:
-        result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
+        given: dict[str, Any] = {} if given_mask is None else {"dynamic_mask": given_mask}
+        if poses is not None:
+            given["T_world_camera"] = poses.at(read.frame.timestamp)
+        result = slam.process(frame, **given)
     except FrameError as error:
         record.skip(error)
         display.skip(error)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dudmap.app.pipeline.frame_source import open_masks
+from dudmap.app.pipeline.given_poses import stored_poses
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run import Job, run
 from dudmap.app.pipeline.run_folder import RunReport, locked
@@ -77,7 +78,16 @@ def resume(
                 return job.carry_out(state, store)
     config, folder = options.config, options.saved_map
     saved_map = None if folder is None else SavedMap.load(folder, config.volume.voxel_size)
-    others = {name: value for name, value in options if name not in ("config", "saved_map")}
+    others = {name: value for name, value in options if name not in ("config", "saved_map", "poses")}
+    poses = None if options.poses is None else stored_poses(out, options.poses)
     return run(
-        sequence, config, out, saved_map=saved_map, calibrate=True, progress=progress, observers=observers, **others
+        sequence,
+        config,
+        out,
+        saved_map=saved_map,
+        poses=poses,
+        calibrate=True,
+        progress=progress,
+        observers=observers,
+        **others,
     )

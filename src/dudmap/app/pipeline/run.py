@@ -4,6 +4,7 @@ import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,8 +12,10 @@ from dudmap import interruption
 from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.frame_processing import process_source
 from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, arriving, open_masks, read_ahead
+from dudmap.app.pipeline.given_poses import POSES, checked_options, stored_poses
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.remarks import remarks
 from dudmap.app.pipeline.run_folder import IGNORED, RunReport, locked, prepare_run_folder, save_mask, write_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
@@ -27,6 +30,7 @@ from dudmap.io.sequences import has_color, is_timed
 from dudmap.io.sequences.images import read_ignored
 
 if TYPE_CHECKING:
+    from dudmap.app.pipeline.given_poses import GivenPoses
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.places.saved_map import SavedMap
@@ -53,6 +57,7 @@ def run(
     live: bool = False,
     record: str | Path | None = None,
     passes: int = 1,
+    poses: "GivenPoses | None" = None,
     calibration: "Calibration | None" = None,
     calibrate: bool = False,
     saved_map: "SavedMap | None" = None,
@@ -95,6 +100,8 @@ def run(
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
+        poses: Poses of the frames, which are the result, or where registration starts; given_poses.txt is their copy.
+            Frames without one are left out of the first kind.
         calibration: Of the colour camera; None takes that of the recording or the camera.
         calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
@@ -125,6 +132,7 @@ def run(
     count = length if max_frames is None else min(max_frames, length or max_frames)
     if count is not None and count < 1:
         raise DatasetError(f"{sequence.name} has {length} frames and {max_frames} are wanted; expected one or more")
+    checked_options(has_poses=poses is not None, refine=False, saved_map=saved_map is not None)
     if passes not in (1, 2) or (live and passes == 2):
         raise ConfigError(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
@@ -141,14 +149,15 @@ def run(
         raise ConfigError("only the frames of a camera are recorded; these are on the disk already")
     if config.system == "thesis":
         foreign = {"second pass": passes == 2, "saved map": saved_map, "memory limit": max_memory, "given masks": masks,
-                   "checkpoints": storing, "mask of ignored pixels": ignore}  # fmt: skip
+                   "checkpoints": storing, "mask of ignored pixels": ignore, "given poses": poses}  # fmt: skip
         if found := [name for name, given in foreign.items() if given]:
             raise ConfigError(f"the thesis' system has no {found[0]}; leave the option out or choose the system dudmap")
     ignored = None if ignore is None else read_ignored(ignore, sequence.camera, calibration or sequence.calibration)
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
         passes=passes, saved_map=_resolved(saved_map and saved_map.folder), localize=localize, max_memory=max_memory,
-        storing=storing, ignore=None if ignored is None else (out / IGNORED).resolve(),
+        storing=storing, poses=None if poses is None else poses.role,
+        ignore=None if ignored is None else (out / IGNORED).resolve(),
     )  # fmt: skip
     figures = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
     with locked(out), ExitStack() as files:
@@ -157,6 +166,8 @@ def run(
         prepare_run_folder(out, masks, save_masks=save_masks)
         if ignored is not None:
             save_mask(out / IGNORED, ignored)
+        if poses is not None:
+            poses.trajectory.save(out / POSES)
         recorder = store = None
         if record is not None:
             recorder = Recorder(Path(record), sequence.camera, sequence.calibration)
@@ -203,6 +214,11 @@ class Job:
     observers: "tuple[RunObserver, ...]" = ()
     recorder: Recorder | None = None
 
+    @cached_property
+    def poses(self) -> "GivenPoses | None":
+        """The given poses, as they are in the run folder."""
+        return None if self.options.poses is None else stored_poses(self.out, self.options.poses)
+
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
         """A new system for this recording."""
         if self.options.config.system == "thesis":
@@ -217,7 +233,15 @@ class Job:
         timed, path = is_timed(self.sequence), self.options.ignore
         calibration = given.get("calibration") or self.sequence.calibration
         ignored = None if path is None else read_ignored(path, self.sequence.camera, calibration)
-        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, ignore=ignored, **given)
+        return Slam(
+            self.sequence.camera,
+            self.options.config,
+            max_blocks=limit,
+            timed=timed,
+            ignore=ignored,
+            poses=self.options.poses or "estimated",
+            **given,
+        )
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
         """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
@@ -238,15 +262,8 @@ class Job:
                     display.note(f"{error}; the run goes on on the CPU")
                     state, store = files.enter_context(self._from_checkpoint(state, store))
                     self._process(state, store)
-                if len(state.slam.maps) > 1:
-                    display.note(_unmerged_submaps(state.slam))
-                if state.record.repeated:
-                    display.note(_repeats(state.record))
-                if degenerate := state.record.counts["degenerate"]:
-                    display.note(f"{degenerate} frames do not show all directions of motion: not fused")
-                if dropped := state.record.dropped:
-                    total = dropped + len(state.record.rows) + len(state.record.unreadable)
-                    display.note(f"live: {dropped} of {total} frames were dropped")
+                for remark in remarks(state.slam, state.record):
+                    display.note(remark)
             except KeyboardInterrupt:
                 count, of_pass = len(state.record.rows), " of the second pass" if state.number else ""
                 if not isinstance(self.sequence, LiveCamera):
@@ -294,8 +311,9 @@ class Job:
                 for frame in frames:
                     with interruption.postponed():
                         process_source(
-                            frame, state.slam, state.record, self.display, mask_folder, background, self.observers
-                        )
+                            frame, state.slam, state.record, self.display, mask_folder, background, self.observers,
+                            self.poses,
+                        )  # fmt: skip
                         state.next = frame.number + 1
                         if store is not None:
                             store.frame(state, frame.read.frame, background)
@@ -344,8 +362,9 @@ class Job:
                 self._fuse_held(state)  # of a run that was stopped
             config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
-                self.out, slam, record, self.sequence, config, stopped, save_map=save_map, defect=defect
-            )
+                self.out, slam, record, self.sequence, config, stopped,
+                save_map=save_map, defect=defect, poses=self.poses,
+            )  # fmt: skip
             for observer in self.observers:
                 observer.finish(self.out)
             complete = not stopped
@@ -366,24 +385,6 @@ class Job:
                 f"{LONGEST_BASELINE:g} s; the recording has {len(stamps)} frames in {stamps[-1] - stamps[0]:.2f} s: "
                 f"expected {LONGEST_BASELINE:g} s or more"
             )
-
-
-def _unmerged_submaps(slam: "Slam") -> str:
-    """Sentence on the submaps that could not be merged."""
-    main, *others = (len(trajectory) for trajectory, _ in slam.maps)
-    names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
-    return f"{len(others)} submap(s) could not be merged: the main map has {main} frames; the others are {names}"
-
-
-def _repeats(record: RunRecord) -> str:
-    """Sentence on the frames that repeat images of the frame before."""
-    what = {
-        "frame": "{} both images (they have the pose of the frame before)",
-        "depth": "{} the depth image (their poses are interpolated)",
-        "color": "{} the colour image (tracked by distances alone, not fused)",
-    }
-    counts = ", ".join(text.format(record.repeated[kind]) for kind, text in what.items() if kind in record.repeated)
-    return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
 def _saved(state: RunState) -> str:

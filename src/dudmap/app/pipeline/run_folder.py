@@ -28,6 +28,7 @@ from dudmap.io.sequences import is_recording
 from dudmap.own_folder import OwnFolder, make_folder, remove_files
 
 if TYPE_CHECKING:
+    from dudmap.app.pipeline.given_poses import GivenPoses
     from dudmap.core.objects.object_map import RigidObject
     from dudmap.core.slam import Slam
     from dudmap.io.cameras import LiveCamera
@@ -40,7 +41,7 @@ LOCKED_BYTE = 1 << 20
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
     "timings.csv", "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
-    "merge.json", "report.html", "changes.jsonl", "ignored.png",
+    "merge.json", "report.html", "changes.jsonl", "ignored.png", "given_poses.txt",
 )  # fmt: skip
 IGNORED = "ignored.png"
 """Copy of the mask of the pixels that never count."""
@@ -183,6 +184,7 @@ def write_run_folder(
     *,
     save_map: bool,
     defect: bool = False,
+    poses: "GivenPoses | None" = None,
 ) -> RunReport:
     """Write all files of the run folder; a file that fails does not prevent the others.
 
@@ -201,6 +203,10 @@ def write_run_folder(
         "map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes, "mesh_vertices": 0, "mesh_triangles": 0,
         "maps": len(others) + 1, "calibration": calibration.tree(),
     }  # fmt: skip
+
+    if poses is not None:
+        correction = poses.corrections(trajectory) if poses.role == "refined" else None
+        metrics["poses"] = {"role": poses.role, "given": len(poses.trajectory), "correction": correction}
 
     def save_mesh() -> None:
         if volume.pager is not None:  # the mesh may not fit into the memory either

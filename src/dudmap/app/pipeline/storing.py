@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -87,6 +87,7 @@ class RunOptions(BaseModel):
     max_memory: int | None = None
     storing: Storing | None = None
     ignore: Path | None = None
+    poses: Literal["given", "refined"] | None = None
 
 
 class StoredRun(BaseModel):

@@ -9,6 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.errors import FrameError
+
 Matrix = NDArray[np.float64]
 IDENTITY = np.eye(3)
 SMALL = 1e-8
@@ -244,3 +246,23 @@ def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, a
     if math.sqrt(apart @ apart) >= distance:
         return False
     return math.degrees(rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])) < angle_deg
+
+
+LARGEST_SKEW = 0.02
+"""Largest difference of the products of a rotation's rows from 0 and 1 that roundings of two digits explain."""
+
+
+def checked_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A pose (4, 4) from elsewhere as a rigid motion.
+
+    Raises:
+        FrameError: It is none.
+    """
+    T = np.array(T, dtype=np.float64)
+    if T.shape != (4, 4) or not np.all(np.isfinite(T)):
+        raise FrameError(f"the given pose has the shape {T.shape}; expected (4, 4) finite numbers, camera to world")
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > LARGEST_SKEW or np.linalg.det(R) < 0 or np.any(T[3] != (0, 0, 0, 1)):
+        raise FrameError("the given pose is no rigid motion; expected a rotation and metres, camera to world")
+    T[:3, :3] = nearest_rotation(R)
+    return T

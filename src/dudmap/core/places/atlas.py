@@ -24,7 +24,7 @@ from dudmap.core.places.map_rebuilding import MAX_ADDED, MAX_IMMEDIATE, PER_FRAM
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase
 from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.pose_prediction import VELOCITY_LIFETIME
+from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
 
 @dataclass(eq=False)

@@ -18,7 +18,7 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.core.tracking.pose_prediction import VELOCITY_LIFETIME, MotionModel
+from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 
 
 class RegisteredLevel(Level):

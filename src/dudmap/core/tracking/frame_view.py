@@ -175,9 +175,11 @@ class PoseEstimate:
     view: FrameView | None = None
 
     @classmethod
-    def at_origin(cls, gain: float = 1.0) -> "PoseEstimate":
-        """Estimate of the frame that defines the world frame, whose colours times a gain are those of its map."""
-        return cls(TrackingResult(np.eye(4), (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0))
+    def at_origin(cls, gain: float = 1.0, T_world_camera: NDArray[np.float64] | None = None) -> "PoseEstimate":
+        """Estimate of the frame that a map is made of, whose colours times a gain are those of its map; it defines the
+        world frame unless its pose (4, 4) is given."""
+        T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera
+        return cls(TrackingResult(T_world_camera, (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0))
 
     @property
     def T_world_camera(self) -> NDArray[np.float64]:

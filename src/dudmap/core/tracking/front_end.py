@@ -16,7 +16,8 @@ from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, MotionModel, PosePrediction
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 
@@ -73,6 +74,8 @@ class FrontEnd(Stateful):
         wherever the camera is: registered as static, he carries the camera along, and only the colours of the floor
         contradict.
         """
+        if self.motion.is_given:
+            return self._at_given(volume, view, prediction)
         estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
         tracking = estimate.tracking
         arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
@@ -135,6 +138,24 @@ class FrontEnd(Stateful):
         if view.without_image:
             tracking = replace(tracking, color_residual=np.nan)
         return PoseEstimate(tracking, labels, unverified, view)
+
+    def _at_given(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
+        """Labels of a frame whose pose is given, which is not registered."""
+        coarse, fine = view.pyramid.coarse, view.pyramid.fine
+        T_world_camera, unverified = prediction.T_world_camera, prediction.unverified_mask
+        excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
+        tracker = self.blind_tracker if view.blind else self.tracker
+        with view.timer("track"):
+            [weights] = initial_weights([coarse], self.last_dynamic, excluded) or [np.ones_like(coarse.depth)]
+            found = tracker.judge(volume, coarse, T_world_camera, weights)
+        labels = None if self.config.dynamics.method == "none" else self._label(volume, view, prediction, found)
+        with view.timer("track_again"):
+            if labels is None:
+                [weights] = initial_weights([fine], None, excluded) or [np.ones_like(fine.depth)]
+            else:
+                [weights] = static_weights(labels, [fine], unverified)
+            tracking = tracker.judge(volume, fine, T_world_camera, weights, found.exposure)
+        return PoseEstimate(tracking, labels, unverified)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""

@@ -1,13 +1,12 @@
 """Prediction of the camera pose, by constant velocity or by the ego-motion between two images."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import Config, TrackerConfig
+from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, DominantMotion, exceeds_noise_share
 from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
 from dudmap.core.frames.observation import Level, is_majority_dynamic
@@ -15,124 +14,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.map.volume import FREE, SURFACE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import Tracker
-
-VELOCITY_LIFETIME = 0.15
-"""Time after the last accepted pose during which the velocity is still used, seconds."""
-PAUSE = 1.0
-"""Time without a pose after which the last velocity says nothing, seconds: a hand accelerates by about 1 m/s^2."""
-ACCELERATION = 1.0
-"""Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
-
-
-class MotionModel(Stateful):
-    """Predicts the next pose from the last two.
-
-    Args:
-        config: Whether velocity is constant.
-        timed: Whether the stamps are the times of the frames; else they only tell their order.
-
-    Attributes:
-        T_world_camera: (4, 4), the last accepted pose.
-    """
-
-    T_world_camera: Remembered[NDArray[np.float64]]
-    _timestamp: Remembered[float] = 0.0
-    _velocity: Remembered[NDArray[np.float64]]
-    _initialized: Remembered[bool] = False
-    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
-
-    def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
-        self.config = config
-        self.timed = timed
-        self.T_world_camera = np.eye(4)
-        self._velocity = np.zeros(6)  # twist per second, camera axes
-
-    @property
-    def timestamp(self) -> float:
-        """Time of the last accepted pose, seconds."""
-        return self._timestamp
-
-    @property
-    def velocity(self) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
-        return self._velocity
-
-    def predict(self, timestamp: float) -> NDArray[np.float64]:
-        """Predicted pose (4, 4) at a time in seconds."""
-        if not self.config.constant_velocity:
-            return self.T_world_camera
-        return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
-
-    def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
-        """Accept the pose of a tracked frame, whose motion was ``observed`` in all directions or partly predicted."""
-        if observed:
-            self._observed = timestamp
-        if self._initialized:
-            self._velocity = self.velocity_to(timestamp, T_world_camera)
-        self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
-
-    def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
-        if not self._initialized:
-            return np.zeros(6)
-        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
-
-    def lost(self, timestamp: float) -> bool:
-        """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
-
-        Returns:
-            Whether the velocity's lifetime is over.
-        """
-        if timestamp - self._timestamp <= VELOCITY_LIFETIME:
-            return False
-        self._velocity = np.zeros(6)
-        return True
-
-    def has_paused(self, timestamp: float) -> bool:
-        """Whether no pose has been accepted for longer than PAUSE."""
-        return self._initialized and timestamp - self._timestamp > PAUSE
-
-    def drift(self, timestamp: float) -> float:
-        """Standard deviation of a pose that is partly predicted, metres.
-
-        An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
-        """
-        return ACCELERATION * (timestamp - self._observed) ** 2 / 2
-
-    def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Continue from the pose of a relocalised frame with unknown velocity."""
-        self._initialized, self._velocity = False, np.zeros(6)
-        self.update(timestamp, T_world_camera)
-
-    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
-        """Follow a correction of the world frame; the velocity is in camera axes and stays."""
-        self.T_world_camera = T_new_old @ self.T_world_camera
-
-    def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
-        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``, or, where the times of the frames are
-        not known, ``step``, by which it moves the median reading, as a share of the width of the image.
-
-        Args:
-            timestamp: Seconds.
-            T_world_camera: (4, 4) pose at that time.
-            image: The image there, of any size.
-        """
-        motion = se3.inverse(self.T_world_camera) @ T_world_camera
-        shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)
-        distance = math.sqrt(shift @ shift)
-        if self.timed:
-            elapsed = self.elapsed(timestamp)
-            return {"speed_m_s": distance / elapsed, "turn_deg_s": math.degrees(angle) / elapsed, "step": np.nan}
-        readings = image.depth[image.depth > 0]
-        depth = float(np.median(readings)) if len(readings) else np.inf
-        step = (distance / depth + angle) * image.camera.fx / image.camera.width
-        return {"speed_m_s": np.nan, "turn_deg_s": np.nan, "step": step}
-
-    def elapsed(self, timestamp: float) -> float:
-        """Seconds since the last accepted pose, at most 1."""
-        return min(max(timestamp - self._timestamp, 1e-3), 1.0)
-
 
 CLEARLY_BETTER = 0.95
 """A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
@@ -248,7 +131,8 @@ class PosePredictor(Stateful):
             if motion is None or T_image is None:
                 return by_velocity
             slow = self._slow_motion(view, T_image, motion.moving_after, previously_dynamic if was_slow else None)
-            if timestamp in self._known_poses:
+            known = timestamp in self._known_poses or self.motion.is_given
+            if known:
                 T_image = T_expected
             elif slow is not None:
                 T_image = T_image if was_slow else slow.T_world_camera  # what is known to move misleads no corner
@@ -264,7 +148,7 @@ class PosePredictor(Stateful):
             young = self.ego_motion.map_is_young(timestamp)
             unverified, lasts = self._watch_crowd(view, motion, slow, moving, was_moving=was_moving)
             occupancy = None if unverified is None and young else _occupancy(volume, view.labelled, T_image)
-            mapped = lasts and unverified is not None and moving_before is None and timestamp not in self._known_poses
+            mapped = lasts and unverified is not None and moving_before is None and not known
             mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
             crowd_in_map = moving if mapped else None
             if not young:  # where the map is known, it labels better than two images

@@ -30,7 +30,7 @@ from dudmap.core.tracking.checks import (
     first_failure,
 )
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
-from dudmap.core.tracking.pose_prediction import MotionModel
+from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
 
 CLEARLY_LESS = 0.5
@@ -272,6 +272,8 @@ class QualityMonitor(Stateful):
                 "corners": partial(self.images.supported, last, view, estimate, seen, image_pose),
             }
             mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
+            if self.motion.is_given:
+                return Verdict("", figures)
             return Verdict(
                 first_failure(CHECKS, figures, self.limits(mode, mostly_dynamic=mostly_dynamic), evidence), figures
             )

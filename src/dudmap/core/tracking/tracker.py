@@ -198,6 +198,27 @@ class Tracker:
             system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
         return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
 
+    def judge(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        exposure: tuple[float, float] | None = None,
+    ) -> TrackingResult:
+        """Result at a pose (4, 4) that is not changed; the exposure is fitted where it is not given."""
+        volume.look_at(T_world_camera)
+        parameters, fitted = self.parameters(volume.band), exposure is None and self.config.exposure
+        curve = exposure or (1.0, 0.0)
+        lit = exposed(level, curve)
+        system = self._descend(volume, lit, T_world_camera, weights, None, NO_STEP, parameters).equations
+        if fitted:
+            curve = fit_exposure(lit.intensity, system.residuals[1], weights)
+            lit = exposed(level, curve)
+            system = self._descend(volume, lit, T_world_camera, weights, None, NO_STEP, parameters).equations
+        found = Minimum(T_world_camera, curve, system, lit, weights, 1 + fitted, True, COMPLETE)
+        return self._judge(found, T_world_camera)
+
     def nearest(
         self,
         volume: TsdfVolume,

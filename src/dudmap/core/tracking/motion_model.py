@@ -1,0 +1,175 @@
+"""Motion of the camera: constant velocity, or the motion of poses that are given from elsewhere."""
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import TrackerConfig
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.stream_check import Rejection
+from dudmap.core.geometry import se3
+from dudmap.core.state import Remembered, Stateful
+from dudmap.errors import ConfigError
+
+GivenRole = Literal["estimated", "given", "refined"]
+"""Role of poses that come with the frames, see ``MotionModel``."""
+VELOCITY_LIFETIME = 0.15
+"""Time after the last accepted pose during which the velocity is still used, seconds."""
+PAUSE = 1.0
+"""Time without a pose after which the last velocity says nothing, seconds: a hand accelerates by about 1 m/s^2."""
+ACCELERATION = 1.0
+"""Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
+
+
+class MotionModel(Stateful):
+    """Predicts the next pose from the last two.
+
+    A pose of the frame from elsewhere (a robot arm, a phone, odometry) replaces constant velocity: the motion since the
+    last accepted pose is that of the given poses, however long ago that was.
+
+    Args:
+        config: Whether velocity is constant.
+        timed: Whether the stamps are the times of the frames; else they only tell their order.
+        poses: Role of given poses: the result (``given``), or where registration starts (``refined``); ``estimated``
+            where none are given.
+
+    Attributes:
+        T_world_camera: (4, 4), the last accepted pose.
+    """
+
+    T_world_camera: Remembered[NDArray[np.float64]]
+    _T_given: Remembered[NDArray[np.float64] | None] = None  # given pose of the frame that comes
+    _T_world_given: Remembered[NDArray[np.float64]]  # world of the given poses in that of the map
+    _timestamp: Remembered[float] = 0.0
+    _velocity: Remembered[NDArray[np.float64]]
+    _initialized: Remembered[bool] = False
+    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
+
+    def __init__(self, config: TrackerConfig, *, timed: bool = True, poses: GivenRole = "estimated") -> None:
+        self.config = config
+        self.timed, self.poses = timed, poses
+        self.T_world_camera, self._T_world_given = np.eye(4), np.eye(4)
+        self._velocity = np.zeros(6)  # twist per second, camera axes
+
+    @property
+    def timestamp(self) -> float:
+        """Time of the last accepted pose, seconds."""
+        return self._timestamp
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
+        return self._velocity
+
+    def give(self, T_world_camera: NDArray[np.float64] | None) -> None:
+        """Take note of the pose (4, 4) that is given for the frame that comes, None for none.
+
+        Raises:
+            ConfigError: Poses are not expected.
+            FrameError: The pose is no rigid motion.
+        """
+        if T_world_camera is not None and self.poses == "estimated":
+            raise ConfigError('a pose is given for a frame; expected Slam(camera, poses="given") or poses="refined"')
+        self._T_given = None if T_world_camera is None else se3.checked_pose(T_world_camera)
+
+    @property
+    def missing(self) -> Rejection | None:
+        """Why the frame that comes cannot be used, None if it can."""
+        lacks = self.poses == "given" and self._T_given is None
+        return Rejection("pose", "no pose is given for the frame") if lacks else None
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the pose of the frame that comes is given and is not to be estimated."""
+        return self.poses == "given" and self._T_given is not None
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """Pose (4, 4) of a frame that a map is made of: the given one, else the origin."""
+        return np.eye(4) if self._T_given is None else self._T_world_given @ self._T_given
+
+    def predict(self, timestamp: float) -> NDArray[np.float64]:
+        """Predicted pose (4, 4) at a time in seconds."""
+        if self._T_given is not None:
+            return self._T_world_given @ self._T_given
+        if not self.config.constant_velocity:
+            return self.T_world_camera
+        return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
+
+    def repeated(self, timestamp: float, T_last: NDArray[np.float64], *, depth_only: bool) -> NDArray[np.float64]:
+        """Pose (4, 4) of a frame that repeats the images of the last one, of pose ``T_last``, or its depth alone."""
+        return self.predict(timestamp) if depth_only or self.is_given else T_last
+
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
+        """Accept the pose of a tracked frame, whose motion was ``observed`` in all directions or partly predicted."""
+        if observed:
+            self._observed = timestamp
+        if self._initialized:
+            self._velocity = self.velocity_to(timestamp, T_world_camera)
+        if self._T_given is not None and self.poses == "refined":
+            self._T_world_given = T_world_camera @ se3.inverse(self._T_given)
+        self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
+
+    def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
+        if not self._initialized:
+            return np.zeros(6)
+        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
+
+    def lost(self, timestamp: float) -> bool:
+        """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
+
+        Returns:
+            Whether the velocity's lifetime is over.
+        """
+        if timestamp - self._timestamp <= VELOCITY_LIFETIME:
+            return False
+        self._velocity = np.zeros(6)
+        return True
+
+    def has_paused(self, timestamp: float) -> bool:
+        """Whether no pose has been accepted for longer than PAUSE."""
+        return self._initialized and timestamp - self._timestamp > PAUSE
+
+    def drift(self, timestamp: float) -> float:
+        """Standard deviation of a pose that is partly predicted, metres.
+
+        An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
+        """
+        return ACCELERATION * (timestamp - self._observed) ** 2 / 2
+
+    def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
+        """Continue from the pose of a relocalised frame with unknown velocity."""
+        self._initialized, self._velocity = False, np.zeros(6)
+        self.update(timestamp, T_world_camera)
+
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Follow a correction of the world frame; the velocity is in camera axes and stays."""
+        self.T_world_camera = T_new_old @ self.T_world_camera
+        self._T_world_given = T_new_old @ self._T_world_given
+
+    def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
+        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``, or, where the times of the frames are
+        not known, ``step``, by which it moves the median reading, as a share of the width of the image.
+
+        Args:
+            timestamp: Seconds.
+            T_world_camera: (4, 4) pose at that time.
+            image: The image there, of any size.
+        """
+        motion = se3.inverse(self.T_world_camera) @ T_world_camera
+        shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)
+        distance = math.sqrt(shift @ shift)
+        if self.timed:
+            elapsed = self.elapsed(timestamp)
+            return {"speed_m_s": distance / elapsed, "turn_deg_s": math.degrees(angle) / elapsed, "step": np.nan}
+        readings = image.depth[image.depth > 0]
+        depth = float(np.median(readings)) if len(readings) else np.inf
+        step = (distance / depth + angle) * image.camera.fx / image.camera.width
+        return {"speed_m_s": np.nan, "turn_deg_s": np.nan, "step": step}
+
+    def elapsed(self, timestamp: float) -> float:
+        """Seconds since the last accepted pose, at most 1."""
+        return min(max(timestamp - self._timestamp, 1e-3), 1.0)
