@@ -28,8 +28,8 @@ UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), 
 def time_unit(stamps: ArrayLike) -> TimeUnit:
     """Unit of time stamps (N,), in any order.
 
-    Stamps that all lie in this century as one of the units are in that unit. Others are told apart by the median step:
-    at 1 to 1000 images a second, it is below 1 in seconds and between 1, 10^3, 10^6 and 10^9 in the other units.
+    Stamps that all lie in this century as one of the units are in that unit. The median step decides on others: at 1 to
+    1000 images a second it is below 1 in seconds, and up to 10^3, 10^6 and 10^9 in the other units.
     """
     values = np.sort(np.asarray(stamps, dtype=np.float64))
     steps = np.diff(values)

@@ -25,7 +25,7 @@ class Trajectory:
     Attributes:
         timestamps: (N,) float64, seconds, strictly increasing.
         Ts_world_camera: (N, 4, 4) float64.
-        remarks: Sentences on what was assumed and left out where they were read.
+        remarks: Sentences on the assumed unit of time and on rows that were left out.
     """
 
     timestamps: NDArray[np.float64]

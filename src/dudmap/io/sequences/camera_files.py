@@ -92,10 +92,10 @@ def _of_file(file: Path) -> Intrinsics:
     try:
         return from_file(file)
     except DatasetError:
-        cameras = [values for _, values in cameras_in(file)]
-        if not cameras or any(values != cameras[0] for values in cameras):
+        cameras = cameras_in(file)
+        if not cameras or any("color" in name or values != cameras[0][1] for name, values in cameras):
             raise
-        return Intrinsics(cameras[0], str(file))
+        return Intrinsics(cameras[0][1], str(file))
 
 
 def unknown(folder: Path, why: str = "") -> DatasetError:

@@ -69,7 +69,11 @@ def known(
         return found
     both = sizes()
     if both is not None and given != both[0]:
-        found = search(folder, *both) or found
+        try:
+            found = search(folder, *both) or found
+        except DatasetError:
+            if found is None:
+                raise
     if found is None:
         raise problem or camera_files.unknown(folder, why)
     return found
