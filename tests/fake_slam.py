@@ -106,6 +106,9 @@ class FakeSlam:
     def prepare(self, frame):
         return frame
 
+    def finish(self):
+        return 0
+
     def process(self, frame):
         index = len(self.frames)
         self.frames.append(frame)

@@ -22,7 +22,7 @@ from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
 from dudmap.app.terminal import counted
 from dudmap.config import Config
-from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError
+from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, MapError
 from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
@@ -358,8 +358,8 @@ class Job:
             slam, record = slam.first_pass or slam, state.first_record or record
         complete = False
         try:
-            if not defect and not isinstance(sys.exception(), DeviceError):
-                self._fuse_held(state)  # of a run that was stopped
+            if not defect and not isinstance(sys.exception(), DeviceError | MapError | OSError | MemoryError):
+                self._fuse_held(state)  # of a run that was stopped; a map that cannot be written is left as it is
             config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
                 self.out, slam, record, self.sequence, config, stopped,
