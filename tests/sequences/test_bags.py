@@ -10,7 +10,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from bags import START, BagWriter, millimetres, write_bag, write_frames
+from bags import START, BagWriter, K, millimetres, write_bag, write_frames
 from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError, FrameError, MissingExtraError
 from dudmap.io.sequences import open_sequence
@@ -232,8 +232,6 @@ def test_topics_are_listed_where_one_is_missing(tmp_path):
 
 def test_topics_can_be_chosen(tmp_path):
     path = write_bag(tmp_path / "a.bag", "ros1", depth_topic="/other/thing")
-    with pytest.raises(DatasetError, match="recognised as depth"):
-        open_sequence(path)
     sequence = open_sequence(path, topics="depth=/other/thing,color=/camera/color/image_raw")
     assert sequence.sources["intrinsics"] == "/other/camera_info"
     check_frames(sequence)
@@ -306,3 +304,37 @@ def test_files_that_only_look_like_bags_are_not_recognised(tmp_path):
         assert not RosBag.recognises(tmp_path / name)
     os.mkdir(tmp_path / "folder")
     assert not RosBag.recognises(tmp_path / "folder")
+
+
+def named_otherwise(path, kind, depth_encoding="16UC1", k=K):
+    """A bag whose depth topic tells by its encoding alone what it is, as that of an OAK camera."""
+    bag = BagWriter(path, kind)
+    for index in range(5):
+        stamp = START + 0.1 * index
+        for space in ("/oak/stereo", "/oak/rgb"):
+            bag.write(f"{space}/camera_info", bag.info(stamp, "oak", k=k), stamp)
+        bag.write("/oak/stereo/image_raw", bag.image(millimetres(index), depth_encoding, stamp, "oak"), stamp)
+        bag.write("/oak/rgb/image_raw", bag.image(color_image(index), "rgb8", stamp, "oak"), stamp)
+    bag.close()
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_images_are_told_apart_by_their_encoding_where_names_do_not_tell(kind, tmp_path):
+    found = open_sequence(named_otherwise(tmp_path / KINDS[kind], kind))
+    assert len(found) == 5
+    np.testing.assert_allclose(found[2].depth, millimetres(2) / 1000, atol=1e-6)
+    np.testing.assert_array_equal(found[2].color, color_image(2))
+
+
+def test_a_16_bit_image_may_be_infrared(tmp_path):
+    with pytest.raises(DatasetError, match=r"no topic of .* is recognised as depth"):
+        open_sequence(named_otherwise(tmp_path / "walk", "mcap", "mono16"))
+
+
+def test_a_camera_that_is_not_calibrated_is_named(tmp_path):
+    path = named_otherwise(tmp_path / "walk", "mcap", k=[0.0] * 9)
+    zeros = r"K in /oak/rgb/camera_info and /oak/stereo/camera_info is all zeros"
+    with pytest.raises(DatasetError, match=rf"{zeros}.*--camera"):
+        open_sequence(path)
+    assert open_sequence(path, camera="60,61,31.5,23.5").camera.fy == 61

@@ -72,7 +72,7 @@ class RosBag(Recording):
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
         """Set topics, times and pairs of messages, and the cameras."""
-        self._topics = bag_messages.find_topics(self._bag.connections, chosen, str(self.path))
+        self._topics = bag_messages.find_topics(self._bag.connections, chosen, str(self.path), self._bag.first)
         self.has_color = self._topics.color is not self._topics.depth
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
@@ -163,6 +163,7 @@ class RosBag(Recording):
         depth, values, color, image = self._probe()
         depth_size, color_size = values.shape[::-1], image.shape[1::-1]
         self._depth_frame = depth.header.frame_id
+        self._uncalibrated: list[str] = []
         color_lens = self._lens(topics.color_info, topics.color, color_size)
         one_size = depth_size == color_size
         if given is not None:
@@ -177,13 +178,13 @@ class RosBag(Recording):
             source = info.topic if info else ""
         if depth_lens is None:
             raise DatasetError(
-                f"{self.path} holds no camera_info beside {topics.depth.topic}; choose it with --topics "
-                "depth_info=/..., or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+                f"{self.path} holds no camera_info beside {topics.depth.topic}{self._without()}; choose it with "
+                "--topics depth_info=/..., or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
             )
         if color_lens is None and not one_size:
             raise DatasetError(
                 f"{self.path}: depth is {size(values)} and colour {size(image)} pixels, and there is no camera_info "
-                f"beside {topics.color.topic}; choose it with --topics color_info=/..."
+                f"beside {topics.color.topic}{self._without()}; choose it with --topics color_info=/..."
             )
         if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
@@ -235,12 +236,20 @@ class RosBag(Recording):
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
+        if not K[0] > 0 and connection is not None:  # as drivers have it for a camera that is not calibrated
+            self._uncalibrated.append(connection.topic)
+            return None
         rectified = "rect" in bag_messages.base(image.topic).rpartition("/")[2] and P[0] > 0
         fx, cx, fy, cy = (P[0], P[2], P[5], P[6]) if rectified else (K[0], K[2], K[4], K[5])
         width, height = (info.width, info.height) if info.width and info.height else shape
         units = self._units()
         camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
         return Lens(camera) if rectified else Lens.of(camera, self._model_of(image, info), tuple(map(float, D)))
+
+    def _without(self) -> str:
+        """Part of a sentence on the camera_info that holds no intrinsics."""
+        found = " and ".join(dict.fromkeys(self._uncalibrated))
+        return f" with a focal length (K in {found} is all zeros: that camera is not calibrated)" if found else ""
 
     def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
         """Model of the lens of an image with its camera_info."""

@@ -6,7 +6,7 @@ encoding that is not known, and data that are damaged or too short, are a ``Fram
 
 import re
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -65,12 +65,24 @@ def chosen_topics(text: str | None) -> dict[str, str]:
     return chosen
 
 
-def find_topics(connections: "Sequence[Connection]", chosen: dict[str, str], bag: str) -> Topics:
-    """Topics that are chosen, and for the rest those that are recognised."""
+def find_topics(
+    connections: "Sequence[Connection]", chosen: dict[str, str], bag: str, first: "Callable[[Connection], Any]"
+) -> Topics:
+    """Topics that are chosen, and for the rest those that are recognised by their names, else by their encodings.
+
+    ``first`` gives the first message of a topic.
+    """
     filled = [connection for connection in connections if connection.msgcount > 0]
     images = [connection for connection in filled if connection.msgtype in IMAGES]
     depths = [_named(images, chosen["depth"], bag)] if "depth" in chosen else [c for c in images if _is_depth(c)]
     colors = [_named(images, chosen["color"], bag)] if "color" in chosen else [c for c in images if _is_color(c)]
+    if not (depths and colors):
+        open_to = [c for c in images if c not in depths and not OTHER_NAME.search(c.topic.lower())]
+        kinds = {connection.topic: _kind(first(connection)) for connection in open_to}
+        if not depths:
+            depths = [connection for connection in open_to if kinds[connection.topic] == "depth"]
+            colors = [connection for connection in colors if connection not in depths]
+        colors = colors or [connection for connection in open_to if kinds[connection.topic] == "colour"]
     others = (c for c in images if c not in depths and not _is_depth(c) and not OTHER_NAME.search(c.topic.lower()))
     alone = "color" not in chosen and not colors and next(others, None) is None
     for wanted, found in (("depth", depths), ("colour", depths if alone else colors)):
@@ -142,6 +154,16 @@ def _is_depth(connection: "Connection") -> bool:
 def _is_color(connection: "Connection") -> bool:
     name = connection.topic.lower()
     return bool(COLOR_NAME.search(name)) and not DEPTH_NAME.search(name) and not OTHER_NAME.search(name)
+
+
+def _kind(image: Any) -> str:  # noqa: ANN401 - the type is made from the bag
+    """Whether an Image or CompressedImage is "depth" or "colour" by its encoding; empty if that may be either."""
+    if hasattr(image, "format"):
+        form = image.format.lower()
+        return "depth" if "compresseddepth" in form else "colour" if re.match(r"(rgb|bgr)a?8|jpe?g", form) else ""
+    if image.encoding in ("16UC1", "32FC1"):  # infrared images may be mono16
+        return "depth"
+    return "colour" if image.encoding in COLOR_ENCODINGS and image.encoding not in ("mono8", "8UC1") else ""
 
 
 def _named(connections: "Sequence[Connection]", topic: str, bag: str) -> "Connection":
