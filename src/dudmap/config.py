@@ -18,6 +18,7 @@ from dudmap.atomic_file import write_text
 from dudmap.config_section import ConfigSection
 from dudmap.errors import ConfigError
 from dudmap.input_files import parse_toml, read_toml
+from dudmap.ranges import RANGES, scaled
 from dudmap.thesis_config import ThesisConfig
 
 
@@ -34,6 +35,9 @@ class SensorConfig(ConfigSection):
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
+    reference_depth: float = Field(default=1.0, ge=0.1, le=10)
+    """Depth at which thresholds of distances are given, metres, and the unit of all lengths that are constants of the
+    program: 1 for rooms. It belongs to the range: ``Config.for_range`` scales it with all other lengths."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
     row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters.
@@ -42,6 +46,11 @@ class SensorConfig(ConfigSection):
     self_calibration: bool = True
     """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
     before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
+
+    @property
+    def reference_sigma(self) -> float:
+        """Standard deviation of a depth reading at ``reference_depth``, metres."""
+        return float(self.sigma(self.reference_depth))
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
@@ -156,9 +165,9 @@ class TrackerConfig(ConfigSection):
     robust: Literal["huber", "tukey"] = "huber"
     """Robust weight function (thesis eq. 4.44, 4.45)."""
     huber: float = Field(default=0.01, gt=0)
-    """Huber threshold of the distance residual, metres at 1 m depth (thesis table 6.1)."""
+    """Huber threshold of the distance residual, metres at the reference depth (thesis table 6.1)."""
     tukey: float = Field(default=0.05, gt=0)
-    """Tukey threshold of the distance residual, metres at 1 m depth."""
+    """Tukey threshold of the distance residual, metres at the reference depth."""
     damping: float = Field(default=0.02, gt=0)
     """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1); at most 1e-4
     on the finest level."""
@@ -327,7 +336,7 @@ class MoversConfig(ConfigSection):
     """Time over which the velocity is averaged, seconds."""
     meshes: bool = False
     """Also reconstruct each rigid object and estimate its pose (movers/<id>.ply and .txt of a run)."""
-    mesh_voxel_size: float = Field(default=0.005, ge=0.004, le=0.1)
+    mesh_voxel_size: float = Field(default=0.005, ge=0.001, le=0.1)
     """Edge length of the voxels of these objects, metres."""
 
 
@@ -353,8 +362,20 @@ class Config(ConfigSection):
     thesis: ThesisConfig = ThesisConfig()
 
     @classmethod
-    def load(cls, path: str | Path) -> "Config":
-        """Configuration of a TOML file; parameters it does not set keep their defaults.
+    def for_range(cls, name: str) -> "Config":
+        """The defaults for a ``near`` (0.1 to 0.5 m), ``room`` or ``far`` (6 to 15 m) scene, see ``dudmap.ranges``.
+
+        Raises:
+            ConfigError: There is no such range.
+        """
+        if name not in RANGES:
+            raise ConfigError(f"found the range {name!r}; expected one of {', '.join(RANGES)}")
+        return cls.from_tree({}, RANGES[name])
+
+    @classmethod
+    def load(cls, path: str | Path, size: float = 1.0) -> "Config":
+        """Configuration of a TOML file; parameters it does not set keep their defaults for a scene of a ``size``, in
+        rooms.
 
         Raises:
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
@@ -365,19 +386,21 @@ class Config(ConfigSection):
             raise ConfigError(f"cannot read the configuration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"the configuration {path} is not valid TOML: {error}") from error
-        return cls.from_tree(tree)
+        return cls.from_tree(tree, size)
 
     @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> "Config":
-        """Configuration of nested dictionaries; parameters they do not set keep their defaults.
+    def from_tree(cls, tree: Mapping[str, Any], size: float = 1.0) -> "Config":
+        """Configuration of nested dictionaries; parameters they do not set keep their defaults for a scene of a
+        ``size``, in rooms. The thesis' system has rooms only.
 
         Raises:
             ConfigError: A key is unknown or a value invalid.
         """
         tree = _without_preset(tree)
         _check_keys(tree)
+        size = 1.0 if tree.get("system") == "thesis" else size
         try:
-            return cls.model_validate(tree)
+            return cls.model_validate(_merged(scaled(cls().model_dump(), size), tree))
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"]) or "configuration"

@@ -120,7 +120,7 @@ def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch
     for module in ("atlas", "loop_correction"):
         monkeypatch.setattr(f"dudmap.core.places.{module}.MAX_IMMEDIATE", 4)
     monkeypatch.setattr(
-        "dudmap.core.places.loop_correction._is_worse", lambda after, before: False
+        "dudmap.core.places.loop_correction._is_worse", lambda after, before, unit: False
     )  # there was no loop
     sequence, frames = scene(movers=(), frames=36)
     settings = ["loops.keep_gap=1", "loops.min_age=100", "volume.voxel_size=0.02"]

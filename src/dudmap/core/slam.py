@@ -102,7 +102,8 @@ class Slam(SlamResults, Stateful):
         given = None if start is None or (registered and start.depth_readout == 0) else start
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
-        self.preprocess = Preprocessor(camera, config.preprocess, None if registered else given, ignore)
+        color = None if registered else given
+        self.preprocess = Preprocessor(camera, config.preprocess, color, ignore, config.sensor)
         self.camera = self.preprocess.camera
         self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)

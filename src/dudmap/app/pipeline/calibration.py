@@ -67,7 +67,8 @@ before and after it, and the others are not read. From a shorter recording every
 GAP = 2.5
 """Largest time between the neighbours of a keyframe, usual intervals: frames were left out where there is more."""
 VOXEL_SIZE = 0.02
-"""Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
+"""Edge of the voxels of the map that these frames are tracked in, reference depths; larger ones of the configuration
+stay."""
 
 
 def kind_of(parameter: str) -> str:
@@ -188,7 +189,8 @@ def calibrate_sequence(
     from dudmap.core.slam import Slam
 
     halvings = halvings_to(WIDTH, sequence.camera)
-    small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
+    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
+    small = _Excerpt(sequence, given, halvings, count, config.sensor.reference_depth)
     slam = Slam(
         small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence),
         ignore=None if ignore is None else _halved(ignore, halvings),
@@ -226,7 +228,7 @@ def _quick(config: Config, halvings: int) -> Config:
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
-        f"volume.voxel_size={max(config.volume.voxel_size, VOXEL_SIZE)}",
+        f"volume.voxel_size={max(config.volume.voxel_size, VOXEL_SIZE * config.sensor.reference_depth)}",
         f"preprocess.filter_sigma_px={preprocess.filter_sigma_px / (1 << halvings)}",
         f"preprocess.filter_radius={max(1, preprocess.filter_radius >> halvings)}",
     ])  # fmt: skip
@@ -244,9 +246,11 @@ class _Excerpt:
     """Frames of a recording around its keyframes, at an ``INTERVAL`` (usually ``interval`` seconds), with images halved
     some times by 2x2 blocks."""
 
-    def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
+    def __init__(
+        self, sequence: "Sequence", given: Calibration, halvings: int, count: int, reference_depth: float
+    ) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
-        self._sequence, self._halvings = sequence, halvings
+        self._sequence, self._halvings, self._reference_depth = sequence, halvings, reference_depth
         self.name, self.ground_truth = sequence.name, None
         step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
         self.interval = step * usual
@@ -262,7 +266,7 @@ class _Excerpt:
         frame = self._sequence[self._numbers[index]]
         depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.rgb
         for _ in range(self._halvings):
-            depth, _ = halve(depth, np.zeros_like(depth), HALVING_BAND)
+            depth, _ = halve(depth, np.zeros_like(depth), HALVING_BAND, self._reference_depth)
             height, width = (size // 2 for size in color.shape[:2])
             color = cv2.resize(color[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
         return replace(frame, depth=depth, color=np.asarray(color, np.uint8))

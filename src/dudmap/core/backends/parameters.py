@@ -33,10 +33,12 @@ class SensorNoise(NamedTuple):
     Attributes:
         base: Metres.
         scale: 1/m.
+        reference: Depth, metres, of the readings whose noise others are compared with.
     """
 
     base: float
     scale: float
+    reference: float = 1.0
 
 
 class TruncationBand(NamedTuple):
@@ -86,11 +88,11 @@ class RegistrationParameters(NamedTuple):
 
     Attributes:
         band: Truncation band; readings farther from the surface are outliers.
-        huber, tukey: Constants of the distance residual, metres at one metre depth; tukey = 0 selects Huber.
+        huber, tukey: Constants of the distance residual, metres at the reference depth; tukey = 0 selects Huber.
         color_weight: Weight of the squared intensity residual (0..1) against the squared distance residual (m).
         color_huber: Constant of the intensity residual.
-        sigma_at_one_metre: Of a reading, metres.
-        noise_weighting: 1 scales each distance residual by sigma(1 m) / sigma(z), 0 does not.
+        reference_sigma: Of a reading at the reference depth, metres.
+        noise_weighting: 1 scales each distance residual by sigma(reference depth) / sigma(z), 0 does not.
     """
 
     band: TruncationBand
@@ -98,7 +100,7 @@ class RegistrationParameters(NamedTuple):
     tukey: float
     color_weight: float
     color_huber: float
-    sigma_at_one_metre: float
+    reference_sigma: float
     noise_weighting: float
 
 

@@ -102,7 +102,7 @@ class DynamicDetector(Stateful):
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config
         self.sensor = sensor
-        self.memory = TemporalMemory(config)
+        self.memory = TemporalMemory(config, sensor.reference_depth)
         self.background = BackgroundModel(config)
 
     def segment(self, levels: Callable[[], Pyramid], voxel_size: float, *, now: bool) -> Callable[[], Segmentation]:

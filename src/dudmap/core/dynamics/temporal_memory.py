@@ -28,7 +28,8 @@ YOUNG_UNKNOWN_SHARE = 0.1
 SEAM = 1
 """Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
 MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
+"""Largest distance of a point from the last frame's reading of it, reference depths: 3 m/s at 30 frames per second in a
+room."""
 DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
@@ -55,6 +56,7 @@ class TemporalMemory(Stateful):
 
     Args:
         config: ``settle_time`` and ``start_seconds``.
+        reference_depth: That of the sensor, metres.
     """
 
     _last: Remembered[RememberedFrame | None] = None
@@ -64,8 +66,9 @@ class TemporalMemory(Stateful):
     _imported: Remembered[bool] = False  # the frames of the first seconds come from another pass
     _young_until: Remembered[float] = -np.inf
 
-    def __init__(self, config: DynamicsConfig) -> None:
+    def __init__(self, config: DynamicsConfig, reference_depth: float = 1.0) -> None:
         self.config = config
+        self._near = MAX_DISPLACEMENT * reference_depth
         self._settle_frames = deque()
         self._recent_frames = deque()
         self._start_frames = []
@@ -148,7 +151,7 @@ class TemporalMemory(Stateful):
         """
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, bool)
-        return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0)
+        return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0, self._near)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
@@ -237,9 +240,9 @@ def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequ
     return reproject(level.depth, level.intensity, level.camera.intrinsics, Ts, older, marks)
 
 
-def _seen_marked(found: Reprojection, n: int) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose points a marked reading of frame n shows, within ``MAX_DISPLACEMENT``."""
-    return (found.marks[n] > 0) & (np.abs(found.gap[n]) < MAX_DISPLACEMENT)
+def _seen_marked(found: Reprojection, n: int, near: float) -> NDArray[np.bool_]:
+    """Pixels (h, w) whose points a marked reading of frame n shows within a distance, metres."""
+    return (found.marks[n] > 0) & (np.abs(found.gap[n]) < near)
 
 
 SAME_INTENSITY = 0.15

@@ -90,7 +90,8 @@ def free_depth(z, near, band):
 
 @written_out
 def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
-    """Weight of a reading, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20), ``best`` for a frontal one at 1 m.
+    """Weight of a reading, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20), ``best`` for a frontal one at
+    the reference depth.
 
     Args:
         z: The reading, metres.
@@ -98,7 +99,7 @@ def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
         x, y: Coordinates of its ray at depth 1.
         fx: Focal length, pixels.
         by_rows: Focal length in rows over the rows between ``up`` and ``down``.
-        best: Weight of a frontal reading at one metre.
+        best: Weight of a frontal reading at the reference depth.
         noise: SensorNoise, whose sigma(z) is err(z).
     """
     zero, half, one = f32(0), f32(0.5), f32(1)
@@ -109,5 +110,5 @@ def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
     cosine = z / sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
     smooth = (min(min(left, right), min(up, down)) > zero) & (max(abs(gu), abs(gv)) < STEEPEST * z)
     cosine = cosine if smooth else UNKNOWN_COSINE
-    weight = best * cosine * (noise.base + noise.scale) / sigma(z, noise)
+    weight = best * cosine * (noise.base + noise.scale * (noise.reference * noise.reference)) / sigma(z, noise)
     return min(max(weight + half, one), f32(16)) if z > zero else zero

@@ -13,7 +13,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
 HALVING_BAND = 0.02
-"""Readings this far (m, and share of the depth) behind the nearest of a 2x2 block belong to the same surface."""
+"""Readings this far (share of the depth, at least of the reference depth) behind the nearest of a 2x2 block belong to
+the same surface."""
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
 WINDOW = 11
@@ -38,6 +39,7 @@ class Observation:
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
         has_color: Whether the frame has a colour image; ``rgb`` and ``intensity`` are of one grey otherwise.
         ignored: (H, W) bool, pixels that never count, which have no depth; None for none.
+        reference_depth: That of the sensor, metres.
         sources: (H, W) int32, number of the recorded pixel that each pixel shows then; None for its own.
     """
 
@@ -51,6 +53,7 @@ class Observation:
     depth_readout: float = 0.0
     has_color: bool = True
     ignored: NDArray[np.bool_] | None = None
+    reference_depth: float = 1.0
     sources: NDArray[np.int32] | None = field(default=None, repr=False, metadata=CACHE)
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False, metadata=CACHE)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(
@@ -76,7 +79,7 @@ class Observation:
         halvings = self._halvings
         while len(halvings) < times:
             depth, intensity = halvings[-1] if halvings else (self.depth, self.intensity)
-            halvings.append(halve(depth, intensity, HALVING_BAND))
+            halvings.append(halve(depth, intensity, HALVING_BAND, self.reference_depth))
         return halvings[times - 1] if times else (self.depth, self.intensity)
 
     @property

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import PreprocessConfig
+from dudmap.config import PreprocessConfig, SensorConfig
 from dudmap.core.backends.cpu.filtering import filter_depth, intensity
 from dudmap.core.backends.parameters import FilterParameters
 from dudmap.core.frames.color_registration import color_projection, register_color
@@ -17,13 +17,13 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError
 
 HOLE_NOISE = 0.01
-"""Readings around a small hole may always differ by this much, metres."""
+"""Readings around a small hole may always differ by this much, reference depths."""
 STEEPEST = 9.5
 """Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
 BORDER = 0.02
 """Share of its width by which the colour image is continued at its borders; readings beyond have no colour."""
 TYPICAL_DEPTH = 2.0
-"""Distance at which it is decided what the colour camera sees, metres."""
+"""Distance at which it is decided what the colour camera sees, reference depths."""
 DEPTH_MIN = 1e-3
 """Smallest lower limit of the depth, metres: 0 means no reading."""
 
@@ -50,13 +50,16 @@ class Preprocessor:
         config: PreprocessConfig | None = None,
         calibration: Calibration | None = None,
         ignore: NDArray[np.bool_] | None = None,
+        sensor: SensorConfig | None = None,
     ) -> None:
         self.config = config or PreprocessConfig()
+        self.reference_depth = reference_depth = (sensor or SensorConfig()).reference_depth
         self.calibration = calibration
         self.camera = replace(camera, distortion=())
         self._maps = _undistortion(camera) if any(camera.distortion) else None
         self._inverse_map = _distortion(camera) if any(camera.distortion) else None
-        self._unseen = None if calibration is None else _unseen(self.camera, calibration)
+        typical = TYPICAL_DEPTH * reference_depth
+        self._unseen = None if calibration is None else _unseen(self.camera, calibration, typical)
         self._ignored = None if ignore is None else IgnoredRegion.of(ignore, camera, calibration)
         self._ignored_depth = None if self._ignored is None else self.mask(self._ignored.depth)
         self._parameters = FilterParameters(
@@ -65,7 +68,7 @@ class Preprocessor:
             drop_mixed=self.config.drop_mixed,
             steepest=STEEPEST / camera.fx,
             fill_holes=self.config.fill_holes,
-            hole_noise=HOLE_NOISE,
+            hole_noise=HOLE_NOISE * reference_depth,
             smooth=self.config.filter == "bilateral",
             alpha=self.config.filter_alpha,
             sigma_px=self.config.filter_sigma_px,
@@ -96,9 +99,10 @@ class Preprocessor:
         has_color = frame.color is not None
         if self.calibration is not None and has_color:
             recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
+        images, reference_depth = (depth, intensity(rgb), rgb, recorded), self.reference_depth
         return Observation(
-            frame.timestamp, self.camera, depth, intensity(rgb), rgb, recorded, offset, has_color=has_color,
-            ignored=self._ignored_depth,
+            frame.timestamp, self.camera, *images, offset, has_color=has_color, ignored=self._ignored_depth,
+            reference_depth=reference_depth,
         )  # fmt: skip
 
     def _colors(
@@ -186,11 +190,12 @@ class Preprocessor:
         return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
 
 
-def _unseen(camera: Camera, calibration: Calibration) -> NDArray[np.bool_] | None:
-    """Pixels (H, W) of the depth image whose surface the colour camera does not see; None if it sees all."""
+def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray[np.bool_] | None:
+    """Pixels (H, W) of the depth image whose surface, at a ``typical`` depth (m), the colour camera does not see; None
+    if it sees all."""
     import cv2
 
-    points = camera.backproject(np.full(camera.shape, TYPICAL_DEPTH, np.float32)).reshape(-1, 3).astype(np.float64)
+    points = camera.backproject(np.full(camera.shape, typical, np.float32)).reshape(-1, 3).astype(np.float64)
     T, color = calibration.T_color_depth, calibration.camera
     pixels, _ = cv2.projectPoints(points, T[:3, :3], T[:3, 3], color.K, np.array(calibration.lens))
     beyond, size = BORDER * color.width, np.array([color.width, color.height]) - 1

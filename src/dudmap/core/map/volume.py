@@ -48,15 +48,15 @@ from dudmap.errors import MapError
 DEPTH_MIN = 0.05
 """Blocks nearer to the camera than this are not updated, metres."""
 MIN_LIMIT = 0.3
-"""Smallest limit of the distances that voxels can store, metres."""
+"""Smallest limit of the distances that voxels can store, reference depths."""
 
 
 def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
     """Parameters of a map whose readings end at ``depth_max`` metres."""
     front = config.truncation_voxels * config.voxel_size
     behind = config.truncation_behind_voxels * config.voxel_size
-    limit = max(MIN_LIMIT, front, behind)
-    noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
+    limit = max(MIN_LIMIT * sensor.reference_depth, front, behind)
+    noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale, sensor.reference_depth)
     return FusionParameters(
         band=TruncationBand(front, behind, config.truncation_noise, limit, noise),
         voxel_size=config.voxel_size,

@@ -43,7 +43,7 @@ class MovingObjects(Stateful):
     _waiting: Remembered[deque[_Frame]]
 
     def __init__(self, config: Config) -> None:
-        self.tracker = ObjectTracker(config.movers) if config.movers.enabled else None
+        self.tracker = ObjectTracker(config.movers, config.sensor.reference_depth) if config.movers.enabled else None
         self.fusion = ObjectFusion(config) if config.movers.enabled and config.movers.meshes else None
         self._waiting = deque()
         self._finding = Lock()

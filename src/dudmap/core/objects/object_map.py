@@ -12,7 +12,8 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
 EXTENT = 1.0
-"""The window of an object's map is that of a camera with readings up to this, metres: a cube of about 2.5 m."""
+"""The window of an object's map is that of a camera with readings up to this, reference depths: a cube of about 2.5 m
+in a room."""
 MIN_FRAMES = 10
 """Fewest registered frames that prove an object rigid."""
 MIN_DURATION = 0.5
@@ -20,7 +21,7 @@ MIN_DURATION = 0.5
 MAX_MISFITS = 0.3
 """Largest share of registered frames that may contradict the map of a rigid object."""
 MIN_DISPLACEMENT = 0.03
-"""Smallest displacement of a moving object, metres."""
+"""Smallest displacement of a moving object, reference depths."""
 MIN_COMPONENT = 0.05
 """Connected components of a mesh with a smaller share of the largest one's vertices than this are removed."""
 
@@ -51,7 +52,8 @@ class ObjectVolume(TsdfVolume):
     """Map of an object: its window stays around the object's origin wherever the camera is; it is not carved."""
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
-        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, extent=EXTENT)
+        extent, still = EXTENT * sensor.reference_depth, config.model_copy(update={"carving": False})
+        super().__init__(camera, still, sensor, depth_max, extent=extent)
         self._T_object_window = np.eye(4)
         self._T_object_window[2, 3] = -self._reach
 
@@ -112,7 +114,7 @@ class ObjectTrack:
             if len(misfits) >= MIN_FRAMES // 2:
                 return f"not rigid: {len(misfits)} maps were contradicted by the next frames, the last: {misfits[-1]}"
             return f"seen too short: {len(self.Ts_camera_object)} frames in {duration:.1f} s"
-        if self.max_displacement < MIN_DISPLACEMENT:
+        if self.max_displacement < MIN_DISPLACEMENT * self.volume.sensor.reference_depth:
             return f"moved by {100 * self.max_displacement:.1f} cm only"
         return ""
 

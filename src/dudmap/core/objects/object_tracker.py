@@ -28,7 +28,7 @@ from dudmap.core.state import Remembered, Stateful
 
 OUTLIER_SPEED = 0.7
 """A displacement whose velocity differs from the median of its neighbours by more than this is a change of the mask,
-m/s."""
+reference depths per second."""
 ESTABLISHED = 0.5
 """Objects that were separate for this long stay separate when they touch, seconds."""
 
@@ -106,8 +106,9 @@ class ObjectTracker(Stateful):
     _last: Remembered[InstanceFrame | None] = None
     _next_id: Remembered[int] = 1
 
-    def __init__(self, config: MoversConfig) -> None:
+    def __init__(self, config: MoversConfig, reference_depth: float = 1.0) -> None:
         self.config = config
+        self.reference_depth = reference_depth
         self._tracks = []
 
     def update(
@@ -138,7 +139,7 @@ class ObjectTracker(Stateful):
                 timestamp - track.last_seen,
                 known_displacements.get(track.id),
                 np.stack([centroid, box.mean(axis=0)]),
-                is_fully_visible(mask, level.depth),
+                is_fully_visible(mask, level.depth, self.reference_depth),
             )
             self._update_velocity(track, measurement)
             track.centroid, track.box, track.last_seen = centroid, box, timestamp
@@ -272,7 +273,8 @@ class ObjectTracker(Stateful):
         )
         if len(velocities):
             deviation = np.linalg.norm(velocities - median(velocities), axis=1)
-            estimates.append(velocities[deviation <= max(OUTLIER_SPEED, float(np.median(deviation)))].mean(axis=0))
+            largest = max(OUTLIER_SPEED * self.reference_depth, float(np.median(deviation)))
+            estimates.append(velocities[deviation <= largest].mean(axis=0))
         usable = [m for m in track.measurements if m.fully_visible] if velocities.size else track.measurements
         if len(usable) >= 2 and (measurement.fully_visible or not velocities.size):
             times = np.array([m.time for m in usable])

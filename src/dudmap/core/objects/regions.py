@@ -16,7 +16,7 @@ MAX_REGIONS = 24
 MIN_SHARE = 12 / (160 * 120)
 """Regions of a smaller share of the image are noise: 12 pixels of a label image of the default size."""
 OCCLUSION_GAP = 0.1
-"""A surface nearer than an object's border by more than this occludes a part of the object, metres."""
+"""A surface nearer than an object's border by more than this occludes a part of the object, reference depths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def trimmed_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)
 
 
-def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> bool:
+def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32], reference_depth: float = 1.0) -> bool:
     """Whether an object (h, w) is cut off neither by the image border nor by an occluding surface."""
     import cv2
 
@@ -150,5 +150,6 @@ def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> boo
     mask, depth = mask[crop], depth[crop]
     nearest = cv2.erode(np.where(mask, depth, np.float32(100)), np.ones((5, 5), np.uint8))
     ring = (nearest < 100) & ~mask
-    occluded = ring & (depth > 0) & (depth < nearest - OCCLUSION_GAP - np.float32(0.03) * depth)
+    gap = np.float32(OCCLUSION_GAP * reference_depth)
+    occluded = ring & (depth > 0) & (depth < nearest - gap - np.float32(0.03) * depth)
     return bool(np.count_nonzero(occluded) <= 0.1 * np.count_nonzero(ring))

@@ -111,6 +111,11 @@ class Atlas(Stateful):
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
+    def unit(self) -> float:
+        """The reference depth of the sensor, metres: unit of the lengths that are constants."""
+        return self.keyframes.sensor.reference_depth
+
+    @property
     def volume(self) -> TsdfVolume:
         """The map of the current submap."""
         return self.volumes[self.current]
@@ -337,7 +342,7 @@ class Atlas(Stateful):
         else:
             nodes = np.array(self.kept_nodes(target))
             Ts = np.array([self.history.frames[n].T_world_camera for n in nodes])
-            near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE)].tolist()
+            near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, MAX_IMMEDIATE, self.unit)].tolist()
             provisional = self.make_volume()
             self.history.reintegrate(provisional, near)
             self.volumes[target].take_over(provisional)

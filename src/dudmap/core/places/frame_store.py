@@ -20,7 +20,8 @@ from dudmap.core.scratch_store import ScratchStore
 from dudmap.core.state import Remembered, Stateful
 
 DEPTH_UNIT = 0.0005
-"""Step of the stored depth, metres. The quantisation error, 0.29 steps rms, is 0.14 mm: a seventh of ``sigma_base``."""
+"""Step of the stored depth, reference depths. The quantisation error, 0.29 steps rms, is 0.14 mm in a room: a seventh
+of ``sigma_base``."""
 JPEG_QUALITY = 95
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` waits for it."""
@@ -92,9 +93,11 @@ class FrameStore(Stateful):
         angle_deg: float = 5.0,
         gap: int = 15,
         registered: Callable[[Frame], Frame] | None = None,
+        depth_unit: float = DEPTH_UNIT,
     ) -> None:
         self.camera = camera
         self.registered = registered
+        self.depth_unit = depth_unit
         self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
         self.frames = []
         self.archived: Callable[[int], EncodedFrame] | None = None
@@ -109,7 +112,8 @@ class FrameStore(Stateful):
         loops = config.loops
         if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
             return None
-        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
+        unit = DEPTH_UNIT * config.sensor.reference_depth
+        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap, depth_unit=unit)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -139,7 +143,7 @@ class FrameStore(Stateful):
             weakref.finalize(self, self._encoder.shutdown, wait=False)
         cells = _fused_cells(frame, static)
         self.frames.append(KeptFrame(frame.timestamp, T_world_camera.copy(), submap, cells, frame.color_timestamp))
-        self._pending.append((len(self) - 1, self._encoder.submit(_encoded, frame, static, exposure)))
+        self._pending.append((len(self) - 1, self._encoder.submit(_encoded, frame, static, exposure, self.depth_unit)))
         self._write(MAX_PENDING)
         return True
 
@@ -183,7 +187,7 @@ class FrameStore(Stateful):
         )
         steps = rvl.decompressed(depth_file)
         assert steps is not None
-        depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
+        depth = steps.astype(np.float32) * np.float32(self.depth_unit)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         kept = self.frames[number]
         frame = Frame(kept.timestamp, depth, rgb, kept.color_timestamp)
@@ -238,12 +242,12 @@ def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
     return int(cells.ravel() @ (1 << np.arange(cells.size)))
 
 
-def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:
-    """Depth in 16-bit steps, exposed colour as JPEG, static mask as 1-bit PNG."""
+def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float], depth_unit: float) -> EncodedFrame:
+    """Depth in 16-bit steps of ``depth_unit`` metres, exposed colour as JPEG, static mask as 1-bit PNG."""
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
-    steps = np.minimum(frame.depth * np.float32(1 / DEPTH_UNIT) + np.float32(0.5), 65535).astype(np.uint16)
+    steps = np.minimum(frame.depth * np.float32(1 / depth_unit) + np.float32(0.5), 65535).astype(np.uint16)
     bgr = cv2.cvtColor(exposed_color(frame.rgb, exposure), cv2.COLOR_RGB2BGR)
     color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]

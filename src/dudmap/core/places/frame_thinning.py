@@ -16,7 +16,8 @@ from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE
 from dudmap.core.state import Remembered, Stateful
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
-"""Views within this distance (m) and angle (deg) of each other show the same: half of what separates keyframes."""
+"""Views within this distance (reference depths) and angle (deg) of each other show the same: half of what
+separates keyframes."""
 MIN_KEPT = 256
 """Kept frames of which none are removed: 50 MB at 640x480. Recordings of some minutes give fewer."""
 
@@ -49,27 +50,29 @@ class FrameThinning(Stateful):
             return
         nodes = self.atlas.kept_nodes(self.atlas.current)
         Ts = np.array([history.frames[n].T_world_camera for n in nodes])
-        for i in 1 + np.flatnonzero(_same_view(Ts[1:-1], Ts[-1])):  # the first one fixes the world; the oldest first
+        # the first one fixes the world; the oldest first
+        for i in 1 + np.flatnonzero(_same_view(Ts[1:-1], Ts[-1], self.atlas.unit)):
             if spare > 0 and self._is_replaced(history, nodes, Ts, int(i)):
                 history.remove_images(nodes[i])
                 spare -= 1
 
     def _is_replaced(self, history: FrameStore, nodes: list[int], Ts: NDArray[np.float64], i: int) -> bool:
         """Whether newer frames show what frame ``nodes[i]`` does; ``Ts`` (n, 4, 4) are the poses of the ``nodes``."""
-        newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i]))
+        newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i], self.atlas.unit))
         cells = np.array([history.frames[nodes[j]].cells for j in (i, *newer)], np.int64)
         fused = (cells[:, None] >> np.arange(np.prod(CELLS))) & 1
         readings = np.array([history.frames[nodes[j]].count for j in newer], np.int64) @ fused[1:]
         if np.any(readings[fused[0] > 0] < self._enough):
             return False
         first = history.frames[nodes[i]].timestamp
-        nearby = self.atlas.keyframes.near(Ts[i], self.atlas.current, 2 * LOCAL_DISTANCE, 2 * LOCAL_ANGLE_DEG)
+        reach = 2 * LOCAL_DISTANCE * self.atlas.unit
+        nearby = self.atlas.keyframes.near(Ts[i], self.atlas.current, reach, 2 * LOCAL_ANGLE_DEG)
         until = min((keyframe.last_seen for keyframe in nearby if keyframe.last_seen >= first), default=np.inf)
         return sum(history.frames[nodes[j]].timestamp <= until for j in newer) >= LOCAL_FRAMES
 
 
-def _same_view(Ts: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _same_view(Ts: NDArray[np.float64], T: NDArray[np.float64], unit: float) -> NDArray[np.bool_]:
     """Which poses (n, 4, 4) have the view of a pose (4, 4)."""
     relative = se3.inverse(T) @ Ts
-    near = np.linalg.norm(relative[:, :3, 3], axis=1) < SAME_DISTANCE
+    near = np.linalg.norm(relative[:, :3, 3], axis=1) < SAME_DISTANCE * unit
     return near & (se3.rotation_angles(relative) < np.radians(SAME_ANGLE_DEG))

@@ -20,11 +20,11 @@ from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 
 NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
-"""A keyframe within this distance (m) and angle (deg) of the camera counts as seen."""
+"""A keyframe within this distance (reference depths) and angle (deg) of the camera counts as seen."""
 CHECK_INTERVAL = 5
 """Frames between two checks for keyframes nearby, and from the start of a search to its evaluation."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.03, 1.0
-"""Two frames confirm each other if their corrections differ by less than this, metres and degrees."""
+"""Two frames confirm each other if their corrections differ by less than this, reference depths and degrees."""
 MAX_VERIFIED = 2
 """Matches of one frame that are verified by registration at most."""
 MAX_BACKOFF = 4
@@ -97,7 +97,7 @@ class LoopCloser(Stateful):
         if not new_keyframe and self._frame % CHECK_INTERVAL:
             return None
         now, T = query.observation.timestamp, query.tracking.T_world_camera
-        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
+        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE * self.atlas.unit, NEAR_ANGLE_DEG)
         returned = any(self._is_old(keyframe, now) for keyframe in near)
         candidates = [keyframe for keyframe in keyframes if self._is_candidate(keyframe, now)]
         wanted = new_keyframe or returned or self._pending is not None or len(self.atlas.volumes) > 1
@@ -159,7 +159,7 @@ class LoopCloser(Stateful):
             confirmed = (
                 pending is not None
                 and pending[0] == submap
-                and agree(pending[1] @ T, T_found, SAME_DISTANCE, SAME_ANGLE_DEG)
+                and agree(pending[1] @ T, T_found, SAME_DISTANCE * self.atlas.unit, SAME_ANGLE_DEG)
             )
             if not confirmed:
                 self._pending = submap, T_found @ se3.inverse(T)
@@ -183,7 +183,7 @@ class LoopCloser(Stateful):
         edge = self.corrector.measured_edge(place.keyframe, T, T)
         if edge is not None:
             self.corrector.edges.append(edge)
-        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
+        near = self.atlas.keyframes.near(T, self.atlas.current, NEAR_DISTANCE * self.atlas.unit, NEAR_ANGLE_DEG)
         _mark_seen(near, query.observation.timestamp)
 
     def _correct(self, place: PlaceMatch, query: LoopQuery, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:

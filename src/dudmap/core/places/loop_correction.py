@@ -13,14 +13,14 @@ from dudmap.core.places.pose_graph import Edge, optimize
 from dudmap.core.state import Remembered, Stateful
 
 TRUNCATED_DISTANCE = 0.05
-"""Distances to the map are truncated at this value in that comparison, metres."""
+"""Distances to the map are truncated at this value in that comparison, reference depths."""
 ODOMETRY_NOISE = 0.002, 0.02
-"""Standard deviation of a tracked motion: metres (or radians), and per metre of its path."""
+"""Standard deviation of a tracked motion: reference depths (or radians), and per reference depth of its path."""
 LOOP_NOISE = 0.005, 0.003
-"""Standard deviation of a motion measured at a loop closure: metres and radians."""
+"""Standard deviation of a motion measured at a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
 """A correction is rejected if the frames of the new pass fit the map of the old one worse than this ratio times the
-misfit to a map of their own, plus an offset: for distances the noise of the measured motion, metres; for intensities in
+misfit to a map of their own, plus an offset: for distances the noise of the measured motion; for intensities in
 units of the range 0..1.
 
 The right correction of a walk of 300 m round a corridor gives 1.1 times that misfit; motions that were made wrong
@@ -56,7 +56,7 @@ class LoopCorrector(Stateful):
             return None
         T_camera_new = se3.inverse(T_tracked) @ history.frames[new].T_world_camera
         T_old_new = se3.inverse(history.frames[old].T_world_camera) @ T_measured @ T_camera_new
-        return Edge(old, new, T_old_new, *LOOP_NOISE)
+        return Edge(old, new, T_old_new, LOOP_NOISE[0] * self.atlas.unit, LOOP_NOISE[1])
 
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
@@ -70,7 +70,7 @@ class LoopCorrector(Stateful):
         nodes = self.atlas.nodes(self.atlas.current)
         index = {n: i for i, n in enumerate(nodes)}
         Ts = np.stack([history.frames[n].T_world_camera for n in nodes])
-        edges = _odometry_edges(Ts)
+        edges = _odometry_edges(Ts, self.atlas.unit)
         for edge in (*self.edges, loop):
             if edge.a in index and edge.b in index:
                 edges.append(Edge(index[edge.a], index[edge.b], edge.T_a_b, edge.sigma_distance, edge.sigma_angle))
@@ -78,11 +78,11 @@ class LoopCorrector(Stateful):
         if not np.all(np.isfinite(Ts_new)):
             return None
         kept = np.flatnonzero([history.frames[n].count for n in nodes])
-        old, new = _passes(Ts_new, kept, index[loop.a], index[loop.b])
+        old, new = _passes(Ts_new, kept, index[loop.a], index[loop.b], self.atlas.unit)
         self.atlas.make_room()
         before = self._misfit(self._map_of(nodes, Ts, new), nodes, Ts, new)
         volume = self._map_of(nodes, Ts_new, old)
-        if _is_worse(self._misfit(volume, nodes, Ts_new, new), before):
+        if _is_worse(self._misfit(volume, nodes, Ts_new, new), before, self.atlas.unit):
             return None
         history.reintegrate(volume, [nodes[i] for i in new], list(Ts_new[new]))
         self.edges.append(loop)
@@ -106,7 +106,7 @@ class LoopCorrector(Stateful):
         history = self.atlas.history
         assert history is not None
         camera = self.atlas.keyframes.camera.scaled(2)
-        distances, differences = [], []
+        distances, differences, largest = [], [], TRUNCATED_DISTANCE * self.atlas.unit
         for i in chosen:
             stored, T = history[nodes[i]], Ts[i]
             depth = np.where(stored.static, stored.frame.depth, np.float32(0))[1::4, 1::4]
@@ -117,7 +117,7 @@ class LoopCorrector(Stateful):
             sample = volume.sample(np.ascontiguousarray(depth), np.asarray(intensity), camera, T)
             gain, offset = fit_exposure(intensity, sample.difference, np.ones_like(intensity))
             difference = sample.difference + (1 - gain) * intensity - offset
-            distances.append(np.minimum(np.abs(sample.distance[np.isfinite(sample.distance)]), TRUNCATED_DISTANCE))
+            distances.append(np.minimum(np.abs(sample.distance[np.isfinite(sample.distance)]), largest))
             differences.append(np.abs(difference[np.isfinite(difference)]))
         return _mean(distances), _mean(differences)
 
@@ -127,34 +127,38 @@ def _mean(parts: list[NDArray[np.float32]]) -> float:
     return float(values.mean()) if len(values) else np.inf
 
 
-def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
+def _is_worse(after: tuple[float, float], before: tuple[float, float], unit: float) -> bool:
     """Whether frames fit a map clearly worse than their own, in distance or intensity."""
-    return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, MAX_OFFSETS, strict=True))
+    offsets = MAX_OFFSETS[0] * unit, MAX_OFFSETS[1]
+    return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, offsets, strict=True))
 
 
-def _passes(Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int) -> tuple[list[int], list[int]]:
+def _passes(
+    Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int, unit: float
+) -> tuple[list[int], list[int]]:
     """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, where a loop from ``a``
     closes: of the old pass, which ends where the path is farthest from there, and of the new one, about as many."""
-    farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
+    farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b], unit))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
-    new = after[nearest_views(Ts[after], Ts[b], max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before)))]
-    old = before[nearest_views(Ts[before], Ts[b], MAX_IMMEDIATE - len(new))]
+    wanted = max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before))
+    new = after[nearest_views(Ts[after], Ts[b], wanted, unit)]
+    old = before[nearest_views(Ts[before], Ts[b], MAX_IMMEDIATE - len(new), unit)]
     return old.tolist(), new.tolist()
 
 
-def _odometry_edges(Ts: NDArray[np.float64]) -> list[Edge]:
+def _odometry_edges(Ts: NDArray[np.float64], unit: float) -> list[Edge]:
     """Tracked motion from each stored frame (n, 4, 4) to the next; its standard deviations, metres and radians, grow
     with its length."""
     motions = se3.inverse(Ts[:-1]) @ Ts[1:]
-    sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions)).tolist()
-    return [Edge(i, i + 1, T, sigma, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]
+    sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions, unit)).tolist()
+    return [Edge(i, i + 1, T, sigma * unit, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]
 
 
-def step_lengths(Ts: NDArray[np.float64]) -> NDArray[np.float64]:
+def step_lengths(Ts: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
     """Lengths (n - 1,) of the steps along a path (n, 4, 4), as of ``lengths``."""
-    return lengths(se3.inverse(Ts[:-1]) @ Ts[1:])
+    return lengths(se3.inverse(Ts[:-1]) @ Ts[1:], unit)
 
 
-def lengths(motions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths (n,) of motions (n, 4, 4), metres; a turn by one radian counts as one metre."""
-    return np.linalg.norm(motions[:, :3, 3], axis=1) + se3.rotation_angles(motions)
+def lengths(motions: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
+    """Lengths (n,) of motions (n, 4, 4) in units of so many metres; a turn by one radian counts as one unit."""
+    return np.linalg.norm(motions[:, :3, 3], axis=1) / unit + se3.rotation_angles(motions)

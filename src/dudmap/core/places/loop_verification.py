@@ -26,9 +26,9 @@ from dudmap.core.tracking.tracker import Tracker, TrackingResult
 LOCAL_FRAMES = 8
 """Stored frames, those nearest to the recognised pose, of which the local map of a place is built."""
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
-"""Largest distance (m) and angle (deg) of these frames from the recognised pose."""
+"""Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
 DRIFT_ALLOWANCE = 0.05
-"""Drift that is believed after any path, metres and radians."""
+"""Drift that is believed after any path, reference depths and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,11 @@ class LoopVerifier:
         """Whether the path since a place of the current submap was last seen is long enough for the drift that the
         match implies, given the tracked pose (4, 4) of the frame."""
         since = [pose.T_world_camera for pose in self._poses_since(place)]
-        path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
+        unit = self.atlas.unit
+        path = step_lengths(np.reshape(since[::3], (-1, 4, 4)), unit).sum()  # every third: less jitter
         limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
-        return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
+        return bool(np.linalg.norm(drift[:3, 3]) < limit * unit) and se3.rotation_angle(drift) < limit
 
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place (or in the
@@ -96,7 +97,9 @@ class LoopVerifier:
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked
         since = list(self._poses_since(place))
-        distances = view_distances(np.reshape([pose.T_world_camera for pose in since], (-1, 4, 4)), T_corrected)
+        distances = view_distances(
+            np.reshape([pose.T_world_camera for pose in since], (-1, 4, 4)), T_corrected, self.atlas.unit
+        )
         older_pass = replace(place.keyframe, last_seen=since[int(np.argmax(distances))].timestamp)
         local = self._local_map(PlaceMatch(older_pass, T_corrected, place.num_inliers))
         return local is None or _misfit(local, newest, T_corrected) < _misfit(local, newest, T_tracked)
@@ -113,11 +116,12 @@ class LoopVerifier:
         assert history is not None
         if keyframe.submap == self.atlas.saved:
             return self.atlas.volumes[keyframe.submap]
+        nearby = LOCAL_DISTANCE * self.atlas.unit
         nodes = [
             n
             for n in self.atlas.kept_nodes(keyframe.submap)
             if history.frames[n].timestamp <= keyframe.last_seen
-            and agree(history.frames[n].T_world_camera, place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+            and agree(history.frames[n].T_world_camera, place.T_world_camera, nearby, LOCAL_ANGLE_DEG)
         ]
         T_camera_world = se3.inverse(place.T_world_camera)
         distances = [np.linalg.norm((T_camera_world @ history.frames[n].T_world_camera)[:3, 3]) for n in nodes]
@@ -135,5 +139,6 @@ def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.flo
     weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
     volume.look_at(T_world_camera)
     sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-    distances = np.minimum(np.nan_to_num(np.abs(sample.distance), nan=TRUNCATED_DISTANCE), TRUNCATED_DISTANCE)
+    largest = TRUNCATED_DISTANCE * volume.sensor.reference_depth
+    distances = np.minimum(np.nan_to_num(np.abs(sample.distance), nan=largest), largest)
     return float(np.average(distances, weights=np.where(level.depth > 0, weights, 0)))

@@ -23,12 +23,12 @@ one is stored with a frame, so that the rebuilding ends."""
 MAX_ADDED = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
-"""Depth of the point by which views are compared, metres: the middle of what a camera sees indoors."""
+"""Depth of the point by which views are compared, reference depths: the middle of what a camera sees indoors."""
 NEAR = 3.0
-"""Largest distance, metres, between the point that a stored frame looks at and that of the view for the frame to be
-added to the provisional map: what others see is out of view, or is added as the camera goes there."""
+"""Largest distance, reference depths, between the point that a stored frame looks at and that of the view for the frame
+to be added to the provisional map: what others see is out of view, or is added as the camera goes there."""
 SPACING = 0.3
-"""Smallest distance, metres, between the points that two added frames look at: nearer ones see the same."""
+"""Smallest distance, reference depths, between the points that two added frames look at: nearer ones see the same."""
 
 
 @dataclass(eq=False)
@@ -78,32 +78,37 @@ class MapRebuilding:
         many."""
         unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self.start and n not in self.shown])
         unknown = unknown.astype(int)
-        points = _looked_at(np.reshape([self.history.frames[n].T_world_camera for n in unknown], (-1, 4, 4)))
-        here = _looked_at(T_world_camera)
+        unit = self.volume.sensor.reference_depth
+        points = _looked_at(np.reshape([self.history.frames[n].T_world_camera for n in unknown], (-1, 4, 4)), unit)
+        here = _looked_at(T_world_camera, unit)
         added: list[int] = []
         while len(unknown) and len(added) < count:
             distances = np.linalg.norm(points - here, axis=1)
             nearest = int(np.argmin(distances))
-            if distances[nearest] > NEAR:
+            if distances[nearest] > NEAR * unit:
                 break
             added.append(int(unknown[nearest]))
-            same = np.linalg.norm(points - points[nearest], axis=1) < SPACING
+            same = np.linalg.norm(points - points[nearest], axis=1) < SPACING * unit
             self.shown.update(unknown[same].tolist())
             unknown, points = unknown[~same], points[~same]
         self.history.reintegrate(provisional, sorted(added))
         return len(added)
 
 
-def nearest_views(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+def nearest_views(
+    Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], count: int, unit: float = 1.0
+) -> NDArray[np.int64]:
     """Numbers, in order, of the poses (n, 4, 4), at most ``count``, whose view is nearest to that of a camera."""
-    return np.sort(np.argsort(view_distances(Ts, T_world_camera), kind="stable")[:count])
+    return np.sort(np.argsort(view_distances(Ts, T_world_camera, unit), kind="stable")[:count])
 
 
-def view_distances(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,) of what poses (n, 4, 4) look at from what a camera looks at, metres."""
-    return np.linalg.norm(_looked_at(Ts) - _looked_at(T_world_camera), axis=-1)
+def view_distances(
+    Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], unit: float = 1.0
+) -> NDArray[np.float64]:
+    """Distances (n,) of what poses (n, 4, 4) look at from what a camera looks at, metres; ``unit``: reference depth."""
+    return np.linalg.norm(_looked_at(Ts, unit) - _looked_at(T_world_camera, unit), axis=-1)
 
 
-def _looked_at(Ts_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+def _looked_at(Ts_world_camera: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
     """Points (..., 3) on the optical axes at ``VIEW_DEPTH``."""
-    return Ts_world_camera[..., :3, 3] + VIEW_DEPTH * Ts_world_camera[..., :3, 2]
+    return Ts_world_camera[..., :3, 3] + VIEW_DEPTH * unit * Ts_world_camera[..., :3, 2]

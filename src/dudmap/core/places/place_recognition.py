@@ -32,7 +32,7 @@ POSITION_ERROR = 0.01
 That are 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
 """
 DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
-"""Matches in one submap with poses nearer to each other than this (m, deg) are duplicates."""
+"""Matches in one submap with poses nearer to each other than this (reference depths, deg) are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,11 +209,11 @@ class KeyframeDatabase(Stateful):
             if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
                 found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
         found.sort(key=lambda match: -match.num_inliers)
-        distinct: list[PlaceMatch] = []
+        distinct, nearby = list[PlaceMatch](), DUPLICATE_DISTANCE * self.sensor.reference_depth
         for match in found:
             if not any(
                 match.keyframe.submap == other.keyframe.submap
-                and agree(match.T_world_camera, other.T_world_camera, DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG)
+                and agree(match.T_world_camera, other.T_world_camera, nearby, DUPLICATE_ANGLE_DEG)
                 for other in distinct
             ):
                 distinct.append(match)

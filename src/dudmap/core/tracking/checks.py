@@ -69,7 +69,7 @@ class Limits:
     @cached_property
     def sigma_mm(self) -> float:
         """Standard deviation of a reading at 1 m, millimetres."""
-        return 1000 * self.sensor.sigma(1.0)
+        return 1000 * self.sensor.reference_sigma
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ UNCHANGED_SHARE = 0.02
 """Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
 on at the finest level alone."""
 SAME_POSE = 0.01, 0.25
-"""Initial poses nearer to each other than this (m, deg) lead to the same registration."""
+"""Initial poses nearer to each other than this (reference depths, deg) lead to the same registration."""
 
 
 class FrontEnd(Stateful):
@@ -78,7 +78,8 @@ class FrontEnd(Stateful):
             return self._at_given(volume, view, prediction)
         estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
         tracking = estimate.tracking
-        arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
+        same_pose = SAME_POSE[0] * self.config.sensor.reference_depth, SAME_POSE[1]
+        arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *same_pose)
         if arrived and not self.monitor.is_unusual(tracking):
             return estimate
         T_image, motion = prediction.image_pose(), prediction.image_motion()
@@ -86,7 +87,7 @@ class FrontEnd(Stateful):
             return estimate
         moving = motion.moving_after if prediction.moving is None else prediction.moving | motion.moving_after
         unseen = moving if estimate.labels is None else moving & ~estimate.labels.dynamic
-        same = agree(T_image, tracking.T_world_camera, *SAME_POSE)
+        same = agree(T_image, tracking.T_world_camera, *same_pose)
         if same and not exceeds_noise_share(unseen, view.labelled):
             return estimate
         other = self.register_from(volume, view, replace(prediction, moving=moving), T_image)

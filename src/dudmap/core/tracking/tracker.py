@@ -125,7 +125,7 @@ class Tracker:
         self.config = config
         self.sensor = sensor
         self.filter_px = filter_px
-        self._sigma = sensor.sigma(1.0)
+        self._sigma = sensor.reference_sigma
 
     def align(
         self,
@@ -323,7 +323,7 @@ class Tracker:
             tukey=config.tukey if config.robust == "tukey" else 0.0,
             color_weight=config.color_weight if color_weight is None else color_weight,
             color_huber=config.color_huber,
-            sigma_at_one_metre=self._sigma,
+            reference_sigma=self._sigma,
             noise_weighting=float(config.noise_weighting),
         )
 
@@ -358,7 +358,7 @@ class Tracker:
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
         computes with ``noise_weighting``."""
-        noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale)
+        noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale, self.sensor.reference_depth)
         everywhere = TruncationBand(np.inf, np.inf, 0.0, np.inf, noise)  # other residuals are NaN
         parameters = self.parameters(everywhere)._replace(noise_weighting=1.0)
         squares = residual_weights(level.depth, system.residuals, weights, parameters)[2]

@@ -266,13 +266,13 @@ def halve_intensity(row_start, row_stop, image, out):
 
 
 @written_out
-def foreground_mean(a, b, c, d, band):
-    """Mean of those of four readings that lie within ``max(band, band z)`` behind the nearest z; 0 without any."""
+def foreground_mean(a, b, c, d, band, least):
+    """Mean of those of four readings that lie within ``band max(least, z)`` behind the nearest z; 0 without any."""
     zero, one, far = f32(0), f32(1), f32(1e9)
     a, b = a if a > zero else far, b if b > zero else far
     c, d = c if c > zero else far, d if d > zero else far
     near = min(min(a, b), min(c, d))
-    limit = near + band * max(one, near)
+    limit = near + band * max(least, near)
     wa, wb = one if a <= limit else zero, one if b <= limit else zero
     wc, wd = one if c <= limit else zero, one if d <= limit else zero
     mean = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
@@ -280,8 +280,8 @@ def foreground_mean(a, b, c, d, band):
 
 
 @kernel
-def halve_depth(row_start, row_stop, depth, band, out):
-    """Mean of the readings of each 2x2 block that lie within ``max(band, band z)`` behind its nearest reading z.
+def halve_depth(row_start, row_stop, depth, band, least, out):
+    """Mean of the readings of each 2x2 block that lie within ``band max(least, z)`` behind its nearest reading z.
 
     Foreground and background are never mixed; a block without a reading gives 0.
     """
@@ -290,7 +290,7 @@ def halve_depth(row_start, row_stop, depth, band, out):
         for u in range(target.size):
             k = np.uintp(2 * u)
             j = np.uintp(2 * u + 1)
-            target[u] = foreground_mean(upper[k], upper[j], lower[k], lower[j], band)
+            target[u] = foreground_mean(upper[k], upper[j], lower[k], lower[j], band, least)
 
 
 def filter_depth(depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
@@ -325,11 +325,11 @@ def intensity(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def halve(
-    depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
+    depth: NDArray[np.float32], intensity: NDArray[np.float32], band: float, least: float = 1.0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
-    ``max(tolerance, tolerance z)`` behind the nearest one z."""
+    ``band max(least, z)`` behind the nearest one z."""
     small_depth, small_intensity = np.empty((2, depth.shape[0] // 2, depth.shape[1] // 2), dtype=np.float32)
-    halve_depth(0, len(small_depth), depth, np.float32(tolerance), small_depth)
+    halve_depth(0, len(small_depth), depth, np.float32(band), np.float32(least), small_depth)
     halve_intensity(0, len(small_intensity), intensity, small_intensity)
     return small_depth, small_intensity

@@ -19,7 +19,8 @@ BANDS = 16
 MAX_FOUND = 1 << 16
 """Most cells that one band may find."""
 FRONTAL_WEIGHT = np.float32(4)
-"""Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
+"""Weight of a frontal reading at the reference depth, weighted by angle and noise: four steps down to the least
+weight 1."""
 LEAST_DEPTH = 0.05
 """Least depth of the farthest reading for the step between pixels, metres."""
 
@@ -27,7 +28,8 @@ LEAST_DEPTH = 0.05
 def reading_weights(
     depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise
 ) -> NDArray[np.uint8]:
-    """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` for a frontal one at 1 m."""
+    """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` for a frontal one at the
+    reference depth."""
     weights = np.ones(depth.shape, dtype=np.uint8)
     observation_weights(0, len(depth), depth, intrinsics, single(noise), FRONTAL_WEIGHT, weights)
     return weights

@@ -175,14 +175,15 @@ def integrate_blocks(
 
 @scalar
 def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out):
-    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal one at 1 m gets ``best``.
+    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal one at the reference depth gets
+    ``best``.
 
     Args:
         row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
         intrinsics: (4,) float32.
         noise: SensorNoise, whose sigma(z) is err(z).
-        best: Weight of a frontal reading at one metre.
+        best: Weight of a frontal reading at the reference depth.
         out: (H, W) uint8 out, at least 1 where there is a reading.
     """
     wide_vectors()
