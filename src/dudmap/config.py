@@ -391,14 +391,13 @@ class Config(ConfigSection):
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], size: float = 1.0) -> "Config":
         """Configuration of nested dictionaries; parameters they do not set keep their defaults for a scene of a
-        ``size``, in rooms. The thesis' system has rooms only.
+        ``size``, in rooms.
 
         Raises:
             ConfigError: A key is unknown or a value invalid.
         """
         tree = _without_preset(tree)
         _check_keys(tree)
-        size = 1.0 if tree.get("system") == "thesis" else size
         try:
             return cls.model_validate(_merged(scaled(cls().model_dump(), size), tree))
         except ValidationError as error:
@@ -445,6 +444,12 @@ class Config(ConfigSection):
                 raise ConfigError(
                     f"the system {self.system} has no parameter {key}; leave it out, or choose --system {other}"
                 )
+
+    @property
+    def range_text(self) -> str:
+        """Sentence part on voxels and depth range."""
+        least, largest = self.preprocess.depth_min, self.preprocess.depth_max
+        return f"voxels of {1000 * self.volume.voxel_size:g} mm, depth from {least:g} to {largest:g} m"
 
     def to_toml(self) -> str:
         """TOML text of all values."""

@@ -13,6 +13,8 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
+from dudmap.errors import DudmapError
+
 _HAS_RELATIVE_NAMES = os.name == "posix"
 NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
@@ -90,6 +92,17 @@ class OwnFolder:
 
     def _place(self, name: str) -> str | Path:
         return self.path / name if self._at is None else name
+
+
+def check_outside(path: Path, recording: object, option: str = "--out") -> None:
+    """Check that what is to be written lies outside of a recording, whose ``path`` is its folder or file.
+
+    Raises:
+        DudmapError: It lies in it, by whatever links.
+    """
+    place = getattr(recording, "path", None)
+    if place is not None and path.resolve().is_relative_to(place.resolve()):
+        raise DudmapError(f"{path} lies in the recording {place}, which is only read; name a place outside ({option})")
 
 
 def make_folder(path: Path) -> None:

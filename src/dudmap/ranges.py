@@ -5,18 +5,23 @@ same residuals, labels and decisions if every length is multiplied by s. So the 
 s sigma_base + (sigma_scale / s) z^2.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
 
 RANGES = {"near": 0.2, "room": 1.0, "far": 2.5}
 """Size of the scene, in rooms. near: voxels of 2 mm, readings from 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
 SMALLEST, LARGEST = 0.2, 5.0
 """Bounds of the size: voxels of 2 mm and of 5 cm."""
-VOXELS = 500
-"""Voxels from the camera to the median reading: the default of 1 cm at 5 m."""
-MEDIANS = 0.4, 5.0
-"""Medians of the readings, metres, that are a room's: nearer, more than half of them may lie before its range; farther,
-voxels larger than those of a room suffice."""
+MEDIAN, FARTHEST = 5.0, 6.0
+"""Median and 98 % quantile of the readings, metres, that the voxels of a room suffice for: 500 and 600 of
+them."""
+NEAREST_MEDIAN = 0.3
+"""Median, metres, below which readings are nearer than in a room: many lie before its range, which begins at 0.2 m."""
+FEW = 0.2
+"""Share of the pixels with a reading below which readings choose no range."""
 
 POWERS = {
     "sensor": {"reference_depth": 1, "sigma_base": 1, "sigma_scale": -1},
@@ -48,12 +53,23 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
     return out
 
 
-def size_of(median: float) -> float:
-    """Size of a scene, in rooms, whose readings have this median, metres."""
-    if MEDIANS[0] <= median <= MEDIANS[1]:
+def size_of(frames: "Iterable[Frame]") -> float:
+    """Size of the scene that some frames show, in rooms: 1 unless their readings are nearer or farther than in a room.
+
+    The voxel size is then 1/500 of the median depth, or 1/600 of the 98 % quantile if that is farther, from 2 mm to
+    5 cm.
+    """
+    import numpy as np
+
+    images = [frame.depth for frame in frames]
+    readings = np.concatenate([image[image > 0] for image in images]) if images else np.zeros(0)
+    if len(readings) <= FEW * sum(image.size for image in images):
         return 1.0
-    default = 0.01  # the voxel size of a room
-    return _rounded(min(max(median / VOXELS / default, SMALLEST), LARGEST))
+    median, farthest = np.percentile(readings, (50, 98)).tolist()
+    if NEAREST_MEDIAN <= median <= MEDIAN:
+        return 1.0
+    wanted = median / MEDIAN if median < MEDIAN else max(median / MEDIAN, farthest / FARTHEST)
+    return float(f"{min(max(wanted, SMALLEST), LARGEST):.2g}")
 
 
 def _rounded(value: float) -> float:

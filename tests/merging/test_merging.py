@@ -21,7 +21,7 @@ from dudmap.errors import DudmapError, MapError
 from dudmap.fleet import map_merging
 from dudmap.fleet.agreement import agreement
 from dudmap.fleet.map_fusion import BlockSums, block_sums, fuse_maps, fused
-from dudmap.fleet.map_merging import Hypothesis, compare_maps
+from dudmap.fleet.map_merging import Hypothesis, MapSurface, compare_maps, decided
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, surface_points
 from dudmap.fleet.merge import merge_runs
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
@@ -237,6 +237,15 @@ def test_among_many_maps_one_other_picture_makes_a_place_another_one():
     assert 0.1 < found.other_color < 0.36  # 0.16 m2, in whole cells of 25 cm
     assert found.rejection_reason() == ""
     assert "m2 have another colour" in found.rejection_reason(many=True)
+
+
+def test_a_map_without_a_surface_is_left_out():
+    (wall, of_wall), nothing = striped_wall(False), TsdfVolume(SMALL, VolumeConfig(voxel_size=0.04))
+    empty = MapSurface(nothing, surface_points(nothing, np.zeros((1, 3)), 100))
+    pair = decided(MapSurface(wall, of_wall), empty, [Hypothesis(np.eye(4), 3, 100)])
+    assert pair.T_a_b is None
+    assert pair.reason == "the second has no surface, its mesh is empty; leave that run out"
+    assert pair.agreement is None
 
 
 def run_folder(folder, found, times):

@@ -2,7 +2,8 @@
 
 Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` with commands of its own
 there, which is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
-sentence. Exit codes: 1 for an error, 2 for wrong usage, 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
+sentence. Exit codes: 1 for an error, 2 for wrong usage, 3 for a run that is of no use, 130 for Ctrl-C, 143 for SIGTERM,
+129 for SIGHUP.
 """
 
 import ctypes
@@ -55,6 +56,9 @@ def application_of(name: str) -> typer.Typer:
     application.command()(grouped(getattr(module, name)))
     return application
 
+
+USELESS = 3
+"""Exit code of a run that is complete and of no use."""
 
 _USAGE: type[Exception] = typer.BadParameter.__mro__[2]
 """Base of the errors of wrong usage: ClickException, of click or of Typer itself."""

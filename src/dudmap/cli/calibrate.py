@@ -7,6 +7,7 @@ from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
+from dudmap.own_folder import check_outside
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -33,17 +34,19 @@ def calibrate(
     the images do not prove stays as the files give it.
     """
     from dudmap.app.pipeline.calibration import calibrate_sequence, known_calibration
+    from dudmap.app.pipeline.inspection import sample
     from dudmap.app.terminal import counted, plain_console
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.sequences.images import read_ignored
 
     recording, notices = reading.open(sequence), list[str]()
+    if out is not None:
+        check_outside(out, recording)
+    config = parameters.read(seen=[frame for _, frame in sample(recording)[0]])
     given = known_calibration(recording, notices.append) if calibration is None else Calibration.load(calibration)
     ignored = None if ignore is None else read_ignored(ignore, recording.camera, given)
     with counted("calibrating", quiet=as_json) as progress:
-        estimate = calibrate_sequence(
-            recording, parameters.read(), given, max_frames, progress=progress, ignore=ignored
-        )
+        estimate = calibrate_sequence(recording, config, given, max_frames, progress=progress, ignore=ignored)
     if out is not None:
         estimate.calibration.save(out)
     if as_json:

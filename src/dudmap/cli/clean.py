@@ -9,6 +9,7 @@ from dudmap.app.terminal import counted
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import DatasetError
+from dudmap.own_folder import check_outside
 
 
 def clean(
@@ -31,16 +32,19 @@ def clean(
     """Replace what moves in every frame of a recording by the map and by what other frames show there."""
     from dataclasses import asdict
 
+    from dudmap.app.pipeline.inspection import sample
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.views.cleaning import clean_recording
     from dudmap.io.exporting.run_content import RunContent
 
     recording = reading.open(sequence)
+    check_outside(out, recording, "OUT")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
+        config = parameters.read(seen=[frame for _, frame in sample(recording)[0]])
         run_sequence(
-            recording, parameters.read(), out / "run",
+            recording, config, out / "run",
             max_frames=max_frames, save_masks=True, passes=passes, ignore=ignore, calibrate=True,
             progress=not (quiet or as_json),
         )  # fmt: skip

@@ -7,6 +7,7 @@ from typer import Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
+from dudmap.own_folder import check_outside
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.inspection import Inspection
@@ -37,6 +38,8 @@ def info(
     from dudmap.app.viewing.snapshot import save_overview
 
     recording = reading.open(sequence)
+    if sheet is not None:
+        check_outside(sheet, recording, "--sheet")
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     found.repeats = repeats(recording)
@@ -83,6 +86,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
         *((f"{what} from", source) for what, source in found.sources.items()),
         ("depth", _depth(found)),
+        ("range", _range(found)),
         (
             "ground truth",
             f"{found.ground_truth} poses; run --poses recording fuses with them" if found.ground_truth else "none",
@@ -111,6 +115,12 @@ def _camera(camera: dict[str, Any]) -> str:
 def _depth(found: "Inspection") -> str:
     median = "no reading" if found.median_depth is None else f"median {found.median_depth:.3g} m"
     return f"{found.depth_scale:g} units per metre, {median}, {found.valid_depth:.0%} of the pixels valid"
+
+
+def _range(found: "Inspection") -> str:
+    least, largest = found.depth_range
+    used = f"{least:g} to {largest:g} m is used, with voxels of {1000 * found.voxel_size:g} mm"
+    return f"{used}; {found.too_near:.0%} of the readings are nearer, {found.too_far:.0%} farther"
 
 
 def _gaps(found: "Inspection") -> str:

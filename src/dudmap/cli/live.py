@@ -7,7 +7,7 @@ from typer import Argument, Option
 
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
-from dudmap.cli.run import run_parameters
+from dudmap.cli.run import for_range, run_parameters
 from dudmap.cli.view import observers
 
 
@@ -40,7 +40,7 @@ def live(
 
     Frames wait for at most 0.1 s; those for which there is no time are counted as dropped, but recorded with --record.
     """
-    from dudmap.app.pipeline.run import run
+    from dudmap.app.pipeline.run import PREVIEW, run
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.cameras import open_camera
     from dudmap.lab.warmup import run_compiled_beside
@@ -48,6 +48,7 @@ def live(
     config, saved_map = run_parameters(parameters, mapped, out)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
+    config = for_range(config, parameters, mapped, source.preview(PREVIEW))
     with observers(watching) as watchers, run_compiled_beside(live=True):
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),

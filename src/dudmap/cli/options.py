@@ -5,7 +5,7 @@ A text that cannot be understood is a ``ConfigError``.
 
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from math import isfinite
@@ -18,6 +18,7 @@ from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from dudmap.config import Config
+    from dudmap.core.frames.frame import Frame
     from dudmap.io.sequences import Recording
 
 GROUPS = {
@@ -29,7 +30,7 @@ GROUPS = {
     "Calibration": "--calibration",
     "Live and viewing": "--live --view --host --port --token --orbit --sweep",
     "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
-    "Advanced": "--system --config --set --device --jobs --resume --checkpoint-every --help",
+    "Advanced": "--system --config --range --set --device --jobs --resume --checkpoint-every --help",
 }
 """Options by the group of the help pages that they stand in; those of a single command stand before them."""
 
@@ -174,11 +175,27 @@ class ParameterOptions:
 
     config: Annotated[Path | None, Option(help="TOML file of parameters.", metavar="FILE")] = None
     system: SystemOption = None
+    range: Annotated[
+        str | None,
+        Option(
+            help="Voxels, depth range and all other lengths: near (0.1 to 0.5 m), room or far (6 to 15 m); default: "
+            "chosen from the first readings.",
+            metavar="NAME",
+        ),
+    ] = None
     assignments: SetOption = None
 
-    def read(self, *more: str) -> "Config":
-        """The parameters, some of them set by ``more``."""
-        return read_config(self.config, self.system, [*(self.assignments or []), *more])
+    def read(self, *more: str, seen: "Iterable[Frame]" = ()) -> "Config":
+        """The parameters, some of them set by ``more``, for ``--range`` or else for the range of the frames ``seen``.
+
+        Lengths that ``--config`` or ``--set`` give are not scaled.
+        """
+        from dudmap.ranges import RANGES, size_of
+
+        if self.range is not None and self.range not in RANGES:
+            raise ConfigError(f"found --range {self.range}; expected one of {', '.join(RANGES)}")
+        size = size_of(seen) if self.range is None else RANGES[self.range]
+        return read_config(self.config, self.system, [*(self.assignments or []), *more], size)
 
 
 @dataclass(frozen=True)
@@ -284,11 +301,14 @@ def memory_size(text: str | None) -> int | None:
         raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
 
 
-def read_config(file: Path | None, system: str | None, assignments: list[str] | None) -> "Config":
-    """Configuration of a file or the defaults, with the system and single parameters set."""
+def read_config(file: Path | None, system: str | None, assignments: list[str] | None, size: float = 1.0) -> "Config":
+    """Configuration of a file or the defaults, with the system and single parameters set, for a scene of a ``size``, in
+    rooms; the thesis' system has rooms only."""
     from dudmap.config import Config
 
-    config = Config() if file is None else Config.load(file)
+    config = Config.from_tree({}, size) if file is None else Config.load(file, size)
     config = config.override([*([f"system={system}"] if system else []), *(assignments or [])])
+    if config.system == "thesis" and size != 1:
+        return read_config(file, system, assignments)
     config.check_used()
     return config

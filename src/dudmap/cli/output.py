@@ -40,7 +40,13 @@ def free_folder(wanted: Path) -> Path:
 
 
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
-    """Print the metrics of a run to stdout: as one JSON object, as a table, or not at all."""
+    """Print the metrics of a run to stdout: as one JSON object, as a table, or not at all.
+
+    Raises:
+        typer.Exit: The run is of no use, which the last line on stderr says; the code is ``USELESS``.
+    """
+    from dudmap.cli import USELESS, fail
+
     if as_json:
         answer(metrics, "", as_json=True)
     elif not quiet:
@@ -50,3 +56,5 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
         console = plain_console()
         console.print(summary(metrics))
         console.print(f"written to {out}", soft_wrap=True)
+    if metrics.get("useless"):
+        fail(str(metrics["useless"]), code=USELESS)

@@ -1,5 +1,6 @@
 """``dudmap run``: process a recording into a run folder."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from dudmap.config import Config
+    from dudmap.core.frames.frame import Frame
     from dudmap.core.places.saved_map import SavedMap
 
 
@@ -91,7 +93,7 @@ def run(
     moving object.
     """
     from dudmap.app.pipeline.given_poses import checked_options, given_poses
-    from dudmap.app.pipeline.inspection import inspect
+    from dudmap.app.pipeline.inspection import inspect, sample
     from dudmap.app.pipeline.resume import resume as resume_run
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.pipeline.storing import Storing
@@ -110,7 +112,9 @@ def run(
     checked_options(has_poses=poses is not None, refine=refine, saved_map=mapped.saved is not None)
     config, saved_map = run_parameters(parameters, mapped, out)
     recording = reading.open(sequence)
-    warnings = inspect(recording).warnings
+    frames, unreadable = sample(recording)
+    config = for_range(config, parameters, mapped, [frame for _, frame in frames])
+    warnings = inspect(recording, frames, unreadable, config).warnings
     for warning in warnings:
         say(f"warning: {warning}", err=True)
     out = out or free_folder(Path("runs") / recording.name)
@@ -149,10 +153,7 @@ def run_parameters(
     from dudmap.core.backends.device import resolve
     from dudmap.core.places.saved_map import SavedMap
 
-    saved = mapped.saved
-    if saved is not None and parameters.config is parameters.system is None and (saved / "config.toml").is_file():
-        parameters = replace(parameters, config=saved / "config.toml")
-    config = parameters.read(*([f"device={mapped.device}"] if mapped.device else []))
+    saved, config = mapped.saved, _config(parameters, mapped)
     resolve(config.device, adaptive=config.volume.adaptive)  # refused before anything takes time
     if saved is None:
         return config, None
@@ -163,3 +164,20 @@ def run_parameters(
     if not config.relocalization.enabled:
         raise ConfigError("the camera is found in a saved map by relocalisation; drop relocalization.enabled=false")
     return config, SavedMap.load(saved, config.volume.voxel_size)
+
+
+def for_range(
+    config: "Config", parameters: o.ParameterOptions, mapped: o.MapOptions, frames: "list[Frame]"
+) -> "Config":
+    """The configuration for the range that some frames show, unless it is given; says what was chosen."""
+    chosen = _config(parameters, mapped, frames)
+    if chosen != config:
+        say(f"{chosen.range_text}, chosen from the readings; --range room keeps those of a room", err=True)
+    return chosen
+
+
+def _config(parameters: o.ParameterOptions, mapped: o.MapOptions, frames: "Iterable[Frame]" = ()) -> "Config":
+    saved = mapped.saved
+    if saved is not None and parameters.config is parameters.system is None and (saved / "config.toml").is_file():
+        parameters = replace(parameters, config=saved / "config.toml")
+    return parameters.read(*([f"device={mapped.device}"] if mapped.device else []), seen=frames)

@@ -171,6 +171,9 @@ def decided(
 ) -> MapPair:
     """The first of some relative poses (at least one) that passes all checks after its refinement, else why the first
     of them does not. ``many``: The maps are two of many, most of which do not show one place."""
+    empty = [name for name, one in (("first", a), ("second", b)) if not len(one.points)]
+    if empty:
+        return MapPair(None, f"the {' and the '.join(empty)} has no surface, its mesh is empty; leave that run out")
     first: MapPair | None = None
     for hypothesis in found:
         pair = _checked(a, b, hypothesis, many, changed)

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.pipeline.image_checks import WRONG, focal_error, image_warnings
+from dudmap.config import Config
 from dudmap.errors import FrameError
 from dudmap.io.sequences import has_color, read_frame
 from dudmap.io.sequences.camera_search import FIELD_OF_VIEW, OFF_CENTER, SCALED, UNEQUAL_FOCAL
 from dudmap.io.sequences.intrinsics import BY_NAME
 from dudmap.io.sequences.rotated_depth import Rotated
+from dudmap.ranges import size_of
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -24,7 +26,12 @@ DEPTH_ALONE = "there are no colour images: the camera is tracked by distances al
 SAMPLES = 12
 """Number of evenly spread frames that are read."""
 NEAR, FAR = 0.1, 8.0
-"""Plausible medians of the depth readings, metres: no depth camera measures nearer or farther most of the time."""
+"""Medians of the depth readings, metres, beyond which a depth unit that is only assumed is doubted."""
+LEAST, LARGEST = 0.05, 25.0
+"""Medians, metres, beyond which any depth unit is doubted: no depth camera measures nearer or farther most of the time.
+Wrist and desk cameras begin at 0.07 m, stereo cameras for outdoors end at 20 to 40 m."""
+LEFT_OUT = 0.1
+"""Share of the readings that the depth range leaves out that is worth a warning."""
 NEAREST, FARTHEST = 0.2, 10.0
 """Where the median lies beyond ``SEEN``: least plausible 5th and largest plausible 95th percentile of the readings,
 metres: few depth cameras measure nearer than 0.2 m, and those for rooms hardly beyond 10 m."""
@@ -68,6 +75,9 @@ class Inspection:
         depth_scale: Units of a 16-bit depth image per metre.
         median_depth: Of all readings of the sampled frames, metres; None without any.
         valid_depth: Share of pixels with a reading.
+        depth_range: Depths that are used, metres.
+        voxel_size: Edge of a voxel, metres; both as given, or chosen from the readings.
+        too_near, too_far: Shares of the readings before and beyond ``depth_range``, which are left out.
         unreadable: Reasons of the sampled frames that cannot be read.
         ground_truth: Number of true poses, 0 without.
         repeats: Shares of the frames that repeat the one before: both images (``frame``), or ``depth`` or ``color``
@@ -89,6 +99,10 @@ class Inspection:
     depth_scale: float
     median_depth: float | None
     valid_depth: float
+    depth_range: tuple[float, float]
+    voxel_size: float
+    too_near: float
+    too_far: float
     ground_truth: int
     has_color: bool = True
     unreadable: list[str] = field(default_factory=list)
@@ -139,11 +153,20 @@ def repeats(sequence: "Sequence") -> dict[str, float]:
 
 
 def inspect(
-    sequence: "Sequence", frames: "list[tuple[int, Frame]] | None" = None, unreadable: list[str] | None = None
+    sequence: "Sequence",
+    frames: "list[tuple[int, Frame]] | None" = None,
+    unreadable: list[str] | None = None,
+    config: Config | None = None,
 ) -> Inspection:
-    """Describe a recording and name what looks wrong; ``frames`` and ``unreadable`` are as ``sample`` returns them."""
+    """Describe a recording and name what looks wrong; ``frames`` and ``unreadable`` are as ``sample`` returns them.
+
+    ``config`` says what is used of the depth; None chooses it from the frames, as ``dudmap run`` does.
+    """
     if frames is None:
         frames, unreadable = sample(sequence)
+    if config is None:
+        config = Config.from_tree({}, size_of(frame for _, frame in frames))
+    least, largest = config.preprocess.depth_min, config.preprocess.depth_max
     depths = [frame.depth[frame.depth > 0] for _, frame in frames]
     readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
     pixels = sum(frame.depth.size for _, frame in frames)
@@ -166,6 +189,10 @@ def inspect(
         depth_scale=camera.depth_scale,
         median_depth=float(np.median(readings)) if len(readings) else None,
         valid_depth=len(readings) / pixels if pixels else 0.0,
+        depth_range=(least, largest),
+        voxel_size=config.volume.voxel_size,
+        too_near=float(np.mean(readings < least)) if len(readings) else 0.0,
+        too_far=float(np.mean(readings > largest)) if len(readings) else 0.0,
         ground_truth=0 if truth is None else len(truth),
         has_color=colored,
         unreadable=list(unreadable or []),
@@ -214,12 +241,16 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_op
         yield "the sampled frames hold no depth reading"
         return
     median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
-    implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
-    if (implausible or not NEAR <= median <= FAR) and not unit_is_open:
+    unlikely = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
+    units = median * found.depth_scale
+    fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
+    source = found.sources.get("depth unit", "")
+    assumed = source.startswith("assumed") or source.endswith(BY_NAME)
+    doubted = assumed and bool(fitting) and (unlikely or not NEAR <= median <= FAR)
+    impossible = not LEAST <= median <= LARGEST
+    if impossible and not unit_is_open:
         yield f"nine tenths of the readings lie from {near:.2g} to {far:.2g} m, which depth cameras hardly measure"
-    elif implausible or not NEAR <= median <= FAR:
-        units = median * found.depth_scale
-        fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
+    elif impossible or (doubted and unit_is_open):
         proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
         unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
         yield (
@@ -227,8 +258,22 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_op
             f"from {near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: "
             f"give --depth-unit {unit}"
         )
+    elif found.too_near + found.too_far > LEFT_OUT:
+        yield _left_out(found, readings)
     if found.valid_depth < FEW_READINGS:
         yield f"only {found.valid_depth:.0%} of the pixels have a depth reading"
+
+
+def _left_out(found: Inspection, readings: NDArray[np.float32]) -> str:
+    """Sentence on the readings outside of the depth range, and the parameter that takes them in."""
+    least, largest = found.depth_range
+    if found.too_near > found.too_far:
+        share, where = found.too_near, f"nearer than {least:g} m"
+        mend = f"depth_min={np.floor(100 * np.percentile(readings, 1)) / 100:g}"
+    else:
+        share, where = found.too_far, f"farther than {largest:g} m"
+        mend = f"depth_max={np.ceil(np.percentile(readings, 99)):g}"
+    return f"{share:.0%} of the readings are {where} and are not used; --set preprocess.{mend} takes them in"
 
 
 def _camera_warnings(name: str, camera: "Camera") -> Iterator[str]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.atomic_file import atomic_file, write_text
+from dudmap.config import PreprocessConfig
 from dudmap.core.result import FrameResult
 from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from dudmap.core.objects.object_tracker import Mover
     from dudmap.errors import FrameError
 
+STRIDE = 4
+"""Rows and columns from one counted reading to the next."""
 COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
 """What ``FrameResult`` says of a frame, of which the number of frames is counted."""
 
@@ -40,6 +43,8 @@ class RunRecord:
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
+        readings: Numbers of depth readings, of every fourth row and column: all, and those before and beyond the depth
+            range.
         counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
             directions of motion are observable.
         warnings: Sentences on what looked wrong in the recording before the run.
@@ -58,6 +63,7 @@ class RunRecord:
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
+    readings: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", "too_near", "too_far"), 0))
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
@@ -114,6 +120,13 @@ class RunRecord:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
+
+    def add_readings(self, depth: NDArray[np.float32], config: PreprocessConfig) -> None:
+        """Count the readings of a frame (H, W), and those that the depth range leaves out."""
+        some = depth[::STRIDE, ::STRIDE]
+        self.readings["all"] += int(np.count_nonzero(some > 0))
+        self.readings["too_near"] += int(np.count_nonzero((some > 0) & (some < config.depth_min)))
+        self.readings["too_far"] += int(np.count_nonzero(some > config.depth_max))
 
     def add_movers(self, row: dict[str, Any], result: FrameResult) -> None:
         """Add the moving objects of a frame to its row of ``rows``, after those of the frames before; meanwhile another
@@ -178,6 +191,9 @@ class RunRecord:
             "ms_reading_median": _number(np.median(readings)),
             "peak_rss_mb": peak_rss_mb(),
             "dynamic_share_mean": _number(np.mean(shares), 4),
+            "readings": {
+                key: round(self.readings[key] / max(self.readings["all"], 1), 4) for key in ("too_near", "too_far")
+            },
             "warnings": self.warnings,
             "lost_frames": self.lost,
             "unreadable_frames": self.unreadable,

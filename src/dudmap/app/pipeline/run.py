@@ -28,6 +28,7 @@ from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import has_color, is_timed
 from dudmap.io.sequences.images import read_ignored
+from dudmap.own_folder import check_outside
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.given_poses import GivenPoses
@@ -116,8 +117,8 @@ def run(
         ConfigError: ``passes`` is not 1 or 2, or 2 with a camera or ``saved_map``; ``localize`` without a
             ``saved_map``; ``storing`` with a camera; an option that the configured system does not have.
         CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
-        DudmapError: Another process writes into the folder, it cannot be written, the recording cannot be used, or no
-            frame could be tracked.
+        DudmapError: Another process writes into the folder, it cannot be written or lies in the recording, the
+            recording cannot be used, or no frame could be tracked.
         KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names what was
             saved.
     """
@@ -127,6 +128,9 @@ def run(
     out = Path(out)
     if live and not isinstance(sequence, LiveCamera):
         sequence = ReplayCamera(sequence)
+    check_outside(out, sequence)
+    if record is not None:
+        check_outside(Path(record), sequence, "--record")
     live = isinstance(sequence, LiveCamera)
     length = sequence.length if isinstance(sequence, LiveCamera) else len(sequence)
     count = length if max_frames is None else min(max_frames, length or max_frames)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
+from dudmap.app.pipeline.usefulness import uselessness
 from dudmap.atomic_file import UNFINISHED, write_image, write_text, writing
 from dudmap.config import Config
 from dudmap.core.geometry.mesh_pieces import save_pieces
@@ -218,6 +219,8 @@ def write_run_folder(
         metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
 
     def save_metrics() -> None:
+        limits = config.preprocess.depth_min, config.preprocess.depth_max
+        metrics["useless"] = None if slam.localize else uselessness(metrics, len(trajectory), limits)
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         about = {"versions": versions(), "machine": machine(), "device": slam.device, "peak_rss_mb": peak_rss_mb()}

@@ -63,6 +63,7 @@ class LiveCamera(ABC):
     ground_truth: "Trajectory | None" = None
     length: int | None = None
     timed: bool = True
+    _previewed: "list[Frame] | None" = None
 
     @abstractmethod
     def read(self) -> CameraFrame | None:
@@ -81,12 +82,14 @@ class LiveCamera(ABC):
         return None
 
     def preview(self, count: int) -> "list[Frame]":
-        """Some frames before the stream begins, with which the kernels are loaded; fewer if the stream ends."""
-        frames = []
-        while len(frames) < count and (arrived := self.read()) is not None:
-            if not isinstance(arrived.frame, FrameError):
-                frames.append(arrived.frame)
-        return frames
+        """Some frames before the stream begins, with which the kernels are loaded; fewer if the stream ends. Later
+        calls return the frames of the first one."""
+        if self._previewed is None:
+            self._previewed = []
+            while len(self._previewed) < count and (arrived := self.read()) is not None:
+                if not isinstance(arrived.frame, FrameError):
+                    self._previewed.append(arrived.frame)
+        return self._previewed[:count]
 
 
 def open_camera(text: str | None = None) -> LiveCamera:

@@ -36,6 +36,7 @@ class ReplayCamera(LiveCamera):
         self.name = self._sequence.name
         self.camera, self.calibration = self._sequence.camera, self._sequence.calibration
         self.ground_truth, self.length = self._sequence.ground_truth, len(self._sequence)
+        self.path = getattr(self._sequence, "path", None)
         self.opened = getattr(self._sequence, "opened", None)
         self.sources: dict[str, str] = getattr(self._sequence, "sources", {})
         self.timed = is_timed(self._sequence)

@@ -1,0 +1,46 @@
+"""Whether a run came to anything; else why not, and what to try."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+LEAST_SHARE = 0.1
+"""Share of the frames in the largest map below which a run is of no use: nine tenths of the recording are not in it."""
+MOST = 0.5
+"""Share of the readings outside of the depth range that explains it."""
+
+
+def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float, float]) -> str | None:
+    """Sentence on a run that is of no use, by its metrics and the number of ``poses`` of its largest map; else None.
+
+    A run is of no use if hardly any frame is in the map, or if the mesh has no triangle.
+    """
+    frames = metrics["frames"]
+    if poses < LEAST_SHARE * frames:
+        found = f"{poses} of {frames} frames are in its largest map"
+    elif not metrics["mesh_triangles"]:
+        found = "its mesh is empty"
+    else:
+        return None
+    why, remedy = _cause(metrics, depth_range)
+    return f"this run is of no use: {found}; {why}; {remedy}"
+
+
+def _cause(metrics: Mapping[str, Any], depth_range: tuple[float, float]) -> tuple[str, str]:
+    """Why a run is of no use, and what to try."""
+    for key, where, limit in zip(("too_near", "too_far"), ("nearer", "farther"), depth_range, strict=True):
+        if (share := metrics["readings"][key]) > MOST:
+            name = "near" if key == "too_near" else "far"
+            return f"{share:.0%} of the depth readings are {where} than {limit:g} m", f"try --range {name}"
+    reasons = [frame["reason"] for frame in metrics["lost_frames"]]
+    if reasons:
+        kinds = Counter(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in reasons)
+        kind, count = kinds.most_common(1)[0]
+        example = next(reason for reason in reasons if re.sub(r"\d+(\.\d+)?", "#", reason) == kind)
+        why = f"{count} of {len(reasons)} lost frames for one reason: {example}"
+    else:
+        why = f"{metrics['fused']} of {metrics['tracked']} tracked frames were fused"
+    if metrics["warnings"]:
+        return why, f"first mend the recording: {metrics['warnings'][0]}"
+    return why, "look at the recording (dudmap info --sheet), and move the camera slowly past shapes and textures"
