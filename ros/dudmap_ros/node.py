@@ -24,6 +24,7 @@ from dudmap_ros.session import Session, config_of, default_parameters
 SETTINGS = {
     "map_frame": "map",
     "camera_frame": "",
+    "range": "room",
     "saved_map": "",
     "localize": False,
     "watch": False,
@@ -67,7 +68,7 @@ class DudmapNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, create publishers and services."""
         try:
-            config = config_of({key: self.setting(key) for key in self.keys})
+            config = config_of({key: self.setting(key) for key in self.keys}, self.setting("range"))
             self.session = Session(
                 config, self.setting("saved_map") or None, self.setting("localize"), self.setting("watch"),
                 self.setting("ignore") or None,

@@ -16,6 +16,7 @@ from dudmap.fleet.change_watch import ChangeWatch
 from dudmap.io.exporting import ros_messages as ros
 from dudmap.io.sequences.bag_messages import color_of, depth_of
 from dudmap.io.sequences.images import read_ignored
+from dudmap.ranges import RANGES
 
 
 def default_parameters() -> dict[str, Any]:
@@ -29,12 +30,14 @@ def default_parameters() -> dict[str, Any]:
     return out
 
 
-def config_of(values: Mapping[str, Any]) -> Config:
-    """Configuration of dotted keys; those that have the default value leave the choice to the preset.
+def config_of(values: Mapping[str, Any], range_name: str = "room") -> Config:
+    """Configuration of dotted keys; those that have the default value leave the choice to the preset and the range.
 
     Raises:
         ConfigError: A value is invalid.
     """
+    if range_name not in RANGES:
+        raise ConfigError(f"found the range {range_name!r}; expected one of {', '.join(RANGES)}")
     defaults, tree = default_parameters(), {}
     for key, value in values.items():
         value = list(value) if isinstance(defaults[key], list) else value
@@ -44,7 +47,7 @@ def config_of(values: Mapping[str, Any]) -> Config:
                 tree.setdefault(part, {})[name] = value
             else:
                 tree[part] = value
-    return Config.from_tree(tree)
+    return Config.from_tree(tree, RANGES[range_name])
 
 
 class Session:

@@ -172,7 +172,7 @@ def test_ctrl_c_is_exit_code_130(monkeypatch):
 
 def test_exit_codes_are_documented():
     page = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| (\d+) \|", page, flags=re.MULTILINE) == ["0", "1", "2", "130"]
+    assert re.findall(r"^\| (\d+) \|", page, flags=re.MULTILINE) == ["0", "1", "2", "3", "130"]
     for name in ("NO_COLOR", "--install-completion", "--json", "DUDMAP_THREADS"):
         assert name in page
 

@@ -108,6 +108,13 @@ def test_a_run_chooses_says_and_obeys(slam, tmp_path):
     assert "found --range close; expected one of near, room, far" in done.stderr
 
 
+def test_a_range_that_changes_nothing_is_refused(slam, tmp_path):
+    Config().save(tmp_path / "all.toml")
+    done = call("run", write_recording(tmp_path / "room", 6), "--config", tmp_path / "all.toml", "--range", "near")
+    assert done.exit_code == 1
+    assert "--range near changes nothing" in done.stderr
+
+
 def test_a_camera_chooses_from_its_first_frames(slam, tmp_path):
     far = recording_from(tmp_path / "far", 6.3, 12.5)
     done = call("live", f"replay:{far}", "--out", tmp_path / "a", "--quiet")

@@ -96,6 +96,10 @@ def test_parameters_are_the_configuration_keys():
     changed = config_of(defaults | {"tracker.huber": 0.02, "tracker.widths": [40, 80, 160]})
     assert (changed.tracker.huber, changed.tracker.widths) == (0.02, (40, 80, 160))
     assert config_of(defaults | {"system": "thesis"}) == Config.from_tree({"system": "thesis"})
+    assert config_of(defaults, "near") == Config.for_range("near")
+    assert config_of(defaults | {"volume.voxel_size": 0.02}, "far").volume.voxel_size == 0.02
+    with pytest.raises(ConfigError, match="expected one of near, room, far"):
+        config_of(defaults, "close")
     assert all(isinstance(value, bool | int | float | str | list) for value in defaults.values())
 
 

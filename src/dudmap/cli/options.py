@@ -195,7 +195,11 @@ class ParameterOptions:
         if self.range is not None and self.range not in RANGES:
             raise ConfigError(f"found --range {self.range}; expected one of {', '.join(RANGES)}")
         size = size_of(seen) if self.range is None else RANGES[self.range]
-        return read_config(self.config, self.system, [*(self.assignments or []), *more], size)
+        assignments = [*(self.assignments or []), *more]
+        found = read_config(self.config, self.system, assignments, size)
+        if self.range not in (None, "room") and found == read_config(self.config, self.system, assignments):
+            raise ConfigError(f"--range {self.range} changes nothing, since --config or the system gives all lengths; drop one")
+        return found
 
 
 @dataclass(frozen=True)
