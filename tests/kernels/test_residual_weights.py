@@ -33,7 +33,7 @@ def test_weights_are_those_of_the_thesis(tukey, noisy):
 
 
 OWNERS = {
-    ("huber", "tukey", "color_huber", "noise_weighting", "reference_sigma"): {
+    ("huber", "tukey", "color_huber", "noise_weighting", "sigma_at_reference"): {
         "core/formulas/residual.py",
         "core/tracking/tracker.py:parameters",  # hands them on
         "core/tracking/tracker.py:_judge",  # asks whether the weights have the noise

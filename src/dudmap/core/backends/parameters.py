@@ -91,7 +91,7 @@ class RegistrationParameters(NamedTuple):
         huber, tukey: Constants of the distance residual, metres at the reference depth; tukey = 0 selects Huber.
         color_weight: Weight of the squared intensity residual (0..1) against the squared distance residual (m).
         color_huber: Constant of the intensity residual.
-        reference_sigma: Of a reading at the reference depth, metres.
+        sigma_at_reference: Of a reading at the reference depth, metres.
         noise_weighting: 1 scales each distance residual by sigma(reference depth) / sigma(z), 0 does not.
     """
 
@@ -100,7 +100,7 @@ class RegistrationParameters(NamedTuple):
     tukey: float
     color_weight: float
     color_huber: float
-    reference_sigma: float
+    sigma_at_reference: float
     noise_weighting: float
 
 

@@ -61,7 +61,7 @@ def tukey_cost(inlier, limit):
 @written_out
 def noise_scale(z, p):
     """sigma(reference depth) / sigma(z), at most 1, where residuals are weighted by the noise of the sensor, else 1."""
-    scaled = min(p.reference_sigma / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
+    scaled = min(p.sigma_at_reference / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
     return p.noise_weighting * scaled + (f32(1) - p.noise_weighting)
 
 

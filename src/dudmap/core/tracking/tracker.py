@@ -323,7 +323,7 @@ class Tracker:
             tukey=config.tukey if config.robust == "tukey" else 0.0,
             color_weight=config.color_weight if color_weight is None else color_weight,
             color_huber=config.color_huber,
-            reference_sigma=self._sigma,
+            sigma_at_reference=self._sigma,
             noise_weighting=float(config.noise_weighting),
         )
 
