@@ -245,7 +245,7 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_op
     units = median * found.depth_scale
     fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
     source = found.sources.get("depth unit", "")
-    assumed = source.startswith("assumed") or source.endswith(BY_NAME)
+    assumed = not source or source.startswith("assumed") or source.endswith(BY_NAME)
     doubted = assumed and bool(fitting) and (unlikely or not NEAR <= median <= FAR)
     impossible = not LEAST <= median <= LARGEST
     if impossible and not unit_is_open:
