@@ -198,7 +198,9 @@ class ParameterOptions:
         assignments = [*(self.assignments or []), *more]
         found = read_config(self.config, self.system, assignments, size)
         if self.range not in (None, "room") and found == read_config(self.config, self.system, assignments):
-            raise ConfigError(f"--range {self.range} changes nothing, since --config or the system gives all lengths; drop one")
+            raise ConfigError(
+                f"--range {self.range} changes nothing: --config gives all lengths, or the system has none"
+            )
         return found
 
 
