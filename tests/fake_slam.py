@@ -86,7 +86,7 @@ class FakeSlam:
         poses="estimated",
     ):
         type(self).timed = timed
-        self.localize, self.config = localize, config
+        self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.device = "cpu"

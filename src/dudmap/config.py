@@ -446,9 +446,15 @@ class Config(ConfigSection):
                 )
 
     @property
+    def depth_limits(self) -> tuple[float, float]:
+        """Smallest and largest depth that the system uses, metres."""
+        part = self.thesis if self.system == "thesis" else self.preprocess
+        return part.depth_min, part.depth_max
+
+    @property
     def range_text(self) -> str:
         """Sentence part on voxels and depth range."""
-        least, largest = self.preprocess.depth_min, self.preprocess.depth_max
+        least, largest = self.depth_limits
         return f"voxels of {1000 * self.volume.voxel_size:g} mm, depth from {least:g} to {largest:g} m"
 
     def to_toml(self) -> str:

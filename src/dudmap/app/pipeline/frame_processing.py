@@ -63,7 +63,7 @@ def process_source(
     if record.masked is not None:
         record.masked += given_mask is not None
     delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
-    record.add_readings(read.frame.depth, slam.config.preprocess)
+    record.add_readings(read.frame.depth)
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     row = record.rows[-1]
     read = read._replace(prepared=None)  # what waits in the background holds no pyramids

@@ -166,7 +166,7 @@ def inspect(
         frames, unreadable = sample(sequence)
     if config is None:
         config = Config.from_tree({}, size_of(frame for _, frame in frames))
-    least, largest = config.preprocess.depth_min, config.preprocess.depth_max
+    least, largest = config.depth_limits
     depths = [frame.depth[frame.depth > 0] for _, frame in frames]
     readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
     pixels = sum(frame.depth.size for _, frame in frames)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.atomic_file import atomic_file, write_text
-from dudmap.config import PreprocessConfig
+from dudmap.config import Config
 from dudmap.core.result import FrameResult
 from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
@@ -45,6 +45,7 @@ class RunRecord:
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
         readings: Numbers of depth readings, of every fourth row and column: all, and those before and beyond the depth
             range.
+        depth_limits: Depths that are used, metres.
         counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
             directions of motion are observable.
         warnings: Sentences on what looked wrong in the recording before the run.
@@ -64,6 +65,7 @@ class RunRecord:
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     readings: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", "too_near", "too_far"), 0))
+    depth_limits: tuple[float, float] = Config().depth_limits
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
@@ -121,12 +123,13 @@ class RunRecord:
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
-    def add_readings(self, depth: NDArray[np.float32], config: PreprocessConfig) -> None:
+    def add_readings(self, depth: NDArray[np.float32]) -> None:
         """Count the readings of a frame (H, W), and those that the depth range leaves out."""
+        least, largest = self.depth_limits
         some = depth[::STRIDE, ::STRIDE]
         self.readings["all"] += int(np.count_nonzero(some > 0))
-        self.readings["too_near"] += int(np.count_nonzero((some > 0) & (some < config.depth_min)))
-        self.readings["too_far"] += int(np.count_nonzero(some > config.depth_max))
+        self.readings["too_near"] += int(np.count_nonzero((some > 0) & (some < least)))
+        self.readings["too_far"] += int(np.count_nonzero(some > largest))
 
     def add_movers(self, row: dict[str, Any], result: FrameResult) -> None:
         """Add the moving objects of a frame to its row of ``rows``, after those of the frames before; meanwhile another

@@ -163,7 +163,10 @@ def run(
         storing=storing, poses=None if poses is None else poses.role,
         ignore=None if ignored is None else (out / IGNORED).resolve(),
     )  # fmt: skip
-    figures = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
+    figures = RunRecord(
+        warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None,
+        depth_limits=config.depth_limits,
+    )  # fmt: skip
     with locked(out), ExitStack() as files:
         display = RunProgress(count and count * passes, bar=progress)
         notice = display.note if progress else lambda text: None
@@ -302,7 +305,10 @@ class Job:
                 masked = state.record.masked and 0
                 state.slam = self._next_system(state, first_pass=state.slam)
                 spent, warnings = state.record.elapsed(), state.record.warnings
-                state.record = RunRecord(warnings=warnings, masked=masked, dropped=None, spent=spent)
+                limits = state.record.depth_limits
+                state.record = RunRecord(
+                    warnings=warnings, masked=masked, dropped=None, spent=spent, depth_limits=limits
+                )
                 state.number, state.next = number, 0
             for observer in self.observers:
                 if state.next:

@@ -219,8 +219,7 @@ def write_run_folder(
         metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
 
     def save_metrics() -> None:
-        limits = config.preprocess.depth_min, config.preprocess.depth_max
-        metrics["useless"] = None if slam.localize else uselessness(metrics, len(trajectory), limits)
+        metrics["useless"] = None if slam.localize else uselessness(metrics, len(trajectory), config.depth_limits)
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         about = {"versions": versions(), "machine": machine(), "device": slam.device, "peak_rss_mb": peak_rss_mb()}
