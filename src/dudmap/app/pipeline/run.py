@@ -306,9 +306,7 @@ class Job:
                 state.slam = self._next_system(state, first_pass=state.slam)
                 spent, warnings = state.record.elapsed(), state.record.warnings
                 limits = state.record.depth_limits
-                state.record = RunRecord(
-                    warnings=warnings, masked=masked, dropped=None, spent=spent, depth_limits=limits
-                )
+                state.record = RunRecord(warnings=warnings, masked=masked, spent=spent, depth_limits=limits)
                 state.number, state.next = number, 0
             for observer in self.observers:
                 if state.next:
