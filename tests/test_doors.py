@@ -14,6 +14,7 @@ FOUNDATION = {
     "errors",
     "extras",
     "input_files",
+    "ranges",
     "interruption",
     "own_folder",
     "config_section",
