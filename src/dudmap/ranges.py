@@ -9,7 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dudmap.core.frames.frame import Frame
+    import numpy as np
+    from numpy.typing import NDArray
 
 RANGES = {"near": 0.2, "room": 1.0, "far": 2.5}
 """Size of the scene, in rooms. near: voxels of 2 mm, readings from 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
@@ -53,15 +54,15 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
     return out
 
 
-def size_of(frames: "Iterable[Frame]") -> float:
-    """Size of the scene that some frames show, in rooms: 1 unless their readings are nearer or farther than in a room.
+def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
+    """Size of the scene that some depth images (H, W), metres, show, in rooms: 1 unless their readings are nearer or farther than in a room.
 
     The voxel size is then 1/500 of the median depth, or 1/600 of the 98 % quantile if that is farther, from 2 mm to
     5 cm.
     """
     import numpy as np
 
-    images = [frame.depth for frame in frames]
+    images = list(depths)
     readings = np.concatenate([image[image > 0] for image in images]) if images else np.zeros(0)
     if len(readings) <= FEW * sum(image.size for image in images):
         return 1.0

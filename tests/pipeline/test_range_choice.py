@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from dudmap.app.pipeline.inspection import inspect
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.core.frames.frame import Frame
 from dudmap.io.sequences import open_sequence
 from dudmap.ranges import size_of
 from recordings import HEIGHT, WIDTH, write_recording
@@ -32,9 +31,8 @@ def recording_from(folder: Path, nearest: float, farthest: float, scale: float =
     return folder
 
 
-def seen(*depths: float) -> list[Frame]:
-    image = np.resize(np.array(depths, np.float32), (8, 8))
-    return [Frame(0.0, image, np.zeros((8, 8, 3), np.uint8))]
+def seen(*depths: float) -> list[np.ndarray]:
+    return [np.resize(np.array(depths, np.float32), (8, 8))]
 
 
 @pytest.mark.parametrize(

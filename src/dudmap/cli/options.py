@@ -194,7 +194,7 @@ class ParameterOptions:
 
         if self.range is not None and self.range not in RANGES:
             raise ConfigError(f"found --range {self.range}; expected one of {', '.join(RANGES)}")
-        size = size_of(seen) if self.range is None else RANGES[self.range]
+        size = size_of(frame.depth for frame in seen) if self.range is None else RANGES[self.range]
         assignments = [*(self.assignments or []), *more]
         found = read_config(self.config, self.system, assignments, size)
         if self.range not in (None, "room") and found == read_config(self.config, self.system, assignments):

@@ -165,7 +165,7 @@ def inspect(
     if frames is None:
         frames, unreadable = sample(sequence)
     if config is None:
-        config = Config.from_tree({}, size_of(frame for _, frame in frames))
+        config = Config.from_tree({}, size_of(frame.depth for _, frame in frames))
     least, largest = config.depth_limits
     depths = [frame.depth[frame.depth > 0] for _, frame in frames]
     readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
