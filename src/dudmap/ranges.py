@@ -55,10 +55,10 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
 
 
 def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
-    """Size of the scene that some depth images (H, W), metres, show, in rooms: 1 unless their readings are nearer or farther than in a room.
+    """Size of the scene in some depth images (H, W), metres, in rooms: 1 for the readings of a room.
 
-    The voxel size is then 1/500 of the median depth, or 1/600 of the 98 % quantile if that is farther, from 2 mm to
-    5 cm.
+    Else the voxel size becomes 1/500 of the median depth, or 1/600 of the 98 % quantile if that is farther, from 2 mm
+    to 5 cm.
     """
     import numpy as np
 
