@@ -133,14 +133,16 @@ def still(segments, dynamic, gap, difference):
 
 
 def compared(depth, intensity, moves, gap, difference, marks, noise):
-    """Shift of two images, and readings: those that agree, all, and those of the older image."""
+    """Shift of two images that saturate at 1, and readings: those that agree, all, and those of the older image."""
     agreeing = np.count_nonzero(np.abs(gap) < AGREEING_SIGMAS * (noise.base + noise.scale * depth**2))
     sigma = noise.base + noise.scale * (depth * depth)
     tolerance = edge_tolerance.py_func(sigma, depth, noise.edge_sigmas, noise.edge_slope)
     common = (marks == 0) & ~moves & (np.abs(gap) < tolerance)
     gain, offset = fit_exposure(intensity, difference, common.astype(np.float32))
+    older = difference + intensity
+    common &= (intensity > 0) & (intensity < 1) & (older > 0) & (older < 1)
     difference = difference + np.float32(1 - gain) * intensity - np.float32(offset)
     down, across = np.gradient(intensity)
-    contrast = float(median(np.sqrt(down**2 + across**2)[common]))
+    contrast = gain * float(median(np.sqrt(down**2 + across**2)[common]))
     shift = np.sqrt(2) * median(np.abs(difference[common])) / contrast
     return shift, agreeing, np.count_nonzero(depth), np.count_nonzero(np.isfinite(gap))

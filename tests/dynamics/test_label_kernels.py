@@ -131,8 +131,8 @@ def test_an_older_image_is_compared(scene):
     difference = np.where(np.isnan(gap), np.float32(np.nan), 0.1 * intensity + 0.02 * smooth(rng, 1))
     images = depth, intensity, smooth(rng, 4) > 1, gap, difference, (smooth(rng, 4) > 1).astype(np.uint8)
     expected = label_oracle.compared(*images, NOISE)
-    assert compare_images(*images, NOISE, 100) == expected
-    assert np.isnan(compare_images(*images, NOISE, depth.size)[0])
+    assert compare_images(*images, NOISE, 100, (1.0, 1.0)) == expected
+    assert np.isnan(compare_images(*images, NOISE, depth.size, (1.0, 1.0))[0])
     assert 0 < expected[0] < 2
 
 

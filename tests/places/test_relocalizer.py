@@ -47,7 +47,7 @@ class Places:
         self.masks.append(dynamic_mask)
         return features(self.num_features)
 
-    def match(self, features):
+    def recognise(self, features):
         return list(self.candidates)
 
 

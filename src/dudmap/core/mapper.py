@@ -112,7 +112,8 @@ class Bootstrap(Stateful):
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember what was fused after the first frame, or that the map began anew with it."""
-        if not self._window:
+        if not self._window or view.blind:
+            self._window = []
             return
         if view.timestamp <= self._window[0].frame.timestamp:
             self._window, self._num_fused = [], 0
@@ -256,10 +257,13 @@ class Mapper:
         """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
-        if self._config.relocalization.enabled and not (view.without_image or self._localize):
+        if self._config.relocalization.enabled and not view.without_image:
             with view.timer("keyframe"):
-                atlas, T_world_camera = self._atlas, estimate.T_world_camera
-                atlas.keyframes.add(view.colored(), T_world_camera, dynamic_mask, atlas.current)
+                keyframes = self._atlas.keyframes
+                place = view.colored(), estimate.T_world_camera, dynamic_mask, self._atlas.current
+                keyframes.remember(*place)
+                if not self._localize:
+                    keyframes.add(*place)
         if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp) and not view.blind:
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
@@ -316,6 +320,8 @@ class Mapper:
             if self._predictor.mostly_slow and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             observation = view.colored()
+            if view.blind:  # black pixels leave the colours of the map as they are
+                observation = replace(observation, rgb=np.zeros_like(observation.rgb), recorded_rgb=None)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)

@@ -204,9 +204,9 @@ class Slam(SlamResults, Stateful):
         self.mapper.revise_first_frame(view, prediction)
         if prediction.crowd_in_map is not None and self.relocalizer.may_start_submaps:
             return self._start_submap(view.with_dynamic(prediction.crowd_in_map))
-        estimate = self.front_end.register(self.reference, view, prediction)
+        last = self.predictor.ego_motion.last
+        view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
         registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
-        verdict = self.monitor.judge(self.predictor.ego_motion.last, view, estimate, prediction.image_pose)
         reason = self.relocalizer.reason or verdict.reason
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
@@ -332,8 +332,7 @@ class Slam(SlamResults, Stateful):
     def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
         """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
         with view.timer("similarity"):
-            known = view.blind or uncertain or self.localize
-            return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
+            return not (uncertain or self.localize or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -381,7 +380,7 @@ class Slam(SlamResults, Stateful):
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
-            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
+            skipped_similar=not (fused or reason or uncertain or self.localize),
             dynamic_mask=self.preprocess.distorted(recorded_mask(dynamic_mask, view.observation)),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,

@@ -89,10 +89,8 @@ class RegistrationParameters(NamedTuple):
     Attributes:
         band: Truncation band; readings farther from the surface are outliers.
         huber, tukey: Constants of the distance residual, metres at the reference depth; tukey = 0 selects Huber.
-        color_weight: Weight of the squared intensity residual (0..1) against the squared distance residual (m).
-        color_huber: Constant of the intensity residual.
-        sigma_at_reference: Of a reading at the reference depth, metres.
-        noise_weighting: 1 scales each distance residual by sigma(reference depth) / sigma(z), 0 does not.
+        color_weight, color_huber: Of the intensity residual (0..1), in the range from ``darkest`` to ``brightest``.
+        sigma_at_reference, noise_weighting: 1 scales each distance residual by this sigma (m) / sigma(z), 0 does not.
     """
 
     band: TruncationBand
@@ -102,6 +100,8 @@ class RegistrationParameters(NamedTuple):
     color_huber: float
     sigma_at_reference: float
     noise_weighting: float
+    darkest: float = -np.inf
+    brightest: float = np.inf
 
 
 class ColorProjection(NamedTuple):

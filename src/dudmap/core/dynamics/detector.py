@@ -26,7 +26,7 @@ from dudmap.core.backends.threads import submit
 from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
-from dudmap.core.frames.observation import Level, Pyramid, exposed
+from dudmap.core.frames.observation import Level, Pyramid, saturated, unsaturated
 from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
@@ -166,6 +166,8 @@ class DynamicDetector(Stateful):
         config, depth = self.config, level.depth
         noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
+        if (dark := saturated(level, exposure, sample.difference)) is not None:
+            sample.difference[dark] = np.nan
         sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
         histogram = np.zeros(BINS, np.int64)
         unknown, (prior, static, moves) = weigh_readings(
@@ -197,7 +199,7 @@ class DynamicDetector(Stateful):
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
         if config.free_space:
-            hidden = self.background.hidden(timestamp, exposed(level, exposure), T_world_camera)
+            hidden = self.background.hidden(timestamp, unsaturated(level, exposure), T_world_camera)
         return Labels(probability, dynamic, mixture, histogram, sample, segments, hidden)
 
     def update(
@@ -219,7 +221,7 @@ class DynamicDetector(Stateful):
         """
         self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.segmentation)
         if self.config.free_space:
-            self.background.update(timestamp, exposed(level, exposure), T_world_camera, labels.dynamic)
+            self.background.update(timestamp, unsaturated(level, exposure), T_world_camera, labels.dynamic)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
         """Move what is remembered with a correction (4, 4) of the world."""

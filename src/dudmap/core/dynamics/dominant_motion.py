@@ -15,7 +15,13 @@ from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import FLOW_WIDTH, WINDOW, Level, Pyramid, scaled_window
-from dudmap.core.frames.optical_flow import RETURN_PX, consistent_with_static, lengths, track_forward_backward
+from dudmap.core.frames.optical_flow import (
+    RETURN_PX,
+    consistent_with_static,
+    equally_exposed,
+    lengths,
+    track_forward_backward,
+)
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
@@ -226,7 +232,8 @@ def dominant_motion(
     Returns:
         None if too few corners follow one motion.
     """
-    fine, fine_after, first, second = before.fine, after.fine, before.fine.grey, after.fine.grey
+    fine, fine_after = before.fine, after.fine
+    first, second = equally_exposed(before, after)
     camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
     points = before.corner_points

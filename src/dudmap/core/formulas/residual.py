@@ -34,6 +34,16 @@ def trilinear(v0, v1, v2, v3, v4, v5, v6, v7, ax, ay, az):
 
 
 @scalar
+def within_range(shade, kx, ky, kz, intensity, p):
+    """Intensity difference between map and image, cut to the range that both can show, and its gradient: beyond that
+    range one of them is saturated and tells nothing."""
+    inside = (shade > p.darkest) & (shade < p.brightest)
+    part = f32(1) if inside else f32(0)
+    difference = min(max(shade, p.darkest), p.brightest) - min(max(intensity, p.darkest), p.brightest)
+    return difference, kx * part, ky * part, kz * part
+
+
+@scalar
 def huber_weight(a, k):
     """Huber weight of an absolute residual (thesis eq. 4.44)."""
     return k / max(a, k)

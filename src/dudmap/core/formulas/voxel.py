@@ -75,7 +75,7 @@ def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
 
     A reading within the truncation band averages its distance, weight and intensity into the voxel. One that passes the
     voxel by more than the band is an observation of emptiness, which counts ``carve_rate`` times in a voxel that holds
-    a surface, and changes no intensity.
+    a surface, and changes no intensity. A black pixel tells no colour: it may be dark for want of light.
 
     Args:
         word: Geometry word of the voxel.
@@ -104,8 +104,11 @@ def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     share = gain / max(weight, one)
     cap = max(old_weight, min(p.max_weight, p.max_readings * bits(color, 0, 0xFF)))
     sdf = old_sdf + (min(s, tau) - old_sdf) * share
-    share = share if banded else zero  # intensity and colour belong to the surface: emptiness does not repaint it
-    intensity_share = one if banded & (old_intensity == zero) else share
+    lit = bits(color, 8, 0xFFFFFF) > zero
+    # intensity and colour belong to the surface: neither emptiness nor darkness repaints it
+    share = share if banded & lit else zero
+    unlit = (old_intensity == zero) | (lit & (old_intensity == one))
+    intensity_share = one if banded & unlit else share
     intensity = old_intensity + (max(luma(color), one) - old_intensity) * intensity_share
     fused = pack_voxel(sdf * by_sdf_unit, min(weight, cap), intensity)
     near = abs(s) < max(f32(2.5) * p.voxel_size, f32(0.4) * tau)

@@ -1,17 +1,21 @@
 """A preprocessed frame, its image pyramid and corners, and their exposure to the intensities of the map."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
+CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
+"""Every so many pixels, across and down, tell from which intensity on colours are saturated: the brightest of the least
+share of those with a saturated channel."""
 HALVING_BAND = 0.02
 """Readings this far (share of the depth, at least of the reference depth) behind the nearest of a 2x2 block belong to
 the same surface."""
@@ -70,6 +74,14 @@ class Observation:
         """Number of pixels with a depth."""
         return int(np.count_nonzero(self.readings))
 
+    @cached_property
+    def ceiling(self) -> float:
+        """Intensity from which on a channel of the colour is saturated, 1 where none is."""
+        full = (self.rgb[::CEILING_STRIDE, ::CEILING_STRIDE] == 255).any(axis=2)
+        if not full.any():
+            return 1.0
+        return float(np.quantile(self.intensity[::CEILING_STRIDE, ::CEILING_STRIDE][full], LEAST_SATURATED))
+
     def halved(self, times: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H >> times, W >> times) of ``camera.scaled(times)``, halved by 2x2 blocks.
 
@@ -92,11 +104,20 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
+    """One level of the image pyramid.
+
+    Attributes:
+        camera: Of the level.
+        depth, intensity: (h, w) m; (h, w) 0..1.
+        ceiling: Smallest intensity that is saturated.
+        shown: Range of intensities in which neither the image nor the map is saturated.
+    """
 
     camera: Camera
     depth: NDArray[np.float32]
     intensity: NDArray[np.float32]
+    ceiling: float = 1.0
+    shown: tuple[float, float] = (-np.inf, np.inf)
 
     @cached_property
     def num_readings(self) -> int:
@@ -121,12 +142,47 @@ class Level:
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
+    """Colours (H, W, 3) with gain and offset applied, comparable to those of the map; black where they are saturated
+    and the map is not."""
     import cv2
 
     gain, offset = exposure
     curve = np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
-    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, curve), dtype=np.uint8)
+    out = rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, curve), dtype=np.uint8)
+    if gain <= 1 / LARGE_GAIN:
+        out[(rgb == 255).any(axis=2)] = 0
+    return out
+
+
+def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.0) -> tuple[float, float]:
+    """Range of the map's intensities that neither an image of this gain and offset saturates, whose own limit is
+    ``ceiling``, nor the map, whose limit is ``other``; all of them if the exposures hardly differ, since both saturate
+    the same pixels then."""
+    gain, offset = exposure
+    if 1 / LARGE_GAIN < gain < LARGE_GAIN:
+        return -np.inf, np.inf
+    return max(offset, 0.0), min(gain * ceiling + offset, other)
+
+
+def saturated(
+    level: Level, exposure: tuple[float, float], difference: NDArray[np.float32] | None = None
+) -> NDArray[np.bool_] | None:
+    """Pixels (h, w) bool that the image saturates, or the map if its intensities less those of the image are given;
+    None where the exposures hardly differ."""
+    darkest, brightest = shown_range(exposure, level.ceiling)
+    if brightest == np.inf:
+        return None
+    out = (level.intensity <= 0) | (level.intensity >= level.ceiling)
+    if difference is not None:
+        of_map = difference + level.intensity
+        out |= (of_map <= darkest) | (of_map >= brightest)
+    return out
+
+
+def unsaturated(level: Level, exposure: tuple[float, float]) -> Level:
+    """Level with gain and offset applied to its intensities, NaN where they are saturated and the map's are not."""
+    lit, dark = exposed(level, exposure), saturated(level, exposure)
+    return lit if dark is None else replace(lit, intensity=np.where(dark, np.float32(np.nan), lit.intensity))
 
 
 def exposed(level: Level, exposure: tuple[float, float]) -> Level:
@@ -134,7 +190,8 @@ def exposed(level: Level, exposure: tuple[float, float]) -> Level:
     gain, offset = exposure
     if (gain, offset) == (1.0, 0.0):
         return level
-    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
+    intensity = np.float32(gain) * level.intensity + np.float32(offset)
+    return Level(level.camera, level.depth, intensity, level.ceiling, shown_range(exposure, level.ceiling))
 
 
 def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
@@ -155,7 +212,9 @@ class Pyramid:
         """The levels whose widths are nearest to those configured."""
         widths = *config.tracker.widths, config.dynamics.width
         halvings = [max(0, round(np.log2(camera.width / width))) for width in widths]
-        levels = {n: Level(camera.scaled(n), *observation.halved(n)) for n in sorted(set(halvings))}
+        levels = {
+            n: Level(camera.scaled(n), *observation.halved(n), observation.ceiling) for n in sorted(set(halvings))
+        }
         *tracked, labelled = (levels[n] for n in halvings)
         return cls(tracked, labelled)
 

@@ -5,8 +5,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN, fit_exposure
 from dudmap.core.backends.threads import bands, run_bands
-from dudmap.core.frames.observation import WINDOW, scaled_window
+from dudmap.core.frames.observation import WINDOW, Pyramid, exposed, scaled_window, shown_range
 
 Number = TypeVar("Number", np.float32, np.float64)
 SIMILAR = 1.5
@@ -21,6 +22,22 @@ def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
     """Lengths (n,) of vectors (n, 2)."""
     squares = vectors * vectors
     return np.sqrt(squares[:, 0] + squares[:, 1])
+
+
+def equally_exposed(before: Pyramid, after: Pyramid) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Grey values (h, w) of two images in which corners are found again: if the light has changed, the darker image in
+    the exposure of the brighter one, and both cut to the range that neither saturates."""
+    pair = [before, after]
+    dark, bright = sorted(pair, key=lambda pyramid: float(pyramid.coarse.intensity.mean()))
+    darker, brighter = dark.coarse.intensity, bright.coarse.intensity
+    if brighter.mean() < LARGE_GAIN * darker.mean():
+        return before.fine.grey, after.fine.grey
+    seen = (brighter < bright.fine.ceiling).astype(np.float32)
+    exposure = fit_exposure(darker, brighter - darker, seen, dark.fine.ceiling)
+    low, high = shown_range(exposure, dark.fine.ceiling, bright.fine.ceiling)
+    intensities = [exposed(p.fine, exposure).intensity if p is dark else p.fine.intensity for p in pair]
+    first, second = (np.clip(255 * np.clip(i, low, high), 0, 255).astype(np.uint8) for i in intensities)
+    return first, second
 
 
 def lucas_kanade(

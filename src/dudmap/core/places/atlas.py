@@ -315,7 +315,7 @@ class Atlas(Stateful):
     def _places(self, submap: int) -> list[TimedPose | Keyframe | KeptFrame]:
         """Everything that has a pose in the world of a submap."""
         frames = [] if self.history is None else self.history.frames
-        return [place for place in (*self.poses, *self.keyframes.keyframes, *frames) if place.submap == submap]
+        return [place for place in (*self.poses, *self.keyframes.places, *frames) if place.submap == submap]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64]) -> None:
         """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); its map

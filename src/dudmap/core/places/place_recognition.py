@@ -75,6 +75,21 @@ class Keyframe:
 
 
 @dataclass(frozen=True, eq=False)
+class LastFrame:
+    """The last tracked frame; its features are extracted once a later frame is not tracked.
+
+    Attributes:
+        keyframe: Its pose, without features.
+        observation: Its images.
+        dynamic_mask: (H, W) bool, pixels without features; None for none.
+    """
+
+    keyframe: Keyframe
+    observation: Observation
+    dynamic_mask: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True, eq=False)
 class PlaceMatch:
     """A frame recognised to show the place of a keyframe.
 
@@ -107,6 +122,7 @@ class KeyframeDatabase(Stateful):
     """
 
     keyframes: Remembered[list[Keyframe]]
+    last: Remembered[LastFrame | None] = None
     _frames_since_last: Remembered[int]
 
     def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:
@@ -176,6 +192,33 @@ class KeyframeDatabase(Stateful):
         self._unsettled = submit(lambda: self._extract(observation, dynamic_mask))
         return True
 
+    def remember(
+        self,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+        dynamic_mask: NDArray[np.bool_] | None = None,
+        submap: int = 0,
+    ) -> None:
+        """Remember the last tracked frame, which a frame that is not tracked is compared with first."""
+        timestamp = observation.timestamp
+        place = Keyframe(timestamp, T_world_camera.copy(), NO_FEATURES, submap, timestamp)
+        self.last = LastFrame(place, observation, dynamic_mask)
+
+    @property
+    def places(self) -> list[Keyframe]:
+        """The keyframes and the last tracked frame."""
+        return [*self.keyframes, *([] if self.last is None else [self.last.keyframe])]
+
+    def recognise(self, features: PlacedFeatures) -> list[PlaceMatch]:
+        """Places that a frame with these features may show: the last tracked frame first, then the keyframes.
+
+        Half as many inliers suffice there: one frame is less often confused than one of many keyframes.
+        """
+        if self.last is not None and len(self.last.keyframe.features) == 0:
+            self.last.keyframe.features = self.extract(self.last.observation, self.last.dynamic_mask)
+        last = [] if self.last is None else [self.last.keyframe]
+        return self.match(features, last, self.config.min_inliers // 2) + self.match(features)
+
     def settle(self) -> None:
         """Wait for the features of the newest keyframe, and keep it if they are enough."""
         features, self._unsettled = self._unsettled(), _nothing
@@ -188,25 +231,28 @@ class KeyframeDatabase(Stateful):
         if len(self.keyframes) > self.config.max_keyframes:
             self._remove_most_redundant()
 
-    def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
+    def match(
+        self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None, min_inliers: int | None = None
+    ) -> list[PlaceMatch]:
         """Keyframes (``among`` these, None = all) that a frame with these features may show, with the frame's pose; the
-        poses are distinct, those with more inliers first."""
+        poses are distinct, those with more inliers first. ``min_inliers`` None: as configured."""
         among = self.keyframes if among is None else among
-        if len(features) < self.config.min_inliers or not among:
+        fewest = self.config.min_inliers if min_inliers is None else min_inliers
+        if len(features) < fewest or not among:
             return []
         found: list[PlaceMatch] = []
         for keyframe in _most_similar(features, among):
             pairs = match_descriptors(
                 features.descriptors, keyframe.features.descriptors, self.config.ratio, mutual=True
             )
-            if len(pairs) < self.config.min_inliers:
+            if len(pairs) < fewest:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
             T_keyframe_camera, inliers = rigid_ransac(
                 a, b, self._tolerance(a) + self._tolerance(b), self.config.min_share
             )
             num_inliers = int(np.count_nonzero(inliers))
-            if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
+            if num_inliers >= max(fewest, self.config.min_share * len(pairs)):
                 found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
         found.sort(key=lambda match: -match.num_inliers)
         distinct, nearby = list[PlaceMatch](), DUPLICATE_DISTANCE * self.sensor.reference_depth

@@ -34,9 +34,9 @@ class Relocalization:
 class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
-    A lost frame is compared with all keyframes of the atlas. Each candidate pose is verified by registering the frame
-    against the map of the candidate's submap. The atlas is read only: switching it to the submap in which the frame
-    was found, and starting a new submap, are left to the caller.
+    A lost frame is compared with the last tracked one and with all keyframes of the atlas. Each candidate pose is
+    verified by registering the frame against the map of the candidate's submap. The atlas is read only: switching it to
+    the submap in which the frame was found, and starting a new submap, are left to the caller.
 
     """
 
@@ -84,9 +84,9 @@ class Relocalizer(Stateful):
     ) -> Relocalization | None:
         """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
 
-        Candidates in the current submap are tried first, those with more matching features before others. The first
-        is taken that its registration confirms and whose registration is accepted. The view's timer receives the time
-        of feature matching as stage ``recognise``.
+        Candidates in the current submap are tried first: the pose by the last tracked frame, then those with more
+        matching features. The first is taken that its registration confirms and whose registration is accepted. The
+        view's timer receives the time of feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:
@@ -97,7 +97,7 @@ class Relocalizer(Stateful):
             keyframes = self.atlas.keyframes
             features = keyframes.extract(view.colored(), view.known_dynamic)
             self._counted = view.observation.timestamp, len(features)
-            candidates = keyframes.match(features)
+            candidates = keyframes.recognise(features)
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
         candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
         num_readings = max(np.count_nonzero(view.labelled.depth), 1)

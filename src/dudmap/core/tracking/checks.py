@@ -54,6 +54,7 @@ class Limits:
         max_dynamic_share: Configured largest share of dynamic readings.
         mode: Key of STRICTNESS.
         mostly_dynamic: Most of the readings are dynamic.
+        blind: The image says nothing.
         residual_mm, overlap, color: What was usual in the frames before; NaN where it is not known yet.
     """
 
@@ -62,6 +63,7 @@ class Limits:
     max_dynamic_share: float = 1.0
     mode: str = "tracking"
     mostly_dynamic: bool = False
+    blind: bool = False
     residual_mm: float = np.nan
     overlap: float = np.nan
     color: float = np.nan
@@ -157,6 +159,12 @@ CHECKS = (
         "verified_share",
         lambda limits: MIN_VERIFIED_SHARE if limits.mostly_dynamic else 0.0,
         "most of the readings seem to move, and only {figure:.0%} rest where the map has a surface",
+        at_least=True,
+    ),
+    Check(
+        "confirmed_share",
+        lambda limits: CONFIRMED_SHARE if limits.blind else 0.0,
+        "the image says nothing, and only {figure:.0%} of the depths agree with the last frame's",
         at_least=True,
     ),
     Check(

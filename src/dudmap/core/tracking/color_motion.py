@@ -37,7 +37,7 @@ class RegisteredLevel(Level):
     velocity: NDArray[np.float64]
 
     def __init__(self, level: Level, **attributes: object) -> None:
-        self.__dict__.update(camera=level.camera, depth=level.depth, **attributes)
+        self.__dict__.update(camera=level.camera, depth=level.depth, ceiling=level.ceiling, **attributes)
 
     @cached_property
     def intensity(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -255,3 +255,13 @@ def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: flo
     across, down = (x * vz - vx) / z - wy + y * wz + x * tilt, (y * vz - vy) / z + wx - x * wz + y * tilt
     resolved = RESOLUTION * np.maximum(1 / camera.fx, voxel_size / z)
     return 1 / (1 + (time_sigma * float(median(np.hypot(across, down) / resolved))) ** 2)
+
+
+def gain_discount(gain: float, sigma: float, color_weight: float) -> float:
+    """Factor in (0, 1] of the weight of the intensity residual of an image that is darker than the map.
+
+    A weight w of the intensities against distances of the standard deviation ``sigma`` stands for the variance
+    sigma^2 / w. Grey levels of an image that a gain g brightens are g apart, and their rounding adds (g^2 - 1) / 12.
+    """
+    rounding = max(gain * gain - 1, 0.0) / (12 * 255**2)
+    return 1 / (1 + rounding * color_weight / sigma**2)

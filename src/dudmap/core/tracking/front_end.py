@@ -6,19 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
+from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import reduced
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
+from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
-from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.quality_monitor import QualityMonitor, Verdict
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 
 NO_CHANCE = 3
@@ -46,6 +48,7 @@ class FrontEnd(Stateful):
     """
 
     last_dynamic: Remembered[NDArray[np.bool_] | None] = None
+    _brightness: Remembered[float | None] = None  # mean intensity of the last tracked image in the exposure of the map
 
     def __init__(
         self,
@@ -64,6 +67,29 @@ class FrontEnd(Stateful):
         self.motion = motion
         self.monitor = monitor
         self.color_motion = color_motion
+
+    def judged(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, last: TrackedImage | None
+    ) -> tuple[FrameView, PoseEstimate, Verdict]:
+        """A frame, its pose and labels, and the outcome of the checks.
+
+        If the checks reject the frame and the light has changed, which differs from place to place, its images say
+        nothing: it is registered and judged once more, by its distances alone, which have to determine all directions.
+        """
+        estimate = self.register(volume, view, prediction)
+        verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
+        if verdict.reason and not view.blind and self._brightness is not None and self._is_relit(view):
+            unlit = replace(view, blind=True)
+            other = self.register(volume, unlit, prediction)
+            judged = self.monitor.judge(last, unlit, other, prediction.image_pose)
+            if not judged.reason and len(other.tracking.unobservable) == 0:
+                return unlit, other, judged
+        return view, estimate, verdict
+
+    def _is_relit(self, view: FrameView) -> bool:
+        """Whether the light differs from that of the map, as far as the mean intensity of a whole image tells it."""
+        mean = float(view.pyramid.coarse.intensity.mean())
+        return self._brightness is None or not mean / LARGE_GAIN < self._brightness < LARGE_GAIN * mean
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Pose and labels of a frame, from its predicted pose on.
@@ -106,12 +132,11 @@ class FrontEnd(Stateful):
         levels, unverified = view.pyramid.tracked, prediction.unverified_mask
         tracker = self.blind_tracker if view.without_image else self.tracker
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
-        split = max(1, len(levels) - 1)
+        split, relit = max(1, len(levels) - 1), self._is_relit(view)
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with view.timer("track"):
-                found = tracker.minimize(
-                    volume, levels[:split], T_init, initial_weights(levels[:split], None, excluded)
-                )
+                coarse, weights = levels[:split], initial_weights(levels[:split], None, excluded)
+                found = tracker.minimize(volume, coarse, T_init, weights, relit=relit)
             view = self.color_motion.refined(view, found.T_world_camera)
             with view.timer("track"):
                 fine, exposure = view.pyramid.tracked[split - 1 :], found.exposure
@@ -122,7 +147,7 @@ class FrontEnd(Stateful):
             return PoseEstimate(tracking, labels, unverified, view)
         with view.timer("track"):
             coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
-            found = tracker.minimize(volume, coarse, T_init, weights)
+            found = tracker.minimize(volume, coarse, T_init, weights, relit=relit)
         view = self.color_motion.refined(view, found.T_world_camera)
         levels = view.pyramid.tracked
         labels = self._label(volume, view, prediction, found)
@@ -134,6 +159,7 @@ class FrontEnd(Stateful):
             velocity = self.motion.velocity_to(view.timestamp, pose)
             time_sigma = self.color_motion.time_sigma(self.config.sensor.color_time_sigma)
             discount = motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
+            discount *= gain_discount(exposure[0], self.config.sensor.reference_sigma, tracker.config.color_weight)
             color_weight = tracker.config.color_weight * discount
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.without_image:
@@ -165,6 +191,9 @@ class FrontEnd(Stateful):
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
+        if not view.blind:
+            (gain, offset), mean = tracking.exposure, float(view.pyramid.coarse.intensity.mean())
+            self._brightness = gain * mean + offset
         if labels is None or view.blind:
             return
         with view.timer("label"):
@@ -175,7 +204,7 @@ class FrontEnd(Stateful):
         self.monitor.lose()
         if self.motion.lost(timestamp):
             self.detector.reset()
-            self.last_dynamic = None
+            self.last_dynamic = self._brightness = None
 
     def _labels_unchanged(self, labels: Labels) -> bool:
         """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not

@@ -151,6 +151,7 @@ class ImageConsistency:
         shift, agreeing, readings, seen = compare_images(
             level.depth, level.intensity, dynamic, gaps[0], differences[0], marks[0],
             noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
+            (level.ceiling, older.ceiling),
         )  # fmt: skip
         shift = np.nan if view.without_image or last.blind else shift
         return ImageComparison(shift, agreeing / max(readings, 1), agreeing / max(seen, 1))
@@ -274,19 +275,20 @@ class QualityMonitor(Stateful):
             mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
             if self.motion.is_given:
                 return Verdict("", figures)
-            return Verdict(
-                first_failure(CHECKS, figures, self.limits(mode, mostly_dynamic=mostly_dynamic), evidence), figures
-            )
+            limits = self.limits(mode, mostly_dynamic=mostly_dynamic, blind=view.blind)
+            return Verdict(first_failure(CHECKS, figures, limits, evidence), figures)
 
     def misfit_reason(self, tracking: TrackingResult) -> str:
         """Reason why the registration of a frame at a recognised place is much worse than usual, empty if it is not."""
         return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
-    def limits(self, mode: str, *, mostly_dynamic: bool = False) -> Limits:
+    def limits(self, mode: str, *, mostly_dynamic: bool = False, blind: bool = False) -> Limits:
         """Configuration and medians of earlier registrations, from which limits follow; NaN before there are enough."""
         config, (residual, overlap, color) = self.config, self._usual
         share = config.dynamics.max_share
-        return Limits(config.tracker, config.sensor, share, mode, mostly_dynamic, 1000 * residual, overlap, color)
+        return Limits(
+            config.tracker, config.sensor, share, mode, mostly_dynamic, blind, 1000 * residual, overlap, color
+        )
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""

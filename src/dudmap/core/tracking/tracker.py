@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
-from dudmap.core.backends.cpu.exposure import fit_exposure
+from dudmap.core.backends.cpu.exposure import LARGE_GAIN, fit_exposure
 from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import (
@@ -153,6 +153,8 @@ class Tracker:
         first_level: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
         color_weight: float | None = None,
+        *,
+        relit: bool = True,
     ) -> Minimum:
         """Minimum of the distances and intensity differences of a frame to the map (eq. 4.32).
 
@@ -164,6 +166,8 @@ class Tracker:
             first_level: Index of the first of these levels in the configuration.
             exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
             color_weight: Weight of the intensity term; None takes that of the configuration.
+            relit: Whether the light may differ from that of the map; else a large gain is that of an image that shows
+                something else, and is not applied.
         """
         volume.look_at(T_init)
         T, iterations, system, settled, seen = T_init, 0, None, True, None
@@ -176,9 +180,10 @@ class Tracker:
             lit, system = exposed(level, exposure), None
             if self.config.exposure and index == 0 and first_level == 0:
                 system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
-                change = fit_exposure(lit.intensity, system.residuals[1], weights)
+                change = fit_exposure(lit.intensity, system.residuals[1], weights, lit.ceiling)
                 iterations += 1
-                if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
+                applied = relit or 1 / LARGE_GAIN < change[0] < LARGE_GAIN
+                if applied and abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
                     lit, system = exposed(level, exposure), None
             rules = self._rules(limit, finest=index == len(limits) - 1)
@@ -285,6 +290,8 @@ class Tracker:
     ) -> Descent:
         """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
         image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
+        darkest, brightest = level.shown
+        parameters = parameters._replace(darkest=darkest, brightest=brightest)
         return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
@@ -347,6 +354,8 @@ class Tracker:
             differences = differences + np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
+        if np.isfinite(level.shown[1]):  # pixels that are saturated differ by nothing
+            difference = difference[difference > 0]
         color_residual = float(median(difference)) if len(difference) else 0.0
         result = TrackingResult(
             T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,

@@ -6,24 +6,34 @@ from numpy.typing import NDArray
 from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import scalar
 
-LARGE_GAIN, MORE_ROUNDS, MAX_GAIN = 1.25, 3, 4.0
-"""A gain above this is fitted again, at most so often, and grows no further beyond the last."""
+LARGE_GAIN = 1.25
+"""A gain beyond this factor, up or down, is a change of the light."""
+FEWEST = 100
+"""Pixels that two numbers are fitted to at least."""
+LOWEST, HIGHEST = 0.5 / 255, 254.5 / 255
+"""Intensities between which an 8-bit image is not saturated."""
 
 
 @scalar
 def fit_exposure(
-    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
+    intensity: NDArray[np.float32],
+    difference: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    ceiling: float = HIGHEST,
 ) -> tuple[float, float]:
     """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
 
-    Auto-exposure changes all intensities at once; without this model such a change would look like motion. The prior of
-    the gain outweighs the low contrast of an image that is suddenly dark, so a large gain is applied and fitted again.
-    A small one is not: it is also what an image gives that shows something else.
+    Auto-exposure changes all intensities at once; without this model such a change would look like motion. Saturated
+    pixels tell nothing and are left out. A fit that changes the median or the contrast by more than LARGE_GAIN only
+    tells that the light has changed, or that the image shows something else: its prior outweighs the low contrast of a
+    dark image, and pixels beside their place flatten it. The quartiles of both images then give gain and offset
+    wherever the pixels lie; a second fit corrects them by less than LARGE_GAIN, or not at all.
 
     Args:
         intensity: (h, w) float32 of the image.
         difference: (h, w) float32 map minus image, NaN off the map.
         weights: (h, w) static weights.
+        ceiling: Intensity at which a channel of the image saturates.
     """
     h, w = intensity.shape
     used, count = np.empty(h * w, np.int32), 0
@@ -32,20 +42,31 @@ def fit_exposure(
             if np.isfinite(difference[v, u]) and weights[v, u] > 0.5:
                 used[count] = v * w + u
                 count += 1
-    if count < 100:
+    if count < FEWEST:
         return 1.0, 0.0
     stride = max(1, count // 1000)  # a thousand pixels determine two numbers well
     x, y = np.empty(-(-count // stride)), np.empty(-(-count // stride))
+    lit, x_lit, y_lit = 0, np.empty(len(x)), np.empty(len(x))
     for n in range(len(x)):
         v, u = used[n * stride] // w, used[n * stride] % w
         x[n] = intensity[v, u]
         y[n] = x[n] + difference[v, u]
-    gain, offset = 1.0, 0.0
-    for _ in range(1 + MORE_ROUNDS):
-        change, shift = _fit(gain * x + offset, y)
+        if LOWEST < x[n] < min(ceiling, HIGHEST) and LOWEST < y[n] < HIGHEST:
+            x_lit[lit], y_lit[lit] = x[n], y[n]
+            lit += 1
+    if lit < FEWEST:
+        return 1.0, nth(y, len(y) // 2) - nth(x, len(x) // 2)
+    x, y = x_lit[:lit], y_lit[:lit]
+    gain, offset = _fit(x, y)
+    low, middle, high = lit // 4, lit // 2, 3 * lit // 4
+    brightening = gain + offset / max(nth(x, middle), LOWEST)
+    if 1 / LARGE_GAIN < min(gain, brightening) and max(gain, brightening) < LARGE_GAIN:
+        return gain, offset
+    gain = (nth(y, high) - nth(y, low)) / max(nth(x, high) - nth(x, low), LOWEST)
+    offset = nth(y, middle) - gain * nth(x, middle)
+    change, shift = _fit(gain * x + offset, y)
+    if 1 / LARGE_GAIN < change < LARGE_GAIN:
         gain, offset = change * gain, change * offset + shift
-        if change < LARGE_GAIN or gain > MAX_GAIN / change:
-            break
     return gain, offset
 
 

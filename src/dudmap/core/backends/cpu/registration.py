@@ -15,7 +15,7 @@ from dudmap.core.backends.parameters import BLOCK, ImageStack, NormalEquations
 from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.damping import accelerated, damped_step, judged, moved
 from dudmap.core.formulas.pixel import elements, rotate
-from dudmap.core.formulas.residual import normal_terms, trilinear, weigh
+from dudmap.core.formulas.residual import normal_terms, trilinear, weigh, within_range
 from dudmap.core.formulas.voxel import intensity_of, sdf_steps
 
 NUM_SUMS = 32
@@ -124,9 +124,9 @@ def linearize_rows(
             i4, i5, i6, i7 = intensity_of(c4), intensity_of(c5), intensity_of(c6), intensity_of(c7)
             darkest = min(min(min(i0, i1), min(i2, i3)), min(min(i4, i5), min(i6, i7)))
             shade, kx_, ky_, kz_ = trilinear(i0, i1, i2, i3, i4, i5, i6, i7, ax, ay, az)
-            rc = shade * by_255 - intensity[v, u]
             scale_c = by_255 * by_voxel
             kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
+            rc, kx_, ky_, kz_ = within_range(shade * by_255, kx_, ky_, kz_, intensity[v, u], parameters)
 
             known = (low > 0) & (wanted[u] > 0) & (darkest > zero)  # a corner in the air is not part of a surface
             valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, weights[v, u], known, parameters)

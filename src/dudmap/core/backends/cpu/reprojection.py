@@ -142,7 +142,7 @@ ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
 @exact
-def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewest):
+def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewest, ceilings):
     """Distance by which two images lie beside each other, and how many of their readings agree.
 
     Args:
@@ -151,9 +151,11 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
         gap, difference, marks: Of the older image, whose moving pixels are marked, see ``Reprojection``.
         noise: NoiseParameters, all float32.
         fewest: Pixels that must show the same static surface in both.
+        ceilings: Intensities from which on this and the older image are saturated.
 
     Returns:
-        The distance, see ``ImageConsistency.compare``; pixels, NaN where it is not known. Readings whose depth agrees
+        The distance, see ``ImageConsistency.compare``; pixels, NaN where it is not known, as where too few pixels are
+        left that neither image saturates. Readings whose depth agrees
         within AGREEING_SIGMAS, all readings, and those at whose place the older image has one.
     """
     h, w = depth.shape
@@ -171,11 +173,12 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
             count += common[v, u]
     if count < fewest:
         return np.nan, agreeing, readings, seen
-    gain, offset = fit_exposure(intensity, difference, common)
+    gain, offset = fit_exposure(intensity, difference, common, ceilings[0])
     slope, shift, count = np.float32(1 - gain), np.float32(offset), 0
     for v in range(h):
         for u in range(w):
-            if common[v, u]:
+            older = difference[v, u] + intensity[v, u]
+            if common[v, u] and ZERO < intensity[v, u] < ceilings[0] and ZERO < older < ceilings[1]:
                 down = intensity[min(v + 1, h - 1), u] - intensity[max(v - 1, 0), u]
                 across = intensity[v, min(u + 1, w - 1)] - intensity[v, max(u - 1, 0)]
                 down = HALF * down if 0 < v < h - 1 else down
@@ -183,6 +186,8 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
                 contrasts[count] = np.sqrt(down * down + across * across)
                 errors[count] = abs(difference[v, u] + slope * intensity[v, u] - shift)
                 count += 1
-    contrast = np.float64(nth(contrasts[:count], count // 2))
+    if count < fewest:
+        return np.nan, agreeing, readings, seen
+    contrast = gain * np.float64(nth(contrasts[:count], count // 2))
     error = np.float64(nth(errors[:count], count // 2))
     return (np.sqrt(2.0) * error / contrast if contrast > 0 else np.nan), agreeing, readings, seen

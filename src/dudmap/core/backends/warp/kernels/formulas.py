@@ -114,5 +114,5 @@ sdf_steps, intensity_of = warp_function(voxel.sdf_steps), warp_function(voxel.in
 fuse_voxel, fuse_color = warp_function(voxel.fuse_voxel), warp_function(voxel.fuse_color)
 is_occupied = warp_function(voxel.is_occupied)
 trilinear, weigh = warp_function(residual.trilinear), warp_function(residual.weigh)
-normal_terms = warp_function(residual.normal_terms)
+normal_terms, within_range = warp_function(residual.normal_terms), warp_function(residual.within_range)
 corner_weight = warp_function(sampling.corner_weight)

@@ -19,6 +19,7 @@ from dudmap.core.backends.warp.kernels.formulas import (
     transform,
     trilinear,
     weigh,
+    within_range,
 )
 from dudmap.core.backends.warp.kernels.structs import Camera, Image, Lattice, RegistrationParameters
 
@@ -95,8 +96,9 @@ def linearize(
                 intensity_of(c[0]), intensity_of(c[1]), intensity_of(c[2]), intensity_of(c[3]),
                 intensity_of(c[4]), intensity_of(c[5]), intensity_of(c[6]), intensity_of(c[7]), ax, ay, az,
             )  # fmt: skip
-            r, rc = distance * sdf_unit, shade * by_255 - intensity[v, u]
             scale = by_255 * by_voxel
+            r = distance * sdf_unit
+            rc, kx, ky, kz = within_range(shade * by_255, kx * scale, ky * scale, kz * scale, intensity[v, u], p)
             static = weights[v, u]
             valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, static, known, p)
             residuals[0, v, u] = wp.where(known, r, wp.nan)
@@ -105,7 +107,7 @@ def linearize(
                 a00, a01, a02, a11, a12, a22, m00, m01, m02, m10, m11, m12, m20, m21, m22,
                 n00, n01, n02, n11, n12, n22, b0, b1, b2, b3, b4, b5,
             ) = normal_terms(
-                wg, wc, dx * by_unit, dy * by_unit, dz * by_unit, kx * scale, ky * scale, kz * scale, r, rc,
+                wg, wc, dx * by_unit, dy * by_unit, dz * by_unit, kx, ky, kz, r, rc,
                 rx * voxel_size, ry * voxel_size, rz * voxel_size,
             )  # fmt: skip
             s += Sums(
