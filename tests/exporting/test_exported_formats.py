@@ -23,10 +23,10 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting.exporters import EXPORTERS, export_run
-from dudmap.io.exporting.gravity import find_floor
 from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.mesh_files import linear_light
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
+from dudmap.io.exporting.up import find_floor
 from exported_runs import CAMERA, VOXEL, make_run
 
 

@@ -34,8 +34,8 @@ def render(
     """
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory
-    from dudmap.io.exporting.gravity import up_of
     from dudmap.io.exporting.run_content import ExportOptions, RunContent
+    from dudmap.io.exporting.up import up_of
 
     orbit = orbit or (trajectory is None and out.suffix.lower() == rendering.PICTURE)
     if (trajectory is None) == (not orbit):

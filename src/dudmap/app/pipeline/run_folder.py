@@ -6,7 +6,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,12 @@ from dudmap.app.pipeline.storing import FILES as STATE_FILES
 from dudmap.app.pipeline.usefulness import uselessness
 from dudmap.atomic_file import UNFINISHED, write_image, write_text, writing
 from dudmap.config import Config
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.mesh_pieces import save_pieces
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import DudmapError, MapError
+from dudmap.errors import DatasetError, DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
+from dudmap.io.exporting.up import find_up
 from dudmap.io.sequences import is_recording
 from dudmap.own_folder import OwnFolder, make_folder, remove_files
 
@@ -46,6 +48,8 @@ FILES = (
 )  # fmt: skip
 IGNORED = "ignored.png"
 """Copy of the mask of the pixels that never count."""
+FACES = 20_000
+"""Triangles among which the direction against gravity is looked for, as by ``diff``: a tenth of a second."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
@@ -209,6 +213,8 @@ def write_run_folder(
         correction = poses.corrections(trajectory) if poses.role == "refined" else None
         metrics["poses"] = {"role": poses.role, "given": len(poses.trajectory), "correction": correction}
 
+    thinned: list[Mesh] = []
+
     def save_mesh() -> None:
         if volume.pager is not None:  # the mesh may not fit into the memory either
             vertices, triangles = save_pieces(volume.extract_pieces(), out / "mesh.ply")
@@ -216,7 +222,11 @@ def write_run_folder(
             mesh = volume.extract_mesh()
             vertices, triangles = len(mesh.vertices), len(mesh.faces)
             mesh.save(out / "mesh.ply")
+            thinned.append(replace(mesh, faces=mesh.faces[:: max(1, triangles // FACES)]))
         metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
+
+    def find_direction() -> None:
+        metrics["up"] = _up(sequence, trajectory, thinned[0] if thinned else None)
 
     def save_metrics() -> None:
         metrics["useless"] = None if slam.localize else uselessness(metrics, len(trajectory), config.depth_limits)
@@ -247,6 +257,7 @@ def write_run_folder(
             steps.append(lambda: volume.save(out / "map.npz"))
             if config.system == "dudmap":
                 steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
+    steps.append(find_direction)
     for number, (path, part) in enumerate(others, start=2):
         steps += [
             partial(path.save, out / f"trajectory-{number}.txt"),
@@ -268,6 +279,20 @@ def write_run_folder(
     if problems and not defect:
         raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
     return RunReport(out, metrics, trajectory)
+
+
+def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None) -> dict[str, Any] | None:
+    """The entry ``up`` of metrics.json; None without poses."""
+    measured, problem = None, ""
+    try:
+        gravity = getattr(sequence, "gravity", None)
+        measured = None if gravity is None else gravity.in_world(poses)
+    except DatasetError as error:
+        problem = f"gravity is not used: {error}"
+    if not len(poses):
+        return None
+    up = find_up(mesh, poses, measured)
+    return (up._replace(contradiction=up.contradiction or problem)).metrics(measured)
 
 
 def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:

@@ -1,7 +1,4 @@
-"""Where up is in a map, and at which height its floor lies.
-
-A direction without length, and a map without a floor where one is needed, are a ``ConfigError``.
-"""
+"""Level surfaces and the floor of a map, and axes that stand on it. A direction without length is a ``ConfigError``."""
 
 from typing import NamedTuple
 
@@ -11,7 +8,6 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.mesh_editing import face_vectors
-from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 CONE = np.cos(np.radians(45))
 """The floor's normal is looked for within 45 degrees of the mean direction that the cameras held up."""
@@ -39,42 +35,13 @@ class Floor(NamedTuple):
     height: float
 
 
-def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
-    """Unit vector (3,) against gravity: the given one, else the normal of level surfaces, else what cameras held up."""
-    if options.up is not None:
-        return _unit(options.up)
-    floor = _floor(run, options)
-    return _mean_camera_up(run) if floor is None else floor.up
-
-
-def find_floor(run: RunContent, options: ExportOptions) -> Floor:
-    """The floor of a map."""
-    floor = _floor(run, options)
-    if floor is None:
-        raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
-    return floor
-
-
-def _floor(run: RunContent, options: ExportOptions) -> Floor | None:
-    """The floor along the given direction, else by level surfaces; None if there is none."""
-    up = level_normal(run.surface, _mean_camera_up(run)) if options.up is None else _unit(options.up)
-    height = None if up is None else floor_height(run.surface, up)
-    if up is None or height is None:
-        return None
-    return Floor(up, height) if options.up is not None else fitted(run.surface, Floor(up, height))
-
-
-def _mean_camera_up(run: RunContent) -> NDArray[np.float64]:
-    """Mean direction (3,) of the upper edge of the images."""
-    return _unit(-run.trajectory.Ts_world_camera[:, :3, 1].mean(axis=0))
-
-
-def level_normal(mesh: Mesh, held: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one."""
+def level_normal(mesh: Mesh, held: NDArray[np.float64], cone: float = CONE) -> NDArray[np.float64] | None:
+    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one; ``cone`` is
+    the cosine of the largest angle between both."""
     vectors = face_vectors(mesh)
     areas = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
     normals = vectors / areas[:, None]
-    near = np.flatnonzero(normals @ held > CONE)
+    near = np.flatnonzero(normals @ held > cone)
     if len(near) == 0:
         return None
     normals, sizes = normals[near], areas[near]
@@ -87,7 +54,7 @@ def level_normal(mesh: Mesh, held: NDArray[np.float64]) -> NDArray[np.float64] |
         return None
     for _ in range(3):
         around = normals @ best > PARALLEL
-        best = _unit((normals[around] * sizes[around, None]).sum(axis=0))
+        best = unit((normals[around] * sizes[around, None]).sum(axis=0))
     return best
 
 
@@ -143,10 +110,10 @@ def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:
         forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
-    return _unit(forward)
+    return unit(forward)
 
 
-def _unit(vector: tuple[float, ...] | NDArray[np.float64]) -> NDArray[np.float64]:
+def unit(vector: tuple[float, ...] | NDArray[np.float64]) -> NDArray[np.float64]:
     """Vector of length 1."""
     values = np.asarray(vector, np.float64)
     length = float(np.linalg.norm(values))

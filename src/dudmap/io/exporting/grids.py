@@ -14,9 +14,10 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import ConfigError
-from dudmap.io.exporting.gravity import find_floor, z_up
+from dudmap.io.exporting.gravity import z_up
 from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
+from dudmap.io.exporting.up import Up, checked_floor, run_up
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Values of cells, those of ROS' ``nav_msgs/OccupancyGrid``."""
@@ -138,7 +139,7 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     float32, metres; ``origin`` (3,), lower corner of the first cell; ``resolution``, metres; ``T_grid_map`` (4, 4)
     from the world of the run to the axes of the grid: z up from the floor, x along the first view.
     """
-    mesh, grid = _grid(run, options)
+    mesh, grid, _ = _grid(run, options)
     with atomic_file(path) as file:
         np.savez_compressed(
             file, format=FORMAT, occupancy=grid.occupancy, esdf=grid.distances(mesh), origin=grid.origin,
@@ -150,7 +151,7 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write ``map.yaml`` and ``map.pgm`` beside it, as nav2's map server reads them."""
     if not options.heights[0] < options.heights[1]:
         raise ConfigError(f"found --heights {options.heights}; expected the lower one first")
-    _, grid = _grid(run, options)
+    _, grid, up = _grid(run, options)
     cells = flat(grid, options.heights)
     image = np.select([cells == value for value in PIXELS], list(PIXELS.values()))
     picture = path.with_suffix(".pgm")
@@ -160,6 +161,7 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
     numbers = " ".join(f"{number:.6f}" for number in grid.T_grid_map.reshape(-1))
     lines = [
         f"# heights {options.heights[0]:g} to {options.heights[1]:g} m above the floor",
+        *(f"# {said}" for said in (f"up: {up.source} ({up.evidence})", up.contradiction) if said),
         f"# motion from the world of the run to this map, by rows: {numbers}",
         f"image: {picture.name}",
         "mode: trinary",
@@ -187,7 +189,7 @@ def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
     return np.select([np.any(inside == OCCUPIED, axis=2), free], [OCCUPIED, FREE], UNKNOWN).astype(np.int8)
 
 
-def _grid(run: RunContent, options: ExportOptions) -> tuple[Mesh, SpaceGrid]:
-    """The chosen part of the surface, and the space around it."""
-    mesh = edited(run.surface, options)
-    return mesh, SpaceGrid.of(run.volume, mesh, z_up(find_floor(run, options)), options.resolution)
+def _grid(run: RunContent, options: ExportOptions) -> tuple[Mesh, SpaceGrid, Up]:
+    """The chosen part of the surface, the space around it, and the direction that is up in it."""
+    mesh, up = edited(run.surface, options), run_up(run, options)
+    return mesh, SpaceGrid.of(run.volume, mesh, z_up(checked_floor(run, up)), options.resolution), up

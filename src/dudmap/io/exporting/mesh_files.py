@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import atomic_file, atomic_path, put_in_place
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.extras import extra
-from dudmap.io.exporting.gravity import up_of, y_up
+from dudmap.io.exporting.gravity import y_up
 from dudmap.io.exporting.mesh_editing import edited, rotated
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
+from dudmap.io.exporting.up import up_of
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
 """Component types of accessors."""
