@@ -71,6 +71,12 @@ class BagWriter:
         stamped = self.type("geometry_msgs/msg/TransformStamped")(self.header(stamp, parent), child, motion)
         return self.type("tf2_msgs/msg/TFMessage")([stamped])
 
+    def imu(self, stamp, frame, acceleration):
+        vector, none = self.type("geometry_msgs/msg/Vector3"), np.zeros(9)
+        turn = self.type("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0)
+        parts = turn, none, vector(0.0, 0.0, 0.0), none, vector(*map(float, acceleration)), none
+        return self.type("sensor_msgs/msg/Imu")(self.header(stamp, frame), *parts)
+
     def close(self):
         self.writer.close()
 

@@ -139,7 +139,7 @@ def test_gravity_that_contradicts_the_poses_is_not_used():
 
 def test_a_given_direction_that_contradicts_gravity_is_taken_and_said():
     mesh, poses, true = scanned(0, 60)
-    measured = Gravity.of_poses(poses, tuple(true), "odometry.csv").in_world(poses)
+    measured = Gravity(poses.timestamps, true @ poses.Ts_world_camera[:, :3, :3], "odometry.csv").in_world(poses)
     up = find_up(mesh, poses, measured, tuple(-true))
     assert up.source == "given"
     assert "180 degrees off the gravity of odometry.csv" in up.contradiction

@@ -10,7 +10,7 @@ import pytest
 from device_layouts import arkit_scenes, polycam, stray_scanner
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import open_sequence
-from dudmap.io.sequences.phones import Video
+from dudmap.io.sequences.video import Video
 from layout_images import color
 from layouts import write
 

@@ -287,6 +287,8 @@ def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None)
     try:
         gravity = getattr(sequence, "gravity", None)
         measured = None if gravity is None else gravity.in_world(poses)
+        if gravity is not None and measured is None:
+            problem = f"gravity of {gravity.source} is not used: none of its times is near a pose"
     except DatasetError as error:
         problem = f"gravity is not used: {error}"
     if not len(poses):

@@ -19,6 +19,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError, printable
 from dudmap.input_files import damaged
 from dudmap.io.sequences import intrinsics
+from dudmap.io.sequences.gravity import Gravity
 
 __all__ = ["Recording", "Sequence", "has_color", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
 
@@ -82,6 +83,7 @@ class Recording(ABC):
         remarks: Sentences on what was left out because no run needs it, or assumed.
         timed: Whether the times were read or their rate was given; False where they are invented.
         has_color: Whether there are colour images; without, the ``color`` of all frames is None.
+        gravity: Directions against gravity that were measured, if they are; reading them may raise a ``DatasetError``.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
 
@@ -99,6 +101,7 @@ class Recording(ABC):
     calibration: Calibration | None = None
     timestamps: NDArray[np.float64]
     ground_truth: Trajectory | None = None
+    gravity: Gravity | None = None
     sources: dict[str, str]
     opened: dict[str, Any]
     remarks: Iterable[str] = ()

@@ -24,7 +24,9 @@ from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.io.exporting.ros_messages import seconds_of
 from dudmap.io.sequences import Recording, bag_messages, intrinsics
 from dudmap.io.sequences.bag_file import BagFile, MessageTimes
+from dudmap.io.sequences.bag_imu import gravity_of, is_realsense_optical
 from dudmap.io.sequences.bag_messages import STATIC_TOPIC, TOPIC, TransformTree, motion_of
+from dudmap.io.sequences.gravity import Gravity
 from dudmap.io.sequences.image_folder import PROBES, size
 from dudmap.io.sequences.intrinsics import Lens
 
@@ -130,6 +132,19 @@ class RosBag(Recording):
         """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
         with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()
+
+    @cached_property
+    def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What the IMU measured, None without one; read from the bag when first asked for."""
+        with foreign(DatasetError, f"the accelerations in {self.path}"):
+            return gravity_of(self._bag, self._rotation_of)
+
+    def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
+        """Rotation (3, 3) of vectors in the frame of an IMU into the depth camera, None if it is unknown."""
+        T = self._transforms.between(self._depth_frame, imu)
+        if T is None:
+            return np.eye(3) if is_realsense_optical(imu, self._depth_frame) else None
+        return T[:3, :3]
 
     def _true_poses(self) -> Trajectory | None:
         world, frame = self._topics.world, self._depth_frame
@@ -317,6 +332,10 @@ class RealSenseRecording(RosBag):
             return found
         recorded = found.recorded[kept]
         return MessageTimes(recorded, np.array([stamps[int(time)] for time in recorded]), True)
+
+    def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
+        """The file gives accelerations in the axes of the depth camera."""
+        return np.eye(3)
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
         """Motion through the reference of both streams, whose points the file takes to either stream."""

@@ -25,9 +25,14 @@ class Gravity(NamedTuple):
     source: str
 
     @classmethod
-    def of_poses(cls, poses: Trajectory, up: tuple[float, float, float], source: str) -> "Gravity":
-        """Readings of camera poses in a world whose direction against gravity is known."""
-        return cls(poses.timestamps, np.asarray(up) @ poses.Ts_world_camera[:, :3, :3], source)
+    def of_rotations(
+        cls, rotations: list[tuple[float, NDArray[np.float64]]], up: tuple[float, float, float], source: str
+    ) -> "Gravity | None":
+        """Readings of timed rotations (3, 3) of the camera into a world whose direction against gravity is known."""
+        if not rotations:
+            return None
+        ups = np.array([np.asarray(up) @ R for _, R in rotations])
+        return cls(np.array([stamp for stamp, _ in rotations]), ups, source)
 
     def in_world(self, poses: Trajectory) -> "MeasuredUp | None":
         """The mean direction in the world of a run with these poses; None if no reading is near one of them."""

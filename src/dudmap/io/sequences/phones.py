@@ -8,7 +8,6 @@ import math
 import re
 from functools import cached_property
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,25 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile
-from dudmap.core.geometry.camera import LARGEST_PIXELS, Camera
+from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
-from dudmap.input_files import open_plain, read_json, read_text
+from dudmap.input_files import damaged, read_json, read_text
 from dudmap.io.sequences import images
 from dudmap.io.sequences.camera_files import values_of
+from dudmap.io.sequences.gravity import Gravity
 from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, size
 from dudmap.io.sequences.intrinsics import Intrinsics, camera_values
 from dudmap.io.sequences.pose_matrices import OPENGL_AXES, read_matrix, rigid_trajectory
+from dudmap.io.sequences.video import Video
+
+Y_UP, Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+"""Directions against gravity in worlds of ARKit, which aligns them to it, and in those that were turned after it."""
+
+
+def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
+    """Times and rotations (3, 3) of poses."""
+    return list(zip(poses.timestamps.tolist(), poses.Ts_world_camera[:, :3, :3], strict=True))
 
 
 class ArkitFolder(ImageFolder):
@@ -74,7 +83,22 @@ class StrayScannerSequence(ArkitFolder):
         return self._one_view([camera_values(K[0, 0], K[1, 1], K[0, 2], K[1, 2])], "camera_matrix.csv")
 
     @cached_property
-    def _video(self) -> "Video":
+    def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The world of the odometry has y up; its poses have our camera axes."""
+        file = self.path / "odometry.csv"
+        header, *rows = (line.replace(" ", "").split(",") for line in read_text(file).splitlines() if line.strip())
+        if not {"qx", "qy", "qz", "qw"} <= set(header):
+            return None
+        with damaged(DatasetError, file):
+            columns = [header.index(name) for name in ("timestamp", "qx", "qy", "qz", "qw")]
+            numbers = np.array([[float(row[column]) for column in columns] for row in rows]).reshape(-1, 5)
+            numbers = numbers[np.all(np.isfinite(numbers), axis=1)]
+            return Gravity.of_rotations(
+                [(row[0], se3.quat_xyzw_to_rotation(row[1:])) for row in numbers], Y_UP, file.name
+            )
+
+    @cached_property
+    def _video(self) -> Video:
         return Video(self.path / "rgb.mp4")
 
     def _read_color(self, path: Path) -> NDArray[np.uint8]:
@@ -121,6 +145,12 @@ class ArkitScenesSequence(ArkitFolder):
             T_camera_world[:3, :3], T_camera_world[:3, 3] = se3.exp_rotation(row[1:4]), row[4:]
             poses.append((float(row[0]), se3.inverse(T_camera_world)))
         return rigid_trajectory(poses)
+
+    @property
+    def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The world of the poses has z up."""
+        poses = self.ground_truth
+        return None if poses is None else Gravity.of_rotations(_rotations(poses), Z_UP, "lowres_wide.traj")
 
 
 class PolycamSequence(ArkitFolder):
@@ -171,8 +201,17 @@ class PolycamSequence(ArkitFolder):
         return self._one_view(found, f"{self._kind}cameras")
 
     def _find_ground_truth(self) -> Trajectory | None:
-        if not self._kind:
-            return None
+        return self._poses() if self._kind else None
+
+    @cached_property
+    def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The world of all cameras has y up."""
+        with damaged(DatasetError, self.path / f"{self._kind}cameras"):
+            poses = self._poses()
+            return None if poses is None else Gravity.of_rotations(_rotations(poses), Y_UP, f"{self._kind}cameras")
+
+    def _poses(self) -> Trajectory | None:
+        """Poses of the cameras, estimates of ARKit or corrected ones."""
         poses = []
         for number, tree in self._cameras.items():
             T = np.eye(4)
@@ -288,99 +327,3 @@ class NerfstudioSequence(ImageFolder):
 def _order(frame: dict[str, Any]) -> tuple[int, str]:
     """Name of the image, shorter ones first, so that frame_2 comes before frame_10."""
     return len(frame["file_path"]), frame["file_path"]
-
-
-MARK = b"ftyp"
-"""Bytes 4 to 8 of an MP4 file. Without this check the decoder guesses the format, and playlists name other files."""
-
-
-EXACT = 1e-5
-"""Largest error of a number that is computed from a time; a frame left out in an hour changes the mean rate more."""
-FAR = 60
-"""Frames ahead up to which decoding all frames costs less than a search."""
-
-
-class Video:
-    """Frames of an MP4 file by number.
-
-    Frames that are asked for in order are decoded one after the other. Others are searched for in videos of a constant
-    rate, where the time of a frame tells its number; elsewhere, or where the search ends at another frame, all frames
-    are decoded from the beginning.
-
-    Args:
-        path: The file.
-
-    Raises:
-        DatasetError: The file is no MP4 video that can be decoded, or its frames are too large.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with open_plain(path) as file:
-            head = file.read(8)
-        if head[4:] != MARK:
-            raise DatasetError(f"{path} is not an MP4 video; expected one as the recording application writes it")
-        self._lock = Lock()
-        self._constant: bool | None = None  # the rate of the frames, once it is needed
-        self._open()
-
-    def _open(self) -> None:
-        import cv2
-
-        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the depth images are not turned either
-        width, height = (self._capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if not self._capture.isOpened() or not 0 < width * height <= LARGEST_PIXELS:
-            raise DatasetError(
-                f"{self.path} cannot be decoded: it is damaged, not copied to its end (where its index stands), or has "
-                f"frames of more than {LARGEST_PIXELS / 1e6:.0f} million pixels"
-            )
-        self._next = 0
-
-    def _jump(self, index: int) -> None:
-        """Go to a frame that is not near, or to the beginning."""
-        import cv2
-
-        self._open()
-        if index > FAR and self._constant is None:
-            last = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) - 1
-            step = self._next_is(0) and self._next_is(1)
-            self._constant = step and self._finds(last) and not self._capture.grab()
-        if index > FAR and self._constant and self._finds(index):
-            self._next = index + 1
-        elif index > FAR:
-            self._open()
-
-    def _finds(self, index: int) -> bool:
-        """Whether a search for a frame ends there."""
-        import cv2
-
-        self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-        return self._next_is(index)
-
-    def _next_is(self, index: int) -> bool:
-        """Whether the time of the next frame is that of this number at the mean rate."""
-        import cv2
-
-        rate = self._capture.get(cv2.CAP_PROP_FPS) / 1000
-        return self._capture.grab() and abs(self._capture.get(cv2.CAP_PROP_POS_MSEC) * rate - index) < EXACT
-
-    def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Frame (H, W, 3), RGB.
-
-        Raises:
-            FrameError: The video has fewer frames, or is damaged there.
-        """
-        import cv2
-
-        with self._lock:
-            if not self._next - 1 <= index <= self._next + FAR:
-                self._jump(index)
-            while self._next <= index:
-                if not self._capture.grab():
-                    raise FrameError(f"{self.path} has no frame {index}; it ends after {self._next} frames")
-                self._next += 1
-            found, image = self._capture.retrieve()
-        if not found:
-            raise FrameError(f"frame {index} of {self.path} cannot be decoded")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
