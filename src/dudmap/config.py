@@ -425,9 +425,9 @@ class Config(ConfigSection):
                 if not isinstance(branch, dict):
                     raise ConfigError(f"{key.strip()} is not a key: {part} holds a value")
             branch[parts[-1]] = _value(text.strip())
-        tree = _without_preset(tree)
-        _check_keys(tree)
-        return self.from_tree(_merged(self.model_dump(), tree))
+        known = _without_preset(tree)
+        _check_keys(known)
+        return self.from_tree(_merged(self.model_dump(), known))
 
     def check_used(self) -> None:
         """Refuse parameters that differ from their defaults and that ``system`` does not have.

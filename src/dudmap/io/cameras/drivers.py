@@ -306,7 +306,7 @@ class IPhoneCamera(LiveCamera):
             raise CameraError("the iPhone sends no frames; press the red button of USB streaming in Record3D")
         frame = self._frame()
         own = self._stream.get_intrinsic_mat()
-        color = Camera(own.fx, own.fy, own.tx, own.ty, frame.color.shape[1], frame.color.shape[0])
+        color = Camera(own.fx, own.fy, own.tx, own.ty, frame.rgb.shape[1], frame.rgb.shape[0])
         self.camera = color.resized(frame.depth.shape[1], frame.depth.shape[0])
         calibration = Calibration(color)
         self.calibration = None if calibration.is_registered(self.camera) else calibration

@@ -115,7 +115,7 @@ def write_report(
 
 
 HUBER, DAMPING, VOXEL, WEIGHT = "thesis.rho", "thesis.lambda_0", "thesis.tau", "thesis.upsilon"
-TABLES: Mapping[str, dict[str, list[float]]] = {
+TABLES: Mapping[str, dict[str, list[Any]]] = {
     "6.1": {HUBER: [0.005, 0.01, 0.025], DAMPING: [0.002, 0.01, 0.02], VOXEL: [0.01, 0.02, 0.05],
             WEIGHT: [0.025, 0.1, 0.175]},
     "6.2": {WEIGHT: [0.1, 0.11, 0.12, 0.125, 0.1275, 0.13, 0.1325, 0.14, 0.15, 0.175]},

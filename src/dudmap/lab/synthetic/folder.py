@@ -55,7 +55,7 @@ def write_folder(
             for index in range(len(sequence)):
                 frame, mask = sequence[index], sequence.mask(index)
                 name = f"{frame.timestamp:.6f}.png"
-                pending.append(pool.submit(_write_image, out / "rgb" / name, frame.color[..., ::-1]))
+                pending.append(pool.submit(_write_image, out / "rgb" / name, frame.rgb[..., ::-1]))
                 pending.append(pool.submit(_write_image, out / "depth" / name, _quantised(sequence, frame.depth)))
                 pending.append(pool.submit(_write_image, out / "masks" / name, mask.astype(np.uint8) * 255))
                 movers.write(_movers_line(sequence, index) + "\n")

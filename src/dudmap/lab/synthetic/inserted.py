@@ -58,5 +58,5 @@ class WithThing:
         points = self.camera.backproject(np.where(shown, rendering.depth, 0))[shown].astype(np.float64)
         self.seen.append(points @ T[:3, :3].T + T[:3, 3])
         return replace(
-            frame, depth=np.where(shown, depth, frame.depth), color=np.where(before[..., None], color, frame.color)
+            frame, depth=np.where(shown, depth, frame.depth), color=np.where(before[..., None], color, frame.rgb)
         )

@@ -212,7 +212,7 @@ class SyntheticSequence:
             while len(self._kept) > 2:
                 self._kept.popitem(last=False)
         frame, mask = self._kept[index]
-        return replace(frame, depth=frame.depth.copy(), color=frame.color.copy()), mask
+        return replace(frame, depth=frame.depth.copy(), color=frame.rgb.copy()), mask
 
     def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
         """What the sensor measures apart from noise: depth with its systematic errors, colour with its exposure."""

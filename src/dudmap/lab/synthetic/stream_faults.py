@@ -157,16 +157,16 @@ def scaled(frame: Frame, factor: float) -> Frame:
 
 
 def _exposed(frame: Frame, gain: float) -> Frame:
-    return replace(frame, color=np.clip(frame.color * gain, 0, 255).astype(np.uint8))
+    return replace(frame, color=np.clip(frame.rgb * gain, 0, 255).astype(np.uint8))
 
 
 def black(frame: Frame) -> Frame:
     """Colour without light."""
-    return replace(frame, color=np.zeros_like(frame.color))
+    return replace(frame, color=np.zeros_like(frame.rgb))
 
 
 def _half_size(frame: Frame) -> Frame:
-    depth, color = frame.depth[::2, ::2], frame.color[::2, ::2]
+    depth, color = frame.depth[::2, ::2], frame.rgb[::2, ::2]
     return replace(frame, depth=np.ascontiguousarray(depth), color=np.ascontiguousarray(color))
 
 
