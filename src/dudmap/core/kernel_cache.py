@@ -6,7 +6,6 @@ this user in the temporary folder, or are compiled in memory.
 
 import multiprocessing
 import os
-import pickle
 import stat
 import tempfile
 import warnings
@@ -73,7 +72,7 @@ class _Cache(caching.FunctionCache):
         """The compiled form for a signature, None if it has to be compiled."""
         try:
             return super().load_overload(sig, target_context)
-        except (OSError, EOFError, pickle.UnpicklingError):
+        except (OSError, EOFError, caching.pickle.UnpicklingError):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
@@ -81,7 +80,7 @@ class _Cache(caching.FunctionCache):
         try:
             try:
                 super().save_overload(sig, data)
-            except (EOFError, pickle.UnpicklingError):  # the list of what is stored is damaged
+            except (EOFError, caching.pickle.UnpicklingError):  # the list of what is stored is damaged
                 self.flush()
                 super().save_overload(sig, data)
         except OSError as error:
