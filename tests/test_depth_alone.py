@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from dudmap import Camera, Config, Frame, Slam, open_sequence, run, synthetic
+from dudmap.app.pipeline.calibration import known_calibration
 from dudmap.app.pipeline.inspection import inspect
 from dudmap.core.frames.frame import GREY
 from dudmap.core.frames.stream_check import repeated
-from dudmap.errors import FrameError
+from dudmap.errors import DatasetError, FrameError
 from dudmap.evaluation.trajectory import ate
 from dudmap.lab.synthetic.folder import write_folder
 
@@ -53,12 +54,16 @@ def test_depth_alone_gives_the_true_trajectory_and_a_grey_mesh(recording):
     assert np.all(mesh.colors == mesh.colors[:, :1])
 
 
-def test_a_missing_image_in_a_map_with_colours_is_not_fused(recording):
+def test_a_missing_image_in_a_map_with_colours_paints_nothing(recording):
     slam = Slam(CAMERA, Config().override(SMALL))
-    for index in range(5):
-        frame = recording[index]
-        result = slam.process(frame if index < 4 else replace(frame, color=None))
-    assert (result.state, result.blind, result.fused, result.colorless) == ("tracked", True, False, True)
+    for index in range(4):
+        slam.process(recording[index])
+    before = slam.volume.extract_mesh().colors
+    result = slam.process(replace(recording[4], color=None))
+    assert (result.state, result.blind, result.fused, result.colorless) == ("tracked", True, True, True)
+    after = slam.volume.extract_mesh().colors
+    assert np.all(after == GREY, axis=1).sum() <= np.all(before == GREY, axis=1).sum()
+    assert abs(after.mean() - before.mean()) < 1
 
 
 def test_a_recording_of_depth_alone_is_run_and_marked(folder, tmp_path):
@@ -134,3 +139,8 @@ def test_a_depth_image_listed_as_colour_is_refused(recording, tmp_path):
     with pytest.raises(Exception, match="as depth images do; expected 8-bit"):
         open_sequence(tmp_path / "wrong")
     assert cv2.imread(str(next((tmp_path / "wrong" / "depth").iterdir())), cv2.IMREAD_UNCHANGED).dtype == np.uint16
+
+
+def test_depth_alone_has_no_colour_camera_to_calibrate(folder):
+    with pytest.raises(DatasetError, match="has no colour images: there is no colour camera to calibrate"):
+        known_calibration(open_sequence(folder), print)

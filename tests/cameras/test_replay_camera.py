@@ -53,9 +53,9 @@ def test_a_frame_that_cannot_be_read_is_delivered_as_its_error(tmp_path):
 
 def test_closing_ends_a_wait(tmp_path):
     folder = write_recording(tmp_path / "desk", 2)
-    text = (folder / "depth.txt").read_text().replace("100.100000", "160.000000")
+    text = (folder / "depth.txt").read_text().replace("100.100000", "109.000000")
     (folder / "depth.txt").write_text(text)
-    text = (folder / "rgb.txt").read_text().replace("100.104000", "160.000000")
+    text = (folder / "rgb.txt").read_text().replace("100.104000", "109.000000")
     (folder / "rgb.txt").write_text(text)
     camera = open_camera(f"replay:{folder}")
     assert camera.read().number == 0

@@ -326,8 +326,8 @@ def test_no_unit_is_asked_for_where_the_format_gives_it(tmp_path):
 
     folder, _ = write(record3d, tmp_path)
     for file in (folder / "depth").iterdir():
-        file.write_bytes(exr({"R": np.full((48, 64), 0.05, np.float32)}))
+        file.write_bytes(exr({"R": np.full((48, 64), 0.04, np.float32)}))
     (warning,) = inspect(open_sequence(folder)).warnings
-    assert warning == "nine tenths of the readings lie from 0.05 to 0.05 m, which depth cameras hardly measure"
+    assert warning == "nine tenths of the readings lie from 0.04 to 0.04 m, which depth cameras hardly measure"
     with pytest.raises(DatasetError, match=r"Record3D images, which has no --depth-unit"):
         open_sequence(folder, depth_unit=0.001)

@@ -33,7 +33,7 @@ def rotated(millimetres):
 
 
 def judged(images, scale):
-    return judge(list(range(len(images))), lambda n: images[n].astype(np.float32), scale, given=False)
+    return judge(len(images), lambda n: images[n].astype(np.float32), scale, given=False)
 
 
 def write(folder, images, place="depth"):

@@ -160,6 +160,8 @@ def calibrate_start(
 def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
     """The calibration that a recording gives, else that of registered colours; where the edges of both images
     contradict its focal length by far, which ``notice`` is told, with that at which they agree."""
+    if not has_color(sequence):
+        raise DatasetError(f"{sequence.name} has no colour images: there is no colour camera to calibrate")
     given = sequence.calibration or Calibration.registered(sequence.camera)
     magnification = color_magnification(sequence)
     if magnification is None:

@@ -1,5 +1,6 @@
 """Lists of timed files and their association by time."""
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,15 +18,22 @@ LARGEST_GAP = 0.02
 
 
 class TimedFile(NamedTuple):
-    """One line of a list: seconds and path, and the unit in which the list gives the time."""
+    """One line of a list: seconds and place of the file, and the unit in which the list gives the time."""
 
     timestamp: float
-    path: Path
+    place: str | Path
     unit: TimeUnit = SECONDS
+
+    @property
+    def path(self) -> Path:
+        """Path of the file, made when it is needed: a list may have a million lines."""
+        return Path(self.place)
 
 
 FIELD = re.compile(r""""[^"]*"|'[^']*'|[^\s,]+""")
 """A field of a list, with the quotes around it if there are any; blanks and commas separate fields."""
+PLAIN = re.compile(r"""[^\s,"']+\s+[^\s,"']+""")
+"""A row of a time and a name without blanks, commas and quotes."""
 
 
 def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[int, list[str]]]:
@@ -56,8 +64,9 @@ def _lines(path: Path, columns: str, *, short: bool = False) -> Iterator[tuple[i
     rows = lines[1:] if len(lines) > 1 and not re.search(r"\d", lines[0][1]) else lines
     if not rows:
         raise DatasetError(f"{path} lists nothing; expected lines '{columns}'")
+    fewest = len(columns.split())
     for number, line in rows:
-        if len(line.replace(",", " ").split()) < len(columns.split()) and not short:
+        if not short and len(line.replace(",", " ").split()) < fewest:
             raise DatasetError(f"{path}, line {number}: expected '{columns}', found {line!r}")
         yield number, line
 
@@ -70,10 +79,14 @@ def read_list(path: Path) -> list[TimedFile]:
     """
     numbers, stamps, names = [], [], []
     for number, line in _lines(path, "timestamp file"):
-        stamp, *rest = FIELD.finditer(line)
         numbers.append(number)
-        stamps.append(parse_stamp(path, number, stamp.group()))
-        names.append(_name(path, number, line, rest))
+        if PLAIN.fullmatch(line):  # as in nearly all lists, and ten times as fast
+            stamp, name = line.split()
+        else:
+            first, *rest = FIELD.finditer(line)
+            stamp, name = first.group(), _name(path, number, line, rest)
+        stamps.append(parse_stamp(path, number, stamp))
+        names.append(name)
     check_increasing(path, numbers, stamps)
     return _in_seconds(path, stamps, names)
 
@@ -125,8 +138,8 @@ def _name(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> st
 
 def _in_seconds(path: Path, stamps: list[float], names: list[str]) -> list[TimedFile]:
     unit = time_unit(stamps)
-    rows = zip(stamps, names, strict=True)
-    return [TimedFile(stamp / unit.per_second, path.parent / name, unit) for stamp, name in rows]
+    rows, folder = zip(stamps, names, strict=True), str(path.parent)
+    return [TimedFile(stamp / unit.per_second, os.path.join(folder, name), unit) for stamp, name in rows]
 
 
 def parse_stamp(path: Path, number: int, text: str) -> float:

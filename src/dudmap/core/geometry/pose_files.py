@@ -2,6 +2,7 @@
 
 import math
 import re
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,10 @@ NANOSECONDS = UNITS[-1]
 LARGEST_ERROR = 0.02
 """Largest difference of a quaternion's length from 1, and of the products of a rotation's rows from 0 and 1: numbers
 that were written with two digits have it."""
+
+
+SAMPLED = 1000
+"""Rows that the format of a file is recognised by."""
 
 
 class PoseFormat(NamedTuple):
@@ -67,11 +72,11 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
         lines = [line.strip() for line in read_text(path).splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
-    order = next(filter(None, map(_named_order, lines)), None)
+    order = next(filter(None, map(_named_order, lines[:SAMPLED])), None)
     if order in ORDERS:
         return FORMATS[ORDERS[order]]
     lines = [line for line in lines if not line.startswith("#")]
-    rows = [row for row in map(_numbers, lines) if any(row[4:8])]
+    rows = list(islice((row for row in map(_numbers, lines) if any(row[4:8])), SAMPLED))
     if not rows:
         return FORMATS["tum"]  # whose reader names the line at fault
     row, commas = rows[0], "," in "".join(lines)
@@ -115,7 +120,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
         return PoseFile(known, None, np.array([_matrix(path, *row) for row in read_rows(path, known.columns)]))
     rows, latest, wrong = [], -np.inf, []
     for number, fields in read_rows(path, known.columns, short=optional):
-        row = _numbers(" ".join(fields[:8]))
+        row = _finite(fields[:8])
         pose = len(row) == 8 and 1e-9 < math.hypot(*row[4:]) < 1e9
         if pose and not (optional and row[0] <= latest):
             latest = row[0]
@@ -136,7 +141,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
         remarks.append(f"{len(wrong)} of {len(wrong) + len(rows)} rows are left out; the first: {wrong[0]}")
     Ts = np.tile(np.eye(4), (len(table), 1, 1))
     Ts[:, :3, 3] = table[:, 1:4]
-    Ts[:, :3, :3] = [se3.quat_xyzw_to_rotation(quat) for quat in table[:, 4:8]]
+    Ts[:, :3, :3] = se3.quat_xyzw_to_rotation(table[:, 4:8])
     return PoseFile(known, table[:, 0] / unit.per_second, Ts, tuple(remarks))
 
 
@@ -165,11 +170,16 @@ def _matrix(path: Path, number: int, fields: list[str]) -> NDArray[np.float64]:
 
 def _numbers(line: str) -> list[float]:
     """Numbers of a row; none if there is a field that is no finite number."""
+    return _finite(line.replace(",", " ").split())
+
+
+def _finite(fields: list[str]) -> list[float]:
+    """Numbers of fields; none if one is no finite number."""
     try:
-        numbers = [float(field) for field in line.replace(",", " ").split()]
+        numbers = list(map(float, fields))
     except ValueError:
         return []
-    return numbers if np.all(np.isfinite(numbers)) else []
+    return numbers if all(map(math.isfinite, numbers)) else []
 
 
 def _holds_rotation(row: list[float]) -> bool:

@@ -181,15 +181,15 @@ def rotation_to_quat_xyzw(R: Matrix) -> Matrix:
 
 
 def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
-    """Rotation matrix (3, 3) of a quaternion (4,) in the order x, y, z, w; it need not be normalised."""
-    x, y, z, w = np.asarray(quat_xyzw, dtype=np.float64) / np.linalg.norm(quat_xyzw)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order x, y, z, w; they need not be normalised."""
+    quats = np.asarray(quat_xyzw, dtype=np.float64)
+    x, y, z, w = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def nearest_rotation(R: Matrix) -> Matrix:

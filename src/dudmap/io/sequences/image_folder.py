@@ -78,8 +78,11 @@ class ImageFolder(Recording):
 
     def _look_for_rotation(self, *, given: bool) -> None:
         """Set the unit of depth images that are rotated by three bits; ``given`` is whether a file gives a unit."""
-        files, scale = [depth.path for _, depth in self._pairs], self.camera.depth_scale
-        self.rotated = rotated_depth.judge(files, lambda file: self._read_depth(file, 1.0), scale, given=given)
+
+        def read(index: int) -> NDArray[np.float32]:
+            return self._read_depth(self._pairs[index][1].path, 1.0)
+
+        self.rotated = rotated_depth.judge(len(self), read, self.camera.depth_scale, given=given)
         if self.rotated is Rotated.YES and not given:
             self.camera = replace(self.camera, depth_scale=rotated_depth.UNITS_PER_METRE)
             self.sources["depth unit"] = "recognised: 16-bit millimetres rotated left by three bits, as in SUN3D"

@@ -7,7 +7,6 @@ the images of the Amazon Picking Challenge have them too. Values in units of 1/8
 from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,21 +54,20 @@ def metres(values: NDArray[np.floating], units_per_metre: float) -> NDArray[np.f
     return unrotated(values).astype(np.float32) / np.float32(units_per_metre / 8)
 
 
-def judge(
-    files: list[Path], read: Callable[[Path], NDArray[np.floating]], units_per_metre: float, *, given: bool
-) -> Rotated:
+def judge(count: int, read: Callable[[int], NDArray[np.floating]], units_per_metre: float, *, given: bool) -> Rotated:
     """Whether the 16-bit values of the depth images of a recording are rotated.
 
     Args:
-        files: The images.
-        read: Reads one: the values as stored, 0 for no reading; values that are not whole are none of 16 bits.
+        count: Number of images.
+        read: Reads the image of a number: the values as stored, 0 for no reading. Values that are not whole are none
+            of 16 bits.
         units_per_metre: Of the values if they are not rotated.
         given: Whether a file or the user gives that number.
     """
     images = []
-    for index in np.unique(np.linspace(0, len(files) - 1, SAMPLED).astype(int)).tolist():
+    for index in np.unique(np.linspace(0, count - 1, SAMPLED).astype(int)).tolist():
         with suppress(FrameError):
-            image = read(files[index])
+            image = read(index)
             images.append(image[image > 0])
             if not _has_eighths(images[-1]):
                 return Rotated.NO

@@ -188,7 +188,7 @@ class CorbsSequence(TumSequence):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         def slashed(file: TimedFile) -> TimedFile:
-            return file._replace(path=Path(str(file.path).replace("\\", "/")))
+            return file._replace(place=str(file.place).replace("\\", "/"))
 
         return [(slashed(depth), slashed(color)) for depth, color in super()._find_pairs()]
 
