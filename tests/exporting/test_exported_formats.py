@@ -349,8 +349,8 @@ def test_colmap_folder(made, run, tmp_path):
 def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"ending or name must be one of \.ply, .*transforms\.json"):
         exported(run, tmp_path / "map.blend")
-    with pytest.raises(ConfigError, match=r"map\.stl does not take --up; it takes --max-triangles, --crop"):
-        exported(run, tmp_path / "map.stl", up=(0, 0, 1))
+    with pytest.raises(ConfigError, match=r"map\.stl does not take --resolution; it takes --max-triangles, --crop"):
+        exported(run, tmp_path / "map.stl", resolution=0.1)
     with pytest.raises(ConfigError, match="the box of --crop is empty"):
         exported(run, tmp_path / "map.ply", crop=(0, 0, 0, 1, -1, 1))
     with pytest.raises(MapError, match="no triangle of the mesh is left"):

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.exporters import export_run
+from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import ExportOptions
 from dudmap.io.exporting.up import find_up
 from dudmap.io.sequences.gravity import Gravity
@@ -159,3 +161,27 @@ def test_nav2_does_not_map_the_ceiling_of_an_upside_down_camera(tmp_path):
     assert angle(direction, T_map_true[:3, 2]) < 5
     export_run(run, tmp_path / "map.yaml", ExportOptions(up=tuple(direction)))
     assert "# up: given" in (tmp_path / "map.yaml").read_text()
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "points.points.ply", "path.tum"])
+def test_surface_and_trajectory_with_z_up(tmp_path_factory, tmp_path, name):
+    where = tmp_path_factory.getbasetemp() / "z-up"
+    truth = where / "truth.npy"
+    if not truth.exists():
+        sequence, T_map_true = make_run(where)
+        np.save(truth, T_map_true)
+        sequence.ground_truth.save(where / "true.txt")
+    T_map_true, poses = np.load(truth), Trajectory.load(where / "true.txt")
+    export_run(where / "run", tmp_path / name, ExportOptions(z_up=True))
+    if name.endswith("tum"):
+        found = Trajectory.load(tmp_path / name).Ts_world_camera
+        heights, true = found[:, 2, 3], poses.Ts_world_camera[:, 2, 3]
+        np.testing.assert_allclose(found[0, :2, 3], 0, atol=0.1)
+        assert found[0, 0, 2] > 0.5  # the first camera looks along x
+    else:
+        heights = np.asarray(trimesh.load(tmp_path / name, process=False).vertices)[:, 2]
+        mesh = without_small_pieces(Mesh.load(where / "run/mesh.ply"))
+        true = ((mesh.vertices - T_map_true[:3, 3]) @ T_map_true[:3, :3])[:, 2]
+    np.testing.assert_allclose(heights, true, atol=0.06)
+    with pytest.raises(ConfigError, match="add --z-up"):
+        export_run(where / "run", tmp_path / name, ExportOptions(up=(0, -1, 0)))

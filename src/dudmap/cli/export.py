@@ -27,6 +27,7 @@ def export(
         float | None, Option(min=0, help="Close holes with a shorter border.", metavar="METRES")
     ] = None,
     up: o.UpOption = None,
+    z_up: Annotated[bool, Option("--z-up", help="Turn surface or trajectory: z up from the floor.")] = False,
     resolution: Annotated[float, Option(min=0.001, help="Cells of grids.", metavar="METRES")] = 0.05,
     heights: Annotated[
         str, Option(help="Lower and upper end of the robot above the floor.", metavar="LOW,HIGH")
@@ -50,6 +51,7 @@ def export(
         drop_pieces_below=drop_pieces_below,
         fill_holes=fill_holes,
         up=o.direction(up),
+        z_up=z_up,
         resolution=resolution,
         heights=(low, high),
         sequence=sequence,

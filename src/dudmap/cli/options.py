@@ -26,7 +26,7 @@ GROUPS = {
     "--trajectory --reference --max-frames --every",
     "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
-    "--resolution --heights --world",
+    "--z-up --resolution --heights --world",
     "Calibration": "--calibration",
     "Live and viewing": "--live --view --host --port --token --orbit --sweep",
     "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
@@ -131,7 +131,10 @@ TokenOption = Annotated[
 ]
 UpOption = Annotated[
     str | None,
-    Option(help="Direction against gravity in the world of the run, by default that of its floor.", metavar="X,Y,Z"),
+    Option(
+        help="Direction against gravity in the world of the run, by default measured, else its floor's.",
+        metavar="X,Y,Z",
+    ),
 ]
 
 

@@ -32,25 +32,28 @@ class Exporter:
         return getattr(import_module(f"dudmap.io.exporting.{module}"), name)
 
 
+_UPRIGHT = ("up", "z_up")
+_MESH = (*MESH_OPTIONS, *_UPRIGHT)
+_POINTS = ("crop", "drop_pieces_below", *_UPRIGHT)
 _GRID = ("crop", "drop_pieces_below", "up", "resolution")
 _VIEWS = ("crop", "drop_pieces_below", "sequence", "camera", "every")
 EXPORTERS: dict[str, Exporter] = {
-    ".ply": Exporter("mesh", "mesh_files:write", MESH_OPTIONS),
-    ".obj": Exporter("mesh", "mesh_files:write", MESH_OPTIONS),
-    ".stl": Exporter("mesh without colours", "mesh_files:write", MESH_OPTIONS),
+    ".ply": Exporter("mesh", "mesh_files:write", _MESH),
+    ".obj": Exporter("mesh", "mesh_files:write", _MESH),
+    ".stl": Exporter("mesh without colours", "mesh_files:write", _MESH),
     ".glb": Exporter("mesh for browsers and Blender, y up", "mesh_files:write_glb", (*MESH_OPTIONS, "up")),
     ".usdz": Exporter("mesh for USD programs, y up", "mesh_files:write_usdz", (*MESH_OPTIONS, "up")),
-    ".points.ply": Exporter("point cloud", "mesh_files:write_ply", _GRID[:2]),
-    ".pcd": Exporter("point cloud of PCL", "mesh_files:write_pcd", _GRID[:2]),
-    ".laz": Exporter("point cloud, compressed LAS 1.4", "mesh_files:write_laz", _GRID[:2]),
-    ".e57": Exporter("point cloud, ASTM E57", "mesh_files:write_e57", _GRID[:2]),
+    ".points.ply": Exporter("point cloud", "mesh_files:write_ply", _POINTS),
+    ".pcd": Exporter("point cloud of PCL", "mesh_files:write_pcd", _POINTS),
+    ".laz": Exporter("point cloud, compressed LAS 1.4", "mesh_files:write_laz", _POINTS),
+    ".e57": Exporter("point cloud, ASTM E57", "mesh_files:write_e57", _POINTS),
     ".npz": Exporter("occupancy and distance grids (ESDF), z up", "grids:write_npz", _GRID),
     "map.yaml": Exporter("2D occupancy map for nav2, with map.pgm", "grids:write_nav2", (*_GRID, "heights")),
     "transforms.json": Exporter("folder for nerfstudio", "view_synthesis:write_nerfstudio", _VIEWS),
     "cameras.txt": Exporter("folder in COLMAP's text format", "view_synthesis:write_colmap", _VIEWS),
-    ".tum": Exporter("trajectory, TUM", "exporters:write_tum"),
-    ".kitti": Exporter("trajectory, KITTI", "exporters:write_kitti"),
-    ".csv": Exporter("trajectory, EuRoC", "exporters:write_euroc"),
+    ".tum": Exporter("trajectory, TUM", "exporters:write_tum", _UPRIGHT),
+    ".kitti": Exporter("trajectory, KITTI", "exporters:write_kitti", _UPRIGHT),
+    ".csv": Exporter("trajectory, EuRoC", "exporters:write_euroc", _UPRIGHT),
     ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "ros_messages:write"),
 }
 """Exporters by the name of the file, or its ending."""
@@ -81,6 +84,10 @@ def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None
     exporter = find_exporter(to.name)
     options.check(exporter.options, to.name)
     run = RunContent.load(folder)
+    if options.z_up:
+        from dudmap.io.exporting.up import upright
+
+        run, options = upright(run, options)
     to.parent.mkdir(parents=True, exist_ok=True)
     exporter.write(run, to, options)
     return to

@@ -196,7 +196,8 @@ class ExportOptions:
         crop: Lower and upper corner of the part of the map to keep, metres, world frame.
         drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres.
         fill_holes: Holes whose border is at most so long are closed, metres.
-        up: Direction against gravity in the world frame; None for the normal of the floor in the map.
+        up: Direction against gravity in the world frame; None for the measured one, else the normal of the floor.
+        z_up: Whether surface and trajectory are written with z up from the floor and x along the first view.
         resolution: Edge of the cells of grids, metres.
         heights: Lower and upper end of the robot above the floor, metres.
         sequence: Recording that the run was made from; None for the one that the run names.
@@ -209,6 +210,7 @@ class ExportOptions:
     drop_pieces_below: float = SPECK
     fill_holes: float | None = None
     up: tuple[float, float, float] | None = None
+    z_up: bool = False
     resolution: float = 0.05
     heights: tuple[float, float] = (0.1, 1.8)
     sequence: Path | None = None
@@ -225,6 +227,8 @@ class ExportOptions:
             if getattr(self, field.name) != field.default and field.name not in taken:
                 known = ", ".join(option_name(option) for option in taken) or "no option"
                 raise ConfigError(f"{name} does not take {option_name(field.name)}; it takes {known}")
+        if self.up is not None and "z_up" in taken and not self.z_up:
+            raise ConfigError(f"{name} keeps the axes of the run, so --up changes nothing; add --z-up or leave it out")
 
 
 def option_name(field: str) -> str:

@@ -1,6 +1,7 @@
 """Which direction is up in the world of a run: given, measured by the recording, or guessed from the floor."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,8 +10,8 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, MapError
-from dudmap.io.exporting.gravity import FLOOR_SHARE, Floor, fitted, floor_height, level_normal, unit
-from dudmap.io.exporting.mesh_editing import face_vectors
+from dudmap.io.exporting.gravity import FLOOR_SHARE, Floor, fitted, floor_height, level_normal, unit, z_up
+from dudmap.io.exporting.mesh_editing import edited, face_vectors, rotated
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.sequences.gravity import MeasuredUp, mean_direction
 
@@ -79,6 +80,17 @@ def checked_floor(run: RunContent, up: Up) -> Floor:
     if up.floor is None:
         raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
     return up.floor
+
+
+def upright(run: RunContent, options: ExportOptions) -> tuple[RunContent, ExportOptions]:
+    """Surface and trajectory of a run in axes with z up from the floor, and the options that are left to apply."""
+    T = z_up(find_floor(run, options))
+    mesh = rotated(edited(run.surface, options), T[:3, :3])
+    mesh = replace(mesh, vertices=(mesh.vertices + T[:3, 3]).astype(np.float32))
+    poses = Trajectory(run.trajectory.timestamps, T @ run.trajectory.Ts_world_camera)
+    turned = RunContent(run.folder)
+    vars(turned).update(mesh=mesh, trajectory=poses)
+    return turned, replace(options, max_triangles=None, crop=None, drop_pieces_below=0.0, fill_holes=None)
 
 
 def run_up(run: RunContent, options: ExportOptions) -> Up:
