@@ -373,7 +373,7 @@ class Job:
                 self.out, slam, record, self.sequence, config, stopped,
                 save_map=save_map, defect=defect, poses=self.poses,
             )  # fmt: skip
-            if said := (report.metrics["up"] or {}).get("contradiction"):
+            if said := (report.metrics.get("up") or {}).get("contradiction"):
                 self.display.note(said)
             for observer in self.observers:
                 observer.finish(self.out)

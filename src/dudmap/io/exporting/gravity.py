@@ -36,8 +36,10 @@ class Floor(NamedTuple):
 
 
 def level_normal(mesh: Mesh, held: NDArray[np.float64], cone: float = CONE) -> NDArray[np.float64] | None:
-    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one; ``cone`` is
-    the cosine of the largest angle between both."""
+    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one.
+
+    ``cone`` is the cosine of the largest angle between both.
+    """
     vectors = face_vectors(mesh)
     areas = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
     normals = vectors / areas[:, None]

@@ -39,8 +39,8 @@ class Up(NamedTuple):
         source: ``given``, ``gravity`` (measured by the recording), ``floor`` (the level surface that an upright camera
             has below it) or ``cameras`` (the mean upper edge of the images).
         sigma_deg: Standard deviation, degrees; None for a given direction.
-        evidence: What it rests on.
-        contradiction: What speaks against it; empty if nothing does.
+        evidence: Words for the source.
+        contradiction: Sentence against it; empty without one.
         floor: The floor below, None if there is none.
     """
 
@@ -69,7 +69,7 @@ def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
 
 
 def find_floor(run: RunContent, options: ExportOptions) -> Floor:
-    """The floor of a map; a ``ConfigError`` where there is none, or where it may be the ceiling."""
+    """The floor of a map; a ``ConfigError`` if there is none, or if it may be the ceiling."""
     return checked_floor(run, run_up(run, options))
 
 
@@ -115,7 +115,7 @@ def find_up(
     """The direction against gravity, by the best evidence there is.
 
     Args:
-        mesh: The surface, None where there is none.
+        mesh: The surface, if there is one.
         poses: Of the cameras, in the world of the mesh.
         measured: Gravity that the recording measured.
         given: Direction that is known.
@@ -151,7 +151,7 @@ def find_up(
 
 
 def _by_gravity(mesh: Mesh | None, measured: MeasuredUp, guess: tuple[Floor, float] | None) -> Up:
-    """The measured direction, or that of a floor that is level by it."""
+    """The measured direction, refined by the floor if it is level."""
     limit = max(ACCURACY, 3 * measured.sigma_deg)
     level = None if mesh is None else _floor(mesh, measured.direction, limit)
     evidence = f"gravity of {measured.source}, {measured.readings} readings"
@@ -201,7 +201,7 @@ def _facing(mesh: Mesh, direction: NDArray[np.float64]) -> float:
 
 
 def _contradiction(mesh: Mesh | None, poses: Trajectory, held: NDArray[np.float64], guess: Up) -> str:
-    """Sentence on what speaks against a guess, with the direction that it speaks for; else nothing."""
+    """Sentence against a guess, with the direction that is more likely; else nothing."""
     if mesh is not None:
         upward = _facing(mesh, guess.direction)
         below = level_normal(mesh, -held)
