@@ -204,15 +204,15 @@ def _contradiction(mesh: Mesh | None, poses: Trajectory, held: NDArray[np.float6
     """Sentence against a guess, with the direction that is more likely; else nothing."""
     if mesh is not None:
         upward = _facing(mesh, guess.direction)
-        below = level_normal(mesh, -held)
-        if below is not None and (downward := _facing(mesh, below)) > UPSIDE_DOWN * upward:
+        below = _floor(mesh, -held)
+        if below is not None and (downward := _facing(mesh, below[0].up)) > UPSIDE_DOWN * upward:
             return (
                 f"the map may be upside down: if the camera was upright, {upward:.2g} m2 of level surface face up and "
-                f"{downward:.2g} m2 down; the other way round it is --up {_numbers(below)}"
+                f"{downward:.2g} m2 down; the other way round it is --up {_numbers(below[0].up)}"
             )
         side = mean_direction(poses.Ts_world_camera[:, :3, 0])[0]
-        sides = [] if side is None or guess.floor is not None else [level_normal(mesh, way * side) for way in (1, -1)]
-        areas = [(_facing(mesh, level), *level) for level in sides if level is not None]
+        sides = [] if side is None or guess.floor is not None else [_floor(mesh, way * side) for way in (1, -1)]
+        areas = [(_facing(mesh, side[0].up), *side[0].up) for side in sides if side is not None]
         if areas and max(areas)[0] > FLOOR_SHARE * float(np.linalg.norm(face_vectors(mesh), axis=1).sum()):
             return (
                 "the camera may have been rolled by 90 degrees: no level surface faces up if it was upright, but "
