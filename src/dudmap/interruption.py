@@ -1,8 +1,7 @@
-"""Requests to end: Ctrl-C, SIGTERM (docker stop, systemd, Slurm) and SIGHUP (a closed terminal), which the command line
-takes alike.
+"""Requests to end: Ctrl-C, SIGTERM (docker stop, systemd, Slurm) and SIGHUP (a closed terminal).
 
-A request is a ``KeyboardInterrupt`` in the main thread. It waits for the end of a frame, and for results that are
-written (``postponed``). Programs that use dudmap as a library keep their own handlers.
+The command line treats them alike: each raises a ``KeyboardInterrupt`` in the main thread. A request waits until a
+frame is processed or results are written (``postponed``). Programs that use dudmap as a library keep their handlers.
 """
 
 import os
@@ -14,8 +13,8 @@ from types import FrameType
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 SECOND = 1.0
-"""Seconds after a first request from which another one is meant as a second: ``timeout`` sends SIGTERM twice, and shell
-and kernel a SIGHUP each."""
+"""Seconds after which another request counts as a second one. Sooner it is a repetition: ``timeout`` sends SIGTERM
+twice, and shell and kernel each send a SIGHUP."""
 
 
 class _Request:
@@ -28,7 +27,7 @@ class _Request:
 
 
 def listen() -> None:
-    """Take SIGTERM and SIGHUP as Ctrl-C, unless they are ignored, as by nohup."""
+    """Handle SIGTERM and SIGHUP like Ctrl-C, unless they are ignored (nohup)."""
     _Request.terminals = tuple(handle for handle in (1, 2) if os.isatty(handle))
     for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
@@ -36,12 +35,12 @@ def listen() -> None:
 
 
 def name() -> str:
-    """Name of the request, Ctrl-C if it was none of the command line."""
+    """Name of the request; Ctrl-C if ``listen`` has not received it."""
     return signal.Signals(_Request.signal).name if must_end() else "Ctrl-C"
 
 
 def must_end() -> bool:
-    """Whether the process is to end, and not only the work that it does."""
+    """Whether the process must end, not only its current work."""
     return _Request.signal not in (0, signal.SIGINT)
 
 
@@ -51,7 +50,7 @@ def exit_code(code: int) -> int:
 
 
 def check() -> None:
-    """Repeat a request whose exception was lost, since it came while a library called Python.
+    """Repeat a request whose exception was lost in a library's callback.
 
     Raises:
         KeyboardInterrupt: There was a request.
@@ -62,7 +61,7 @@ def check() -> None:
 
 @contextmanager
 def postponed() -> Iterator[None]:
-    """Have a first request wait for the end of a block, which processes a frame or writes results.
+    """Delay a first request until the end of a block, which processes a frame or writes results.
 
     Raises:
         KeyboardInterrupt: At the end of the block, if a request came in it.
@@ -79,10 +78,10 @@ def postponed() -> Iterator[None]:
 
 @contextmanager
 def recognised() -> Iterator[None]:
-    """Take what a kernel makes of a request for the request: Numba calls it a result with an exception set.
+    """Replace the error that Numba raises for a request during a kernel ("result with an exception set").
 
     Raises:
-        KeyboardInterrupt: In place of that error.
+        KeyboardInterrupt: Instead of that error.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Arrays of a caller, copied: what dudmap keeps lies in memory of its own."""
+"""Copies of a caller's arrays: dudmap keeps all arrays in memory of its own."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ from dudmap.errors import DatasetError
 def copied(
     values: object, what: str, dtype: DTypeLike | None = np.float64, shape: tuple[int, ...] | None = None
 ) -> NDArray[Any]:
-    """Copy of an array, or of what makes one, such as a list.
+    """Copy of an array or of an array-like object.
 
     Args:
-        values: What the caller gave.
-        what: Its name in messages.
-        dtype: Type of the copy; None keeps that of ``values``.
+        values: The caller's array, list or number.
+        what: Name in messages.
+        dtype: Type of the copy; None keeps the type of ``values``.
         shape: The only possible shape; None allows all.
 
     Raises:
-        DatasetError: It is no array of numbers, or one of another shape.
+        DatasetError: ``values`` is no array of numbers, or has another shape.
     """
     try:
         out = np.array(values, dtype=dtype, order="C")

@@ -1,7 +1,7 @@
-"""The folder in which compiled kernels are stored: chosen here, for all kernels, and nowhere else.
+"""Folder of the compiled kernels, for all kernels.
 
-Numba refuses to define a kernel if it can write into none of its folders. Then the kernels of dudmap go to a folder of
-this user in the temporary folder, or are compiled in memory.
+Numba refuses to define a kernel if none of its folders can be written. Then the kernels of dudmap are stored in a
+private folder of this user in the temporary folder, or are compiled in memory.
 """
 
 import multiprocessing
@@ -58,12 +58,12 @@ def store(kernel: Dispatcher, stamp: str) -> None:
 
 
 class _Cache(caching.FunctionCache):
-    """Numba's cache of one kernel, without which it works, too: when the disk is full, or a file in it is damaged."""
+    """Numba's cache of one kernel. A full disk or a damaged file disables the cache, not the kernel."""
 
     def __init__(self, function: Any, stamp: str) -> None:  # noqa: ANN401 - any function
         super().__init__(function)
         self._cache_file._source_stamp = stamp
-        # two processes that compile it for other types at the same time do not write one file
+        # two processes that compile for different types at the same time write different files
         self._cache_file._data_name_pattern = self._cache_file._data_name_pattern.replace(
             "{number", f"{os.getpid()}.{{number"
         )
@@ -125,7 +125,7 @@ _Cache._impl_class = _Impl
 
 @cache
 def _private() -> Path | None:
-    """Folder of this user in the temporary folder, in which nobody else can put or replace a file."""
+    """Folder of this user in the temporary folder; no other user can add or replace a file."""
     try:
         base = Path(tempfile.gettempdir())
         temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}

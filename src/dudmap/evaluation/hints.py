@@ -1,4 +1,4 @@
-"""Errors of a trajectory that have another cause than the estimate: clocks that differ, or poses of another body."""
+"""Causes of trajectory errors other than the estimate: different clocks, or poses of another body."""
 
 from math import degrees
 
@@ -9,8 +9,8 @@ from dudmap.evaluation.time_offset import LARGEST_HINT, MotionComparison
 from dudmap.evaluation.trajectory import adjusted, ate, body_rotation
 
 EXPLAINED = 0.5
-"""Share of the error that is left at most if a cause explains it. Noise does not halve: the causes have one and three
-degrees of freedom, the errors as many as the trajectory has seconds."""
+"""Largest remaining share of an error that a cause explains. Noise does not halve by chance: the causes have one and
+three degrees of freedom, the errors as many as the trajectory has seconds."""
 
 
 def hints(estimate: Trajectory, reference: Trajectory, max_difference: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""Difference between the clocks of two trajectories of one camera, found from its motion."""
+"""Time offset between two trajectories of one camera, estimated from its motion."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ Numbers = NDArray[np.float64]
 STEP = LARGEST_STEP / 3
 """Step between the offsets that are compared first, seconds: three within a time of steady motion."""
 GRID = STEP / 5
-"""Step between the times at which the turns of the reference are computed, seconds: that of motion capture."""
+"""Step between the times at which the turns of the reference are computed, seconds: the rate of motion capture."""
 WINDOW = 2 * LARGEST_STEP
 """Time over which rotations are compared, seconds: two times of steady motion."""
 SAMPLES = 300
@@ -25,14 +25,14 @@ SMALLEST_OVERLAP = 0.5
 CHUNK = 1000
 """Number of offsets that are compared at a time; bounds the memory to 30 MB."""
 LARGEST_HINT = CHUNK * STEP / 2
-"""Largest offset that is looked for unasked, seconds: comparing these offsets takes 0.2 s."""
+"""Largest offset searched for a hint, seconds: the search takes 0.2 s."""
 
 
 class TimeOffset(NamedTuple):
     """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
 
-    ``unexplained`` is ``1 - r^2``, 0 for equal motions and 1 for unrelated ones. r is the correlation of the positions
-    after their alignment, or that of the angles of rotation: the mean of both where both are defined.
+    ``unexplained`` is ``1 - r^2``, 0 for equal motions and 1 for unrelated ones. r is the correlation of the aligned
+    positions or of the angles of rotation. If both are defined, ``unexplained`` is the mean of both.
     """
 
     seconds: float

@@ -1,4 +1,4 @@
-"""Poses that come with a recording or in a file: read, tested against the images, found by time."""
+"""Poses given by a recording or a file: read, tested against the images, looked up by time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 RECORDING = "recording"
-"""Name of the poses that the recording brings."""
+"""Name of the recording's own poses."""
 SAME_TIME = 1e-4
-"""Stamps that differ by less are one, seconds: files give them with four digits or more."""
+"""Stamps that differ by less are equal, seconds: files give them with four digits or more."""
 LARGEST_GAP = 0.05
-"""Largest time from a frame to a pose before and after it between which its pose is interpolated, seconds."""
+"""Largest time from a frame to the poses before and after it for interpolation, seconds."""
 POSES = "given_poses.txt"
 """Copy in the run folder of the given poses at the times of the frames."""
 
@@ -40,7 +40,7 @@ class GivenPoses:
     role: Literal["given", "refined"]
 
     def at(self, timestamp: float) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of the frame of a time in seconds, None if it has none."""
+        """Pose (4, 4) of the frame at a time in seconds, None if it has none."""
         return _at(self.trajectory, timestamp)
 
     def corrections(self, found: Trajectory) -> dict[str, float]:
@@ -59,12 +59,11 @@ def given_poses(name: str, sequence: "Sequence", convention: str | None = None, 
     """The poses of the frames of a recording.
 
     Args:
-        name: ``recording`` for the poses that it brings, else a file of poses, or a folder with one file per frame.
+        name: ``recording`` for its own poses, else a file of poses, or a folder with one file per frame.
         sequence: The recording.
-        convention: Format and convention of the file, separated by commas (``pose_files.FORMATS``,
-            ``pose_conventions.WORDS``); None recognises the format and takes camera-to-world, x right, y down, z
-            forward, metres.
-        refine: Whether they are only the start of registration.
+        convention: Format (``pose_files.FORMATS``) and convention (``pose_conventions.WORDS``), separated by commas.
+            None recognises the format. The default is camera-to-world, x right, y down, z forward, metres.
+        refine: Whether registration starts from the poses.
 
     Raises:
         ConfigError: The convention is unknown.
@@ -93,7 +92,7 @@ def given_poses(name: str, sequence: "Sequence", convention: str | None = None, 
 
 
 def _at(poses: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
-    """Pose (4, 4) at a time, between two poses that are near; None if there are none."""
+    """Pose (4, 4) at a time, interpolated between near poses; None if there are none."""
     stamps = poses.timestamps
     after = int(np.searchsorted(stamps, timestamp))
     for number in (after - 1, after):
@@ -140,7 +139,7 @@ def _natural(path: Path) -> tuple[int, str]:
 def _matrices(path: Path) -> NDArray[np.float64] | None:
     """Poses (N, 4, 4) of a file of four numbers a line, four lines a pose; None for any other file.
 
-    Lines of three numbers between them, as of Open3D's .log, are left out.
+    Lines of three numbers between the poses are left out (Open3D's .log).
     """
     with damaged(DatasetError, path):
         lines = [line.split() for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
@@ -155,7 +154,7 @@ def _matrices(path: Path) -> NDArray[np.float64] | None:
 
 
 def stored_poses(folder: Path, role: Literal["given", "refined"]) -> GivenPoses:
-    """The poses in a run folder, as the run uses them: a resumed run finds the same numbers."""
+    """Poses stored in a run folder; a resumed run uses the same numbers."""
     return GivenPoses(Trajectory.load(folder / POSES), role)
 
 

@@ -1,4 +1,4 @@
-"""Conventions in which poses are written, and which of them fits the depth images."""
+"""Conventions of poses, and a test which convention fits the depth images."""
 
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,7 @@ AXES = {
     "opengl": np.diag([1.0, -1, -1, 1]),
     "ros": np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
 }
-"""Axes of the camera in other conventions (x right, y up, z back; x forward, y left, z up) of those used here."""
+"""Camera axes of other conventions (x right, y up, z back; x forward, y left, z up) in the axes used here."""
 WORDS = {
     "world-to-camera": "inverse poses",
     "opengl": "camera x right, y up, z back",
@@ -26,29 +26,29 @@ WORDS = {
     "wxyz": "quaternions with w in the other place",
     "millimetres": "positions in millimetres",
 }
-"""Words of ``--poses-as``, by what differs from camera-to-world, camera x right, y down, z forward, metres."""
+"""Words of ``--poses-as`` by their difference from camera-to-world, camera x right, y down, z forward, metres."""
 PAIRS = 12
 """Pairs of images that are compared."""
 TURN, STEP = 8.0, 0.15
 """Least motion from one image of a pair to the other, degrees or metres: far more than the noise of odometry."""
 FURTHEST = 90
-"""Most frames from one image of a pair to the other: the view has changed beyond that."""
+"""Largest number of frames between the images of a pair: later the view has changed."""
 FARTHEST = 50.0
-"""Extent of the positions in metres beyond which they may be millimetres: a desk is 500 across then."""
+"""Extent of the positions in metres beyond which they may be millimetres: a desk would be 500 wide."""
 STRIDE = 6
 """Every so many pixels, across and down, are compared."""
 TOLERANCE = 0.03
-"""Depths agree that differ by less than this, metres at 1 m and in proportion beyond."""
+"""Largest difference of depths that agree, metres at 1 m and in proportion beyond."""
 CLEARLY = 0.12
-"""Share of the pixels by which another convention must fit better, on average: three times its spread over pairs."""
+"""Mean share of the pixels by which another convention must fit better: three times its spread over pairs."""
 MOSTLY = 0.8
-"""Share of the pairs in which it must."""
+"""Share of the pairs in which the other convention must fit better."""
 HARDLY = 0.15
-"""Share of the pixels whose depth agrees below which poses do not belong to the images at all."""
+"""Smallest share of pixels with agreeing depth. Below it the poses do not belong to the images."""
 
 
 class Convention(NamedTuple):
-    """How poses are written; the names are those of ``WORDS``."""
+    """Convention of poses; the names are keys of ``WORDS``."""
 
     inverse: bool = False
     axes: str = ""

@@ -1,4 +1,4 @@
-"""Sentences on what a run found, at its end."""
+"""Sentences at the end of a run on its findings."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING

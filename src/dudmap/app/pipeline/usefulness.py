@@ -1,4 +1,4 @@
-"""Whether a run came to anything; else why not, and what to try."""
+"""Tests whether a run is of use; otherwise names the cause and a remedy."""
 
 import re
 from collections import Counter
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 LEAST_SHARE = 0.1
-"""Share of the frames in the largest map below which a run is of no use: nine tenths of the recording are not in it."""
+"""Smallest share of the frames in the largest map of a useful run: below it nine tenths are not in the map."""
 MOST = 0.5
-"""Share of the readings outside of the depth range that explains it."""
+"""Share of the measurements outside of the depth range that explains a useless run."""
 
 
 def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float, float]) -> str | None:
@@ -28,7 +28,7 @@ def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float
 
 
 def _cause(metrics: Mapping[str, Any], depth_range: tuple[float, float]) -> tuple[str, str]:
-    """Why a run is of no use, and what to try."""
+    """Cause of a useless run, and a remedy."""
     for key, where, limit in zip(("too_near", "too_far"), ("nearer", "farther"), depth_range, strict=True):
         if (share := metrics["readings"][key]) > MOST:
             name = "near" if key == "too_near" else "far"

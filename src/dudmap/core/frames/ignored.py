@@ -1,4 +1,4 @@
-"""Pixels that never count: the robot's arm, a bonnet, a vignette, whatever moves with the camera."""
+"""Pixels that never count because they move with the camera: a robot's arm, a bonnet, a vignette."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 
 DISTANCES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
-"""Distances at which a pixel of one camera is looked up in the image of another one, metres: the nearest surface that a
-depth camera measures, then twice as far each, so that a baseline moves the pixel by half as much each time."""
+"""Distances at which a pixel of one camera is projected into the image of another one, metres. They start at the
+nearest surface that a depth camera measures. Each is twice the one before, which halves the shift by the baseline."""
 
 
 @dataclass(frozen=True, eq=False)
 class IgnoredRegion:
-    """The ignored pixels of both images as they are recorded.
+    """The ignored pixels of both recorded images.
 
     Attributes:
         depth: (H, W) bool, of the depth image.
         color: (h, w) bool, of the colour image.
-        nearest: (n,) int, for each ignored pixel of the colour image the number of the nearest other pixel.
+        nearest: (n,) int, index of the nearest unmasked pixel for each ignored pixel of the colour image.
     """
 
     depth: NDArray[np.bool_]
@@ -30,10 +30,10 @@ class IgnoredRegion:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], camera: Camera, calibration: Calibration | None) -> "IgnoredRegion":
-        """The region of a mask of the depth image, or of the colour image where that has another size.
+        """Region of a mask, which has the size of the depth image or of a colour image of another size.
 
-        Where the colour camera is another one (``calibration``), the region of the other image is where it shows the
-        masked pixels at any distance.
+        If the colour camera is a separate one (``calibration``), the region is projected into the other image at all
+        ``DISTANCES``.
 
         Raises:
             ConfigError: The mask has the size of neither image, another type, or covers all of one.
@@ -60,15 +60,17 @@ class IgnoredRegion:
         return cls(depth.copy(), color, _nearest(color))
 
     def filled(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colour image (h, w, 3) whose ignored pixels continue the colours at their border: no feature of them, and no
-        edge of the region, stays with the camera."""
+        """Colour image (h, w, 3) whose ignored pixels have the colours at their border.
+
+        The region then has no feature and no edge that moves with the camera.
+        """
         out = color.copy()
         out[self.color] = color.reshape(-1, 3)[self.nearest]
         return out
 
 
 def _nearest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Number of the nearest unmasked pixel, for each masked pixel of an image (h, w)."""
+    """Index of the nearest unmasked pixel, for each masked pixel of an image (h, w)."""
     import cv2
 
     _, labels = cv2.distanceTransformWithLabels(
@@ -81,8 +83,7 @@ def _nearest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _places(camera: Camera, calibration: Calibration, distance: float) -> NDArray[np.int64]:
-    """Pixels (H, W, 2), u and v, of the colour image where the surface at a distance is seen that a pixel of the depth
-    image shows."""
+    """Pixels (H, W, 2), u and v, of the colour image to which depth pixels project at a distance (m)."""
     import cv2
 
     points = camera.backproject(np.full(camera.shape, distance, np.float32)).reshape(-1, 3).astype(np.float64)

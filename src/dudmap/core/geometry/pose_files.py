@@ -1,4 +1,4 @@
-"""Text files of camera poses in the formats of TUM, EuRoC and KITTI, and which of them a file has."""
+"""Text files of camera poses in the formats of TUM, EuRoC and KITTI, and recognition of the format."""
 
 import math
 import re
@@ -17,12 +17,12 @@ from dudmap.input_files import read_text
 
 NANOSECONDS = UNITS[-1]
 LARGEST_ERROR = 0.02
-"""Largest difference of a quaternion's length from 1, and of the products of a rotation's rows from 0 and 1: numbers
-that were written with two digits have it."""
+"""Largest difference of a quaternion's length from 1, and of the products of a rotation's rows from 0 and 1. Numbers
+with two digits have such errors."""
 
 
 SAMPLED = 1000
-"""Rows that the format of a file is recognised by."""
+"""Number of rows from which the format is recognised."""
 
 
 class PoseFormat(NamedTuple):
@@ -47,7 +47,7 @@ ORDERS = {"xyzxyzw": "tum", "xyzwxyz": "euroc"}
 
 
 class PoseFile(NamedTuple):
-    """Content of a file: format, times (N,) in seconds or None if it holds none, poses (N, 4, 4), and remarks."""
+    """Content of a file: format, times (N,) in seconds or None, poses (N, 4, 4), and remarks."""
 
     format: PoseFormat
     timestamps: NDArray[np.float64] | None
@@ -58,8 +58,8 @@ class PoseFile(NamedTuple):
 def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     """Format of a file.
 
-    The header decides if it names the columns. Else 12 or 16 numbers a line that hold a rotation are KITTI, numbers
-    between blanks TUM, and numbers between commas with times in nanoseconds EuRoC.
+    The header decides if it names the columns. Without such a header, lines of 12 or 16 numbers that hold a rotation
+    are KITTI. Numbers between blanks are TUM. Numbers between commas with times in nanoseconds are EuRoC.
 
     Args:
         path: The file.
@@ -98,20 +98,19 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
 
 
 def read_poses(path: Path, name: str | None = None, *, optional: bool = False, option: str = "--format") -> PoseFile:
-    """Poses of a file in the format of the given name, else in the one that it seems to have.
+    """Poses of a file in the named format, or else in the recognised one.
 
     Comments and a header are left out, and times in another unit than seconds are converted.
 
     Args:
         path: The file.
         name: One of ``FORMATS``.
-        optional: Leave out rows with times that are no pose, or no later than the row before, and count them in the
-            remarks.
+        optional: Leave out rows of timed formats that hold no pose or do not increase in time; the remarks count them.
         option: As for ``pose_format``.
 
     Raises:
         ConfigError: The name is unknown.
-        DatasetError: The file is missing, is in no clear format, holds no pose, or holds a row that is none.
+        DatasetError: The file is missing, has no clear format, holds no pose, or holds a row that is no pose.
     """
     if name is not None and name not in FORMATS:
         raise ConfigError(f"the format of a trajectory is {name!r}; expected one of {', '.join(FORMATS)}")
@@ -146,7 +145,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
 
 
 def _named_order(line: str) -> str:
-    """Last letters of the names of the second to eighth column if a line is such a header, else nothing."""
+    """Last letters of the names of columns two to eight of a header line; empty for any other line."""
     names = re.sub(r"\[.*?\]|\(.*?\)", "", line.lower()).strip("#, ")
     columns = [name.strip() for name in names.split(",")] if "," in names else names.split()
     letters = "".join(name[-1:] for name in columns[1:8])

@@ -10,7 +10,7 @@ CENTURY = (1e9, 4.1e9)
 LONGEST_STEP = 1000.0
 """Largest plausible median time between two rows, seconds."""
 SLOWEST_COUNT = 10.0
-"""Median step, up to which stamps are seconds or count frames: as milliseconds they would be 100 images a second, more
+"""Largest median step of stamps that are seconds or count frames. As milliseconds it would be 100 images a second, more
 than depth cameras deliver at full size."""
 
 
@@ -28,8 +28,8 @@ UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), 
 def time_unit(stamps: ArrayLike) -> TimeUnit:
     """Unit of time stamps (N,), in any order.
 
-    Stamps that all lie in this century as one of the units are in that unit. The median step decides on others: at 1 to
-    1000 images a second it is below 1 in seconds, and up to 10^3, 10^6 and 10^9 in the other units.
+    If all stamps lie in this century in one of the units, that is the unit. Otherwise the median step decides. At 1 to
+    1000 images a second it is at most 1 s, 10^3 ms, 10^6 us or 10^9 ns.
     """
     values = np.sort(np.asarray(stamps, dtype=np.float64))
     steps = np.diff(values)

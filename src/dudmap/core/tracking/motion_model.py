@@ -1,4 +1,4 @@
-"""Motion of the camera: constant velocity, or the motion of poses that are given from elsewhere."""
+"""Motion of the camera: constant velocity, or the motion of given poses."""
 
 import math
 from typing import Literal
@@ -18,22 +18,22 @@ GivenRole = Literal["estimated", "given", "refined"]
 VELOCITY_LIFETIME = 0.15
 """Time after the last accepted pose during which the velocity is still used, seconds."""
 PAUSE = 1.0
-"""Time without a pose after which the last velocity says nothing, seconds: a hand accelerates by about 1 m/s^2."""
+"""Time without a pose after which the last velocity is useless, seconds: a hand accelerates by about 1 m/s^2."""
 ACCELERATION = 1.0
-"""Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
+"""Standard deviation of the acceleration of a handheld camera, m/s^2: the cause of prediction errors."""
 
 
 class MotionModel(Stateful):
     """Predicts the next pose from the last two.
 
-    A pose of the frame from elsewhere (a robot arm, a phone, odometry) replaces constant velocity: the motion since the
-    last accepted pose is that of the given poses, however long ago that was.
+    Given poses (of a robot arm, a phone, odometry) replace constant velocity. They predict the motion since the last
+    accepted pose, after any time.
 
     Args:
         config: Whether velocity is constant.
-        timed: Whether the stamps are the times of the frames; else they only tell their order.
-        poses: Role of given poses: the result (``given``), or where registration starts (``refined``); ``estimated``
-            where none are given.
+        timed: Whether the stamps are the times of the frames; otherwise they only give the order.
+        poses: Role of given poses: the result (``given``), or the start of registration (``refined``); ``estimated`` if
+            there are none.
 
     Attributes:
         T_world_camera: (4, 4), the last accepted pose.
@@ -60,14 +60,14 @@ class MotionModel(Stateful):
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
+        """Twist per second (6,), camera axes, between the last two poses; 0 if unknown."""
         return self._velocity
 
     def give(self, T_world_camera: NDArray[np.float64] | None) -> None:
-        """Take note of the pose (4, 4) that is given for the frame that comes, None for none.
+        """Set the given pose (4, 4) of the next frame, None for none.
 
         Raises:
-            ConfigError: Poses are not expected.
+            ConfigError: The role of poses is ``estimated``.
             FrameError: The pose is no rigid motion.
         """
         if T_world_camera is not None and self.poses == "estimated":
@@ -76,18 +76,18 @@ class MotionModel(Stateful):
 
     @property
     def missing(self) -> Rejection | None:
-        """Why the frame that comes cannot be used, None if it can."""
+        """Why the next frame cannot be used, None if it can."""
         lacks = self.poses == "given" and self._T_given is None
         return Rejection("pose", "no pose is given for the frame") if lacks else None
 
     @property
     def is_given(self) -> bool:
-        """Whether the pose of the frame that comes is given and is not to be estimated."""
+        """Whether the given pose of the next frame is its result, without estimation."""
         return self.poses == "given" and self._T_given is not None
 
     @property
     def start(self) -> NDArray[np.float64]:
-        """Pose (4, 4) of a frame that a map is made of: the given one, else the origin."""
+        """Pose (4, 4) of the first frame of a map: the given one, else the identity."""
         return np.eye(4) if self._T_given is None else self._T_world_given @ self._T_given
 
     def predict(self, timestamp: float) -> NDArray[np.float64]:
@@ -151,13 +151,15 @@ class MotionModel(Stateful):
         self._T_world_given = T_new_old @ self._T_world_given
 
     def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
-        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``, or, where the times of the frames are
-        not known, ``step``, by which it moves the median reading, as a share of the width of the image.
+        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``.
+
+        Without the times of the frames it is ``step``: the shift of the median measurement as a share of the image
+        width.
 
         Args:
             timestamp: Seconds.
             T_world_camera: (4, 4) pose at that time.
-            image: The image there, of any size.
+            image: The image at that pose, of any size.
         """
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
         shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)

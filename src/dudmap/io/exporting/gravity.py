@@ -36,7 +36,7 @@ class Floor(NamedTuple):
 
 
 def level_normal(mesh: Mesh, held: NDArray[np.float64], cone: float = CONE) -> NDArray[np.float64] | None:
-    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one.
+    """The most frequent surface normal (3,) near a direction (3,), None if none is frequent.
 
     ``cone`` is the cosine of the largest angle between both.
     """

@@ -1,4 +1,4 @@
-"""Which direction is up in the world of a run: given, measured by the recording, or guessed from the floor."""
+"""The upward direction in the world of a run: given, measured by the recording, or guessed from the floor."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -16,18 +16,19 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.sequences.gravity import MeasuredUp, mean_direction
 
 CONTRADICTS = 20.0
-"""Two directions against gravity contradict each other beyond this angle, degrees: ramps and stairs rise less or more
-than that, and the drift of a map tilts it by a few degrees."""
+"""Two directions against gravity contradict each other beyond this angle, degrees. Ramps are less steep and stairs
+steeper. The drift of a map tilts it by a few degrees."""
 ACCURACY = 5.0
-"""A floor within this angle of measured gravity is level, degrees; so far a mounted IMU and a drifting map differ."""
+"""A floor within this angle of measured gravity is level, degrees: the error of IMU mounting and map drift."""
 LEVEL = np.cos(np.radians(15))
-"""Surface within 15 degrees of a direction faces it."""
+"""A surface faces a direction if its normal is within 15 degrees (cosine)."""
 UPSIDE_DOWN = 2.0
-"""The map may be upside down if so many times more surface faces down than up: rooms have much more surface facing up,
-since cameras look down on what stands on the floor."""
+"""Ratio of surface facing down to surface facing up from which the map may be upside down. Rooms have much more surface
+facing up, since cameras look down on furniture."""
 TURNED, STEADY = 0.64, 0.9
-"""Singular values of the mean rotation of cameras that turn by half a turn or more about an axis (sin(x) / x for x of a
-quarter turn), and of the axis itself, if they nod by less than about 25 degrees."""
+"""Singular values of the mean rotation matrix. The second one is below ``TURNED`` if the cameras turn by half a turn or
+more about an axis: sin(x) / x at a quarter turn. The first one is above ``STEADY`` if they nod by less than about 25
+degrees."""
 ASSUMED = "assumed: the camera is upright"
 
 
@@ -36,8 +37,8 @@ class Up(NamedTuple):
 
     Attributes:
         direction: (3,) unit vector.
-        source: ``given``, ``gravity`` (measured by the recording), ``floor`` (the level surface that an upright camera
-            has below it) or ``cameras`` (the mean upper edge of the images).
+        source: ``given``, ``gravity`` (measured by the recording), ``floor`` (the level surface below an upright
+            camera) or ``cameras`` (the mean upper edge of the images).
         sigma_deg: Standard deviation, degrees; None for a given direction.
         evidence: Words for the source.
         contradiction: Sentence against it; empty without one.
@@ -52,7 +53,7 @@ class Up(NamedTuple):
     floor: Floor | None = None
 
     def metrics(self, measured: MeasuredUp | None) -> dict[str, Any]:
-        """The entry ``up`` of metrics.json, with gravity as it was measured."""
+        """The entry ``up`` of metrics.json, with the measured gravity."""
         gravity = None if measured is None else measured._asdict() | {"direction": measured.direction.tolist()}
         height = None if self.floor is None else round(self.floor.height, 4)
         sigma = None if self.sigma_deg is None else round(self.sigma_deg, 2)
@@ -74,7 +75,7 @@ def find_floor(run: RunContent, options: ExportOptions) -> Floor:
 
 
 def checked_floor(run: RunContent, up: Up) -> Floor:
-    """The floor of a map below a direction, which is not a guess that is contradicted."""
+    """The floor of a map below a direction; a ``ConfigError`` if the direction is a contradicted guess."""
     if up.contradiction and up.source not in ("given", "gravity"):
         raise ConfigError(up.contradiction)
     if up.floor is None:
@@ -99,7 +100,7 @@ def run_up(run: RunContent, options: ExportOptions) -> Up:
 
 
 def measured_in(run: RunContent) -> MeasuredUp | None:
-    """What the recording of a run measured, as it stands in metrics.json."""
+    """Direction against gravity that the recording measured, from metrics.json; None without one."""
     found = (run.metrics.get("up") or {}).get("gravity")
     if found is None:
         return None
@@ -118,7 +119,7 @@ def find_up(
         mesh: The surface, if there is one.
         poses: Of the cameras, in the world of the mesh.
         measured: Gravity that the recording measured.
-        given: Direction that is known.
+        given: Known direction.
 
     Raises:
         ConfigError: The given direction has no length.
@@ -167,7 +168,7 @@ def _by_gravity(mesh: Mesh | None, measured: MeasuredUp, guess: tuple[Floor, flo
 
 
 def _floor(mesh: Mesh, near: NDArray[np.float64], limit: float | None = None) -> tuple[Floor, float] | None:
-    """The floor whose normal is near a direction (3,), and its accuracy in degrees: the angle by which it is uneven."""
+    """The floor whose normal is near a direction (3,), and its unevenness in degrees."""
     level = level_normal(mesh, near) if limit is None else level_normal(mesh, near, float(np.cos(np.radians(limit))))
     height = None if level is None else floor_height(mesh, level)
     if level is None or height is None:
@@ -187,7 +188,7 @@ def _unevenness(mesh: Mesh, floor: Floor) -> float:
 
 
 def _against(measured: MeasuredUp | None, direction: NDArray[np.float64], name: str) -> str:
-    """Sentence on a direction that contradicts measured gravity, else nothing."""
+    """Sentence on a direction that contradicts measured gravity; empty otherwise."""
     if measured is None or (angle := _angle(measured.direction, direction)) <= CONTRADICTS:
         return ""
     return f"up: {name} is {angle:.0f} degrees off the gravity of {measured.source}"

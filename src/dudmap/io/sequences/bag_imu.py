@@ -1,4 +1,4 @@
-"""Gravity from the accelerations in a bag: an IMU that is held still measures the direction against it."""
+"""Gravity from the accelerations in a bag: an IMU at rest measures the direction against gravity."""
 
 import re
 from typing import TYPE_CHECKING, Any
@@ -21,18 +21,18 @@ FIRST = 4000
 STANDARD = 9.80665
 """Standard acceleration of gravity, m/s^2 (ISO 80000-3)."""
 SCALE = 0.1
-"""Largest deviation of the median acceleration from gravity, in proportion: far more than an IMU's error of scale, and
-far less than that of another unit."""
+"""Largest relative deviation of the median acceleration from gravity: far more than an IMU's scale error, and far less
+than a wrong unit gives."""
 STILL = 0.02
-"""An IMU moves steadily if its acceleration differs by less than this from the median, in proportion."""
+"""Largest relative deviation of an acceleration from the median for an IMU in steady motion."""
 
 
 def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64] | None]") -> Gravity | None:
-    """What the IMUs of a bag measured, of the first one that can be used; None if there is none.
+    """Gravity measured by the first usable IMU of a bag; None without an IMU.
 
     Args:
         bag: The bag.
-        rotation_of: Rotation (3, 3) of vectors in a frame of that name into the depth camera, None if it is unknown.
+        rotation_of: Rotation (3, 3) of vectors in a named frame into the depth camera, None if it is unknown.
 
     Raises:
         DatasetError: There are IMUs, but none can be used; the sentence tells why.
@@ -64,8 +64,10 @@ def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64]
 
 
 def is_realsense_optical(imu: str, depth: str) -> bool:
-    """Whether a frame is that of the IMU of the RealSense camera whose image frame the other one is: its driver gives
-    accelerations in the axes of the depth camera, and names all frames after the camera."""
+    """Whether two frames, ``imu`` and ``depth``, belong to one RealSense camera.
+
+    Its driver gives accelerations in the axes of the depth camera and names all frames after the camera.
+    """
     found = re.fullmatch(r"/?(.*)(?:imu|accel|gyro)_optical_frame", imu)
     return found is not None and depth.lstrip("/").startswith(found[1]) and depth.endswith("_optical_frame")
 
