@@ -112,7 +112,7 @@ def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
     monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: (targets, np.zeros(300), np.ones(300, bool)))
     monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
     points = CAMERA.points(*pixels.T, level.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64))
-    view = SimpleNamespace(fine=level, grey=None, corners=pixels, corner_points=points, labelled=level)
+    view = SimpleNamespace(fine=level, coarse=level, grey=None, corners=pixels, corner_points=points, labelled=level)
     motion = dominant_motion(view, view, (None, None))
     np.testing.assert_allclose(motion.T_after_before, np.eye(4), atol=1e-6)
     assert motion.share == pytest.approx(16 / 18)
@@ -148,7 +148,7 @@ def test_corners_in_a_corner_of_the_image_do_not_tell_what_moves_elsewhere(monke
     monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: tracked)
     monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
     points = CAMERA.points(*pixels.T, level.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64))
-    view = SimpleNamespace(fine=level, grey=None, corners=pixels, corner_points=points, labelled=level)
+    view = SimpleNamespace(fine=level, coarse=level, grey=None, corners=pixels, corner_points=points, labelled=level)
     motion = dominant_motion(view, view, (None, None))
     on_floor = motion.before.pixels[:, 1] >= 70
     moving, static = motion.before.moving, motion.before.static

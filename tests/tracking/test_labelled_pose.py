@@ -56,7 +56,7 @@ def test_what_moves_close_to_the_camera_does_not_take_the_labelled_pose_along(tr
     T_nearest, after = blind.nearest(slam.reference, level, T)
     assert np.linalg.norm(se3.log(T_nearest @ se3.inverse(T))[:3]) > 0.008
     assert np.nanmean(np.abs(after)) < np.nanmean(np.abs(before))
-    moved = SimpleNamespace(blind=False, known_dynamic=None, labelled=level)
+    moved = SimpleNamespace(without_image=False, known_dynamic=None, labelled=level)
     prediction = PosePrediction(T, lambda: None, lambda: None, None)
     np.testing.assert_array_equal(slam.front_end._by_distances(slam.reference, moved, prediction, tracking), T)
 

@@ -112,8 +112,7 @@ class Bootstrap(Stateful):
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember what was fused after the first frame, or that the map began anew with it."""
-        if not self._window or view.blind:
-            self._window = []
+        if not self._window:
             return
         if view.timestamp <= self._window[0].frame.timestamp:
             self._window, self._num_fused = [], 0
@@ -320,8 +319,6 @@ class Mapper:
             if self._predictor.mostly_slow and estimate.unverified_mask is not None:
                 static &= ~full_size(estimate.unverified_mask, view.labelled.depth, observation.depth)
             observation = view.colored()
-            if view.blind:  # black pixels leave the colours of the map as they are
-                observation = replace(observation, rgb=np.zeros_like(observation.rgb), recorded_rgb=None)
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)

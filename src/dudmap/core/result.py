@@ -57,7 +57,7 @@ class FrameResult:
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless, or missing in a map with colours, or rejected after a change of the
-            light: its pose rests on the distances alone, and its colours are not fused.
+            light: its pose rests on the distances alone, and it is not fused.
         colorless: Whether the frame has no colour image: its pose rests on the distances alone.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Reason why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.

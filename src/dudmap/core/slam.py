@@ -215,7 +215,7 @@ class Slam(SlamResults, Stateful):
         view = registered if relocalized is None else self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = estimate.unobserved_motion or self.predictor.ambiguity(view, prediction, estimate)
+        uncertain = estimate.doubt(view) or self.predictor.ambiguity(view, prediction, estimate)
         fuse = self._adds_information(view, estimate, uncertain)
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
@@ -332,7 +332,8 @@ class Slam(SlamResults, Stateful):
     def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
         """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
         with view.timer("similarity"):
-            return not (uncertain or self.localize or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
+            known = view.blind or uncertain or self.localize
+            return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -380,7 +381,7 @@ class Slam(SlamResults, Stateful):
         result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
-            skipped_similar=not (fused or reason or uncertain or self.localize),
+            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(recorded_mask(dynamic_mask, view.observation)),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,

@@ -35,6 +35,7 @@ FIGURES = (
 NOT_FUSED = {
     "skipped_similar": "redundant view",
     "uncertain": "uncertain pose or labels",
+    "blind": "without usable colour",
 }
 """Why a tracked frame is not fused, by the key of metrics.json that counts such frames."""
 

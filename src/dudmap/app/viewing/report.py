@@ -290,7 +290,7 @@ def _losses(metrics: dict[str, Any]) -> Html:
     lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
     notes = [
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
-        (metrics.get("blind"), "images told too little: tracked by distances alone, their colours are not in the map"),
+        (metrics.get("blind"), "images told too little: tracked by distances alone, they are not in the map"),
         (metrics.get("colorless"), "frames without colour were tracked by distances alone"),
         (metrics.get("uncertain"), "frames with uncertain poses or labels are not in the map"),
         (metrics.get("degenerate"), "of them do not show all directions of motion"),

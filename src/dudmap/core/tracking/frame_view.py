@@ -14,7 +14,7 @@ from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask, full_size
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced
+from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced, saturated
 from dudmap.core.state import CACHE
 from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult
@@ -76,7 +76,7 @@ class FrameView:
         timer: Collects the processing time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
         blind: The image is textureless although the first image of the map was not, or the light has changed too much:
-            the pose rests on the distances alone, and its colours are not fused.
+            the pose rests on the distances alone, and the frame is not fused.
         color_velocity: (6,) twist of the camera per second with which the colours were registered.
         colors: Returns the observation with its colours registered; None where those it has are.
     """
@@ -195,6 +195,16 @@ class PoseEstimate:
     def unobserved_motion(self) -> str:
         """Reason why the pose is uncertain: directions that the view does not determine; empty if there are none."""
         return unobserved_motion(self.tracking.unobservable)
+
+    def doubt(self, view: FrameView) -> str:
+        """Reason why the pose is uncertain: the view does not determine all directions, or the light has changed and
+        most of the image is saturated; empty if there is none."""
+        if self.unobserved_motion:
+            return self.unobserved_motion
+        level = view.labelled
+        dark = saturated(level, self.exposure)
+        share = 0.0 if dark is None else np.count_nonzero(dark & (level.depth > 0)) / max(level.num_readings, 1)
+        return f"the light has changed, and {share:.0%} of the image is saturated" if share > 0.5 else ""
 
     def dynamic_mask(self, view: FrameView) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of the frame, of the labels and of those that are known before."""
