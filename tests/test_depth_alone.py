@@ -54,16 +54,12 @@ def test_depth_alone_gives_the_true_trajectory_and_a_grey_mesh(recording):
     assert np.all(mesh.colors == mesh.colors[:, :1])
 
 
-def test_a_missing_image_in_a_map_with_colours_paints_nothing(recording):
+def test_a_missing_image_in_a_map_with_colours_is_not_fused(recording):
     slam = Slam(CAMERA, Config().override(SMALL))
-    for index in range(4):
-        slam.process(recording[index])
-    before = slam.volume.extract_mesh().colors
-    result = slam.process(replace(recording[4], color=None))
-    assert (result.state, result.blind, result.fused, result.colorless) == ("tracked", True, True, True)
-    after = slam.volume.extract_mesh().colors
-    assert np.all(after == GREY, axis=1).sum() <= np.all(before == GREY, axis=1).sum()
-    assert abs(after.mean() - before.mean()) < 1
+    for index in range(5):
+        frame = recording[index]
+        result = slam.process(frame if index < 4 else replace(frame, color=None))
+    assert (result.state, result.blind, result.fused, result.colorless) == ("tracked", True, False, True)
 
 
 def test_a_recording_of_depth_alone_is_run_and_marked(folder, tmp_path):
