@@ -1,8 +1,8 @@
 """Ranges of the camera: every length of the configuration scaled to the size of the scene.
 
-A scene s times as large as a room, seen by a camera whose noise is that of a room's camera in proportion, gives the
-same residuals, labels and decisions if every length is multiplied by s. So the noise is s sigma(z / s), which is
-s sigma_base + (sigma_scale / s) z^2.
+Let a scene be s times as large as a room, with the noise of its camera scaled likewise. If every length is multiplied
+by s, residuals (in standard deviations), labels and decisions stay the same. So the noise is s sigma(z / s), which is s
+sigma_base + (sigma_scale / s) z^2.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,12 +17,11 @@ RANGES = {"near": 0.2, "room": 1.0, "far": 2.5}
 SMALLEST, LARGEST = 0.2, 5.0
 """Bounds of the size: voxels of 2 mm and of 5 cm."""
 MEDIAN, FARTHEST = 5.0, 6.0
-"""Median and 98 % quantile of the readings, metres, that the voxels of a room suffice for: 500 and 600 of
-them."""
+"""Largest median and 98 % quantile of the depth, metres, for the voxels of a room: 500 and 600 voxels."""
 NEAREST_MEDIAN = 0.3
-"""Median, metres, below which readings are nearer than in a room: many lie before its range, which begins at 0.2 m."""
+"""Smallest median depth of a room, metres. Below it many measurements are nearer than the room's range (0.2 m)."""
 FEW = 0.2
-"""Share of the pixels with a reading below which readings choose no range."""
+"""Smallest share of pixels with a measurement for the choice of a range."""
 
 POWERS = {
     "sensor": {"reference_depth": 1, "sigma_base": 1, "sigma_scale": -1},
@@ -35,9 +34,9 @@ POWERS = {
     "loops": {"min_distance": 1, "keep_distance": 1},
     "movers": {"min_area": 2, "merge_distance": 1, "max_jump": 1, "mesh_voxel_size": 1},
 }
-"""Power of the size of the scene by which a parameter grows. All others have no length in them."""
+"""Exponent of the size of the scene in a parameter's scale. All other parameters contain no length."""
 SHRINKING = {"tracker": ("stop", "stop_coarse")}
-"""Parameters of metres and radians at once, which shrink with the scene and do not grow."""
+"""Parameters in both metres and radians: they shrink with smaller scenes and do not grow with larger ones."""
 
 
 def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
@@ -55,10 +54,10 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
 
 
 def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
-    """Size of the scene in some depth images (H, W), metres, in rooms: 1 for the readings of a room.
+    """Size of the scene in some depth images (H, W), metres, relative to a room (1).
 
-    Else the voxel size becomes 1/500 of the median depth, or 1/600 of the 98 % quantile if that is farther, from 2 mm
-    to 5 cm.
+    The voxel size of other scenes becomes 1/500 of the median depth, or 1/600 of the 98 % quantile if that is larger,
+    clipped to 2 mm to 5 cm.
     """
     import numpy as np
 
@@ -74,5 +73,5 @@ def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
 
 
 def _rounded(value: float) -> float:
-    """The value with the digits that one writes."""
+    """The value rounded to the digits in use."""
     return float(f"{value:.3g}")

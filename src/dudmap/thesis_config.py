@@ -31,7 +31,7 @@ class ThesisConfig(ConfigSection):
     """Voxel size, metres (table 6.1)."""
     d_max: float = Field(default=0.1, gt=0)
     """Largest distance stored in front of a surface, metres. The thesis gives no number. 10 cm is three standard
-    deviations of a Kinect at 4 m, and exceeds ``theta``, without which no far motion would be found."""
+    deviations of a Kinect at 4 m. It exceeds ``theta``; otherwise no point in free space could be dynamic."""
     d_min: float = Field(default=0.1, gt=0)
     """Largest distance stored behind a surface, metres."""
     w_max: int = Field(default=255, ge=1, le=255)

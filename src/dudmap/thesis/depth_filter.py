@@ -16,8 +16,8 @@ ROWS = 60
 def fill_zeros(D: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth (H, W) with each zero pixel replaced by the mean of its 5x5 window; zero if the window is empty.
 
-    Reading: the mean is that of the valid pixels. Zeros are missing measurements; counted as depth they would draw
-    the surface towards the camera.
+    Reading: the mean is over the valid pixels. Zeros are missing measurements; as depths they would draw the surface
+    towards the camera.
     """
     valid = (D > 0).astype(np.float32)
     total, count = (

@@ -41,8 +41,8 @@ def density(d: Array, rho: float) -> Array:
 def neighbourhood_mean(u: Array, known: NDArray[np.bool_]) -> Array:
     """Mean of u (h, w) over the known pixels of each neighbourhood.
 
-    Reading: the graph of algorithm 3 is that of the pixels and their eight neighbours. Its maximal cliques are the
-    squares of 2x2 pixels; the neighbourhood of a pixel is the union of the four cliques that hold it, 3x3 pixels.
+    Reading: the graph of algorithm 3 connects each pixel to its eight neighbours. Its maximal cliques are squares of
+    2x2 pixels. The neighbourhood of a pixel is the union of its four cliques, 3x3 pixels.
     """
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
     total, count = (

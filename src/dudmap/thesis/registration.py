@@ -26,8 +26,8 @@ class Residuals:
     """Terms of the joint error (eq. 4.40) of all pixels of an image at a pose.
 
     Attributes:
-        psi: (h, w) distance psi of the points to the surface, metres; NaN where the map is unknown.
-        e_c: (h, w) intensity error V_I - I, intensities in [0, 1]; NaN where the map has no intensity.
+        psi: (h, w) distance psi of the points to the surface, metres; NaN off the map.
+        e_c: (h, w) intensity error V_I - I, intensities in [0, 1]; NaN without intensity in the map.
     """
 
     psi: NDArray[np.float32]
@@ -119,8 +119,8 @@ class Registration:
     def _align_level(self, volume: TsdfVolume, level: Level, T: Array, labels: NDArray[np.bool_] | None) -> Array:
         """Pose after the iterations of one level.
 
-        Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end; both
-        must hold, as the text after it says. A step that does not reduce the error is rejected.
+        Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As in
+        the text after it, both conditions must hold. A step that does not reduce the error is rejected.
         """
         damping, error = self.config.lambda_0, self.error(residuals(volume, level, T, self.config.d_max), labels)
         H, g = self.normal_equations(volume, level, T, labels)
@@ -165,8 +165,8 @@ class Registration:
         """J^T J (6, 6) and J^T f (6,) of both terms (eq. 4.43, 4.46, 4.47).
 
         Readings: eq. 4.46 and 4.47 have rho(psi) before the sums; it weighs each pixel. Eq. 4.38 differentiates a sum
-        of squares; J_c is the derivative of V_I - I. The gradient of V_I is that of the image, to which it is equal
-        where both are registered (eq. 4.36, 4.37 differentiate images).
+        of squares; J_c is the derivative of V_I - I. The gradient of V_I is replaced by the image gradient, which
+        equals it after registration (eq. 4.36, 4.37 differentiate images).
         """
         found = residuals(volume, level, T, self.config.d_max)
         eta = gradient(volume, level, T)
@@ -189,7 +189,8 @@ class Registration:
 
     @staticmethod
     def _color_gradient(level: Level, p: Array, used: NDArray[np.bool_]) -> Array:
-        """Gradient of the intensity by the point (n, 3), camera axes: image gradient times that of the projection."""
+        """Gradient of the intensity by the point (n, 3), camera axes: image gradient times Jacobian of the
+        projection."""
         I_x, I_y = (image[used].astype(np.float64) for image in sobel(level.intensity))
         (fx, fy), Z = level.camera.focal, p[:, 2]
         return np.stack([I_x * fx / Z, I_y * fy / Z, -(I_x * fx * p[:, 0] + I_y * fy * p[:, 1]) / Z**2], axis=-1)

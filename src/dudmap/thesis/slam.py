@@ -50,7 +50,7 @@ class ThesisSlam:
 
     Attributes:
         volume: The map; ``extract_mesh`` and ``raycast`` give the mesh and the artificial view.
-        color_error: (h, w) float32 error e_c of the last registered frame (eq. 4.49); NaN where the map has no colour.
+        color_error: (h, w) float32 error e_c of the last registered frame (eq. 4.49); NaN without colour in the map.
     """
 
     first_pass, localize, device = None, False, "cpu"

@@ -1,7 +1,7 @@
-"""Cameras in the content of a file, whatever it is called: text, JSON, YAML, NumPy arrays.
+"""Cameras in the content of a file of any name: text, JSON, YAML, NumPy arrays.
 
-A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths with a principal point, under any of the
-names that programs give them. Only numbers are looked at here; whether they fit the images is decided by the caller.
+A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths with a principal point under any usual
+name. The caller tests whether the numbers fit the images.
 """
 
 import re
@@ -26,32 +26,32 @@ ALIASES = {
     "width": ("width", "image_width", "img_width", "w"), "height": ("height", "image_height", "img_height", "h"),
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
 }  # fmt: skip
-"""Our keys and the names they have elsewhere, in lower case with underscores."""
+"""Our keys and their names in other programs, in lower case with underscores."""
 PAIRS = {
     ("fx", "fy"): ("focal_length", "focal"), ("cx", "cy"): ("principal_point", "optical_center"),
     ("width", "height"): ("resolution", "image_size", "img_size", "size"),
 }  # fmt: skip
-"""Two keys whose numbers stand in one list, and the names of the list."""
+"""Pairs of keys whose numbers form one list, and the names of the list."""
 LENSES = (
     "coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "dist_coeff",
     "dist", "d",
 )  # fmt: skip
 """Names of the coefficients of a lens."""
 ROWS = re.compile(r"intrin|calib|cam|param|^k$|^data$|^$")
-"""Names of a list ``fx fy cx cy`` with a size, or with coefficients of a lens, behind it."""
+"""Names of a list ``fx fy cx cy`` that continues with a size or with coefficients of a lens."""
 KNOWN = sorted((name for names in ALIASES.values() for name in names), key=len, reverse=True)
 KEYED = re.compile(rf"(?:(.+)_)?({'|'.join(KNOWN)})(?:_(.+))?")
-"""A name of one number, with words before and after it that tell of which camera it is: ``fx_depth``, ``Camera.fx``."""
+"""Name of one number, with words before and after it that name its camera: ``fx_depth``, ``Camera.fx``."""
 LENS = ("k1", "k2", "p1", "p2", "k3")
 COLMAP = {"pinhole": 6, "opencv": 10}
-"""Models of COLMAP's cameras.txt, and how many numbers they have: width height fx fy cx cy [k1 k2 p1 p2]."""
+"""Models of COLMAP's cameras.txt and their count of numbers: width height fx fy cx cy [k1 k2 p1 p2]."""
 SKEW = 0.01
-"""Largest skew of a matrix that is left out, as a share of fx: it shifts the edge of an image by 1 % of its height."""
+"""Largest ignored skew of a matrix, as a share of fx. It shifts the edge of an image by 1 % of its height."""
 LEAST = 8.0
-"""Smallest focal length and principal point of a camera, pixels: those of images of 16 pixels. Other numbers that stand
-in fours, such as quaternions, are smaller."""
+"""Smallest focal length and principal point of a camera, pixels, as for images of 16 pixels. Other groups of four
+numbers, such as quaternions, are smaller."""
 LEAST_SCALE = 100.0
-"""Smallest scale of depth, units per metre: a centimetre. Other numbers are called a scale, too."""
+"""Smallest scale of depth, units per metre (a centimetre). Smaller numbers named scale mean something else."""
 LARGEST_CONTENT = LARGEST_TOML
 """Largest file of intrinsics, bytes."""
 NO_NAMES = ("px", "pixel", "pixels")
@@ -59,10 +59,10 @@ NO_NAMES = ("px", "pixel", "pixels")
 
 
 def cameras_in(file: Path) -> list[tuple[str, Values]]:
-    """Names, in lower case, and numbers by our keys of all cameras in a file; none if it is something else.
+    """Names (lower case) and values by our keys of all cameras in a file; empty for other files.
 
     Raises:
-        DatasetError: A camera has a lens of a model that is not read.
+        DatasetError: A camera has an unsupported lens model.
     """
     tree = _tree(file)
     unit = depth_scale(tree) or 0
@@ -75,7 +75,7 @@ def cameras_in(file: Path) -> list[tuple[str, Values]]:
 
 
 def _tree(file: Path) -> Any:  # noqa: ANN401 - dictionaries and lists
-    """Content of a file as dictionaries, lists and numbers; None if it is none of the forms that are read."""
+    """Content of a file as dictionaries, lists and numbers; None for unsupported formats."""
     suffix = file.suffix.lower()
     try:
         if suffix == ".npy":
@@ -95,7 +95,7 @@ def _tree(file: Path) -> Any:  # noqa: ANN401 - dictionaries and lists
 
 
 def _tokens(text: str) -> Any:  # noqa: ANN401
-    """Names and the numbers behind each in a text, or only its numbers; a name that returns begins another camera."""
+    """Names in a text and the numbers after each, or only its numbers; a repeated name begins another camera."""
     numbers: list[float] = []
     parts: list[dict[str, Any]] = [{}]
     words: list[str] = []
@@ -192,14 +192,14 @@ def _of_dictionary(tree: dict[str, Any], name: str) -> Iterator[tuple[str, Value
 
 
 def _may_be(key: str, below: Any) -> bool:  # noqa: ANN401
-    """Whether a value may hold cameras: a list of plain numbers only under a name of cameras."""
+    """Whether a value may hold cameras: a list of plain numbers needs a name of cameras."""
     if isinstance(below, list):
         return ROWS.search(key) is not None or not all(map(_is_number, below))
     return isinstance(below, dict)
 
 
 def _row(value: list[Any], name: str) -> Values | None:
-    """Camera of a list: a matrix, or the numbers fx fy cx cy, with width and height or coefficients behind them."""
+    """Camera of a list: a matrix, or the numbers fx fy cx cy, then width and height or coefficients."""
     if (K := _matrix(value)) is not None:
         return values_of({"K": K.ravel().tolist()})
     if not all(map(_is_number, value)) or len(value) not in (4, 6, 7, 8, 9):
@@ -216,7 +216,7 @@ def _by_place(numbers: list[Any]) -> Values:
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Matrix K (3, 3) of 9, 12 or 16 numbers by rows or columns, with the rows fx s cx, 0 fy cy, 0 0 1; else None."""
+    """Matrix K (3, 3), rows fx s cx, 0 fy cy, 0 0 1, of 9, 12 or 16 numbers by rows or columns; else None."""
     flat = _flat(value)
     if flat is None or len(flat) not in (9, 12, 16):
         return None
@@ -235,7 +235,7 @@ def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
 
 
 def _flat(value: Any) -> list[float] | None:  # noqa: ANN401
-    """Numbers of a list, of a list of rows, or of the ``data`` of a matrix in OpenCV's form; None if it is none."""
+    """Numbers of a list, of a list of rows, or of the ``data`` of OpenCV's matrix; None for other values."""
     if isinstance(value, dict):
         value = value.get("data")
     if not isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Intrinsics in files of any name: accepted is the only camera, for each kind of images, that fits their size."""
+"""Intrinsics in files of any name: for each kind of images, the only camera that fits their size is accepted."""
 
 import os
 import re
@@ -18,11 +18,11 @@ NAMED = re.compile(r".*(cam|intrin|calib|param).*|k([._-].*)?", re.IGNORECASE)
 """Names of files, without their suffix, that may hold intrinsics."""
 SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".csv", ".npy", ".npz", ".cfg", ".ini", ".conf", ".toml", "")
 FOLDERS = re.compile(r"config|.*(intrin|calib).*", re.IGNORECASE)
-"""Names of folders in which such files, under any name, are looked for, too."""
+"""Names of folders that are searched for such files of any name."""
 MOST_NAMES = 5
-"""Files that a message names."""
+"""Largest number of files in a message."""
 SAME = 0.5
-"""Largest difference of the numbers of one camera in two files, pixels: below what shifts an edge by a pixel."""
+"""Largest difference of the numbers of one camera in two files, pixels: it shifts an edge by less than a pixel."""
 FIELD_OF_VIEW = (20.0, 130.0)
 """Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
 OFF_CENTER = 0.25
@@ -30,14 +30,14 @@ OFF_CENTER = 0.25
 UNEQUAL_FOCAL = 0.1
 """Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
 SCALED = ", scaled from "
-"""In a source of intrinsics, before the size that its file gives."""
+"""Text in a source of intrinsics before the size in its file."""
 COLOR_WORDS, OTHER_WORDS = r"colou?r|rgb(?!_?d)|left", r"right|infra"
 
 Size = tuple[int, int]
 
 
 class Found(NamedTuple):
-    """A camera of a file, for the images of a kind, with the size that the file gives where it is scaled."""
+    """Camera of a file for one kind of images, with the size in the file if it was scaled."""
 
     file: Path
     kind: str
@@ -48,13 +48,13 @@ class Found(NamedTuple):
 def known(
     folder: Path, published: Intrinsics | None, sizes: Callable[[], tuple[Size, Size] | None], why: str = ""
 ) -> Intrinsics:
-    """Intrinsics of a recording: of a file of a usual name, else the published ones, else of any file that fits.
+    """Intrinsics of a recording: from a file of a usual name, else the published ones, else from any file that fits.
 
     Args:
         folder: The folder of the recording.
         published: Intrinsics of the data set, if it is known.
         sizes: Width and height of the depth and of the colour images, None if no image can be read.
-        why: For the message: why those of the data set are not known.
+        why: For the message: why the data set's intrinsics are unknown.
 
     Raises:
         DatasetError: No file gives one camera.
@@ -80,7 +80,7 @@ def known(
 
 
 def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
-    """Intrinsics in a folder, in the one above, or in their folders for configurations; None without any.
+    """Intrinsics in a folder, its parent, or their configuration folders; None without any.
 
     Args:
         folder: The folder of the recording.
@@ -124,7 +124,7 @@ def _is_small(file: Path) -> bool:
 
 
 def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) -> Found | None:
-    """A camera for the images that it fits, depth where it fits both; None if it fits none."""
+    """Camera for the kind of images that it fits, depth if it fits both; None if it fits none."""
     if re.search(OTHER_WORDS, name):
         return None
     kinds = {"depth": depth, "color": color}
@@ -159,7 +159,7 @@ def _is_multiple(given: Size, size: Size) -> bool:
 
 
 def _is_plausible(values: Values, size: Size) -> bool:
-    """Whether numbers can be those of a camera of images of a size."""
+    """Whether numbers are a plausible camera for images of a size."""
     focal, center = np.array([values["fx"], values["fy"]]), np.array([values["cx"], values["cy"]])
     if not (focal > 0).all():
         return False
@@ -170,7 +170,7 @@ def _is_plausible(values: Values, size: Size) -> bool:
 
 
 def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intrinsics:
-    """Intrinsics of the cameras that were found."""
+    """Intrinsics from the found cameras."""
     cameras: dict[str, Values] = {}
     for kind in ("depth", "color"):
         known = [camera for camera in found if camera.kind == kind]
@@ -204,7 +204,7 @@ def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intr
 
 
 def _distinct(cameras: list[Found]) -> list[Found]:
-    """Cameras that differ, each with the most that is known of it."""
+    """Distinct cameras, each with its most complete values."""
     kept: list[Found] = []
     for camera in sorted(cameras, key=lambda camera: -len(camera.values)):
         if not any(_is_same(camera.values, other.values) for other in kept):
@@ -219,7 +219,7 @@ def _is_same(one: Values, other: Values) -> bool:
 
 
 def _source(found: list[Found], folder: Path) -> str:
-    """Files of cameras for people, and how their numbers were scaled."""
+    """Text that names the files of cameras and the scaling of their numbers."""
     names = list(dict.fromkeys(_shown(camera.file, folder) for camera in found))
     scaled = next((camera for camera in found if camera.scaled), None)
     text = _listed(names)

@@ -1,4 +1,4 @@
-"""The direction against gravity as a recording measured it."""
+"""The direction against gravity measured by a recording."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.trajectory import Trajectory
 
 NEAR = 0.05
-"""Largest time from a reading to the pose that it is seen from, seconds: one and a half frames at 30 Hz."""
+"""Largest time between a measurement and its pose, seconds: one and a half frames at 30 Hz."""
 
 
 class Gravity(NamedTuple):
-    """Directions against gravity, seen from the depth camera.
+    """Directions against gravity in the axes of the depth camera.
 
     Attributes:
         timestamps: (N,) times of the readings, seconds.

@@ -1,4 +1,4 @@
-"""Headers of image files: format, size, and whether the values are those of depth or of colour images."""
+"""Headers of image files: format, size, and kind of the values (depth or colour)."""
 
 import re
 import struct
@@ -11,7 +11,7 @@ from dudmap.io.sequences import exr
 
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
 LARGEST_HEADER = 1 << 16
-"""Bytes of a file in which its header is looked for."""
+"""Largest size of a header, bytes from the start of the file."""
 LARGEST_SCANS = 100
 """Largest number of passes over the image in a progressive JPEG file; encoders write up to 10, and each takes time."""
 _TIFF_TYPES = {3: "H", 4: "I"}
@@ -20,9 +20,9 @@ _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}
 
 
 def check_size(data: bytes, name: str) -> None:
-    """Check that an image is in a format that is read, and has a possible size; ``name`` is used in messages.
+    """Check the format and size of an image; ``name`` is used in messages.
 
-    Other formats that the decoder knows are refused: each is code of its own that would read what others wrote.
+    The decoder's other formats are refused, since each adds code that reads untrusted files.
 
     Raises:
         FrameError: It is in another format, too large, or its header is damaged.
@@ -116,11 +116,11 @@ _FORMATS = {
     PNG: _png, JPEG: _jpeg, **dict.fromkeys(TIFF, _tiff), b"BM": _bmp, b"RIFF": _webp,
     **{b"P" + digit: _pnm for digit in (b"1", b"2", b"3", b"4", b"5", b"6", b"f", b"F")},
 }  # fmt: skip
-"""First bytes of the formats that are read, and what finds their size."""
+"""First bytes of the supported formats, and the function that finds the size."""
 
 
 def kind_of(file: Path) -> str:
-    """Kind of the values of an image file as ``content`` names it; empty where the file cannot be read."""
+    """Kind of the values of an image file, see ``content``; empty if the file cannot be read."""
     try:
         with open_plain(file) as opened:
             data = opened.read(LARGEST_HEADER)
@@ -133,8 +133,8 @@ def content(data: bytes) -> str:
     """Kind of the values of an image by its header.
 
     Returns:
-        ``depth`` for one channel of 16 bits or floats, ``color`` for 8-bit colours, ``gray`` for 8-bit intensities,
-        ``other`` for palettes and the like, and an empty text for what is no image.
+        ``depth`` (one channel of 16 bits or floats), ``color`` (8-bit colours), ``gray`` (8-bit intensities), ``other``
+        (such as palettes), or an empty text for data that are no image.
     """
     try:
         if data.startswith(PNG):

@@ -1,4 +1,4 @@
-"""Numbers in the names of images, by which colour and depth images pair: counts, times, or all numbers of a name."""
+"""Numbers in image names that pair colour and depth: counts, times, or all numbers of a name."""
 
 import re
 from collections.abc import Iterator
@@ -11,11 +11,11 @@ from dudmap.core.geometry.association import associate
 from dudmap.core.geometry.times import time_unit
 
 NUMBER = r"\d+(?:\.\d+)?"
-"""A number in a name; a decimal one counts as a whole."""
+"""A number in a name; a decimal number counts as one."""
 LARGEST_NUMBER = 10**8
-"""From here on a number in a file name is a time, not the number of a frame: 38 days at 30 frames a second."""
+"""Numbers of this size and more in a file name are times, not frame numbers: 38 days at 30 frames a second."""
 LARGEST_SECONDS = 10**11
-"""Up to here a time since 1970 is one in seconds."""
+"""Largest time since 1970 in seconds; larger numbers have a smaller unit."""
 Keys = tuple[list[float], list[float]]
 """Numbers of the colour images and of the depth images."""
 
@@ -28,8 +28,8 @@ def last_number(file: Path) -> float:
 def keys(colors: list[Path], depths: list[Path]) -> Keys:
     """Numbers by which most of the images pair.
 
-    Tried are ``<seconds>_<fraction>``, the last number, the numbers before it, and the place of a name among all names
-    in the order of all their numbers.
+    The candidates are ``<seconds>_<fraction>``, the last number, each earlier number, and the rank of a name in the
+    order of all its numbers.
     """
     best, most = None, -1
     for found in _kinds_of_keys(colors, depths):
@@ -43,7 +43,7 @@ def keys(colors: list[Path], depths: list[Path]) -> Keys:
 
 
 def count_pairs(colors: list[Path], depths: list[Path]) -> int:
-    """How many of the images pair."""
+    """Number of image pairs."""
     return _count(keys(colors, depths))
 
 

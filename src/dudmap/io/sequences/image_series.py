@@ -1,7 +1,7 @@
-"""Which numbered images of a folder are colour and which are depth, by names and by content.
+"""Recognition of colour and depth among the numbered images of a folder, by names and by content.
 
-A series are the images of one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in the names
-of files and folders decide first. Where they say nothing, or the opposite of the content, the content decides: one
+A series is the set of images in one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in the
+names of files and folders decide first. If they do not tell, or contradict the content, the content decides: one
 channel of 16 bits or floats is depth, 8-bit colours are colour.
 """
 
@@ -21,10 +21,10 @@ from dudmap.io.sequences.image_headers import kind_of
 from dudmap.io.sequences.image_numbers import NUMBER, count_pairs, last_number
 
 WORDS = {"color": ("color", "colour", "rgb", "left", "image", "img", "mono"), "depth": ("depth",)}
-"""Words of files and folders of either kind, the surest first."""
+"""Words in names of files and folders of each kind, the surest first."""
 NEITHER = {"right", "vis", "ir", "seg", "flow"}
 NEITHER_STARTS = "confid", "mask", "normal", "label", "instance", "semantic", "segment", "dispar", "infra", "thermal"
-"""Words, and beginnings of words, of other images than depth and colour."""
+"""Words, and beginnings of words, in names of images that are neither depth nor colour."""
 CONTENTS = {
     "depth": "one channel of 16 bits or floats", "color": "8-bit colours", "gray": "8-bit intensities",
     "other": "palettes or other values", "": "content that differs or cannot be read",
@@ -32,12 +32,12 @@ CONTENTS = {
 PROBED = 3
 """Images of a series whose headers are read."""
 LEAST_SHARE = 0.25
-"""Share of the longer of two series that must have a partner if content tells that both belong together; and share of
-the images of its kind that a series needs to replace others, which are called alike but hold something else."""
+"""Smallest share of the longer of two series with a partner, if content alone pairs them. Also the smallest share of
+the images of its kind in a series that replaces another one by its content."""
 LARGEST_LIST = 5
-"""Series that a message names."""
+"""Largest number of series in a message."""
 Found = dict[str, "Series | None"]
-"""The series of either kind, None if there is none."""
+"""The series of each kind, None if there is none."""
 
 
 @dataclass
@@ -45,9 +45,9 @@ class Series:
     """Images of one folder whose names differ by numbers alone.
 
     Attributes:
-        label: Name of the folder and of the files, with N for every number.
+        label: Names of folder and files, with N for every number.
         files: The images by name.
-        kind: ``depth``, ``color``, ``neither``, or empty, by names, and by content where names contradict each other.
+        kind: ``depth``, ``color``, ``neither``, or empty: by names, and by content if names contradict each other.
     """
 
     label: str
@@ -56,24 +56,24 @@ class Series:
 
     @cached_property
     def content(self) -> str:
-        """Kind of the values (``image_headers.content``); empty where the sampled images differ or none is read."""
+        """Kind of the values (``image_headers.content``); empty if the sampled images differ or none is readable."""
         sampled = {self.files[k] for k in np.linspace(0, len(self.files) - 1, PROBED).astype(int)}
         kinds = {kind for file in sampled if (kind := kind_of(file))}
         return kinds.pop() if len(kinds) == 1 else ""
 
     @property
     def fits(self) -> bool:
-        """Whether the content may be of the kind that names say."""
+        """Whether the content may be of the kind in the names."""
         return self.content not in {"depth": ("color", "gray", "other"), "color": ("depth",)}.get(self.kind, ())
 
     def may_be(self, kind: str) -> bool:
-        """Whether the images are of a kind by their content; colours that are called depth are pictures of it."""
+        """Whether the content is of a kind; colour images named depth are visualisations and do not count."""
         if self.kind == "neither" or (kind, self.kind) == ("color", "depth"):
             return False
         return self.content == kind or (kind == self.kind == "color" and self.content == "gray")
 
     def rank(self, kind: str) -> tuple[bool, list[bool]]:
-        """Sorts the series that may be of a kind, those with the surest names first."""
+        """Sort key of the series that may be of a kind: surest names first."""
         return self.kind != kind, [word not in self.label.lower() for word in WORDS[kind]]
 
     def __str__(self) -> str:
@@ -96,8 +96,7 @@ def kind_by_name(name: str) -> str:
 
 
 def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
-    """Colour and depth images of a folder: by the given patterns, else by names, else by content; empty if there are
-    none.
+    """Colour and depth images of a folder by given patterns, else by names, else by content; may be empty.
 
     Raises:
         DatasetError: A pattern matches no numbered image, or several series may be meant.
@@ -110,7 +109,7 @@ def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
 
 
 def by_names(path: Path) -> Found:
-    """Colour and depth images by words: in a folder, else in one folder of each kind in it."""
+    """Colour and depth images by words in names: in the folder, else in one subfolder of each kind."""
     own = _series_in(path)
     found = {kind: _surest(own, kind) for kind in WORDS}
     if (depth := found["depth"]) and not found["color"]:  # 0001.jpg is the colour of 0001_depth.png
@@ -124,9 +123,9 @@ def by_names(path: Path) -> Found:
 
 
 def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
-    """Colour and depth images that pair, by content where names say nothing; empty if there are none.
+    """Pairs of colour and depth images, by content if names do not tell; empty if there are none.
 
-    Images of both kinds in one folder of the folder are a recording of their own.
+    A subfolder with images of both kinds is a recording of its own.
 
     Raises:
         DatasetError: Several series may be meant.
@@ -139,7 +138,7 @@ def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
 
 
 def alone(path: Path, given: dict[str, Series] | None = None) -> Found:
-    """Depth images without any images that may be colour; empty if there are none.
+    """Depth images of a folder without possible colour images; empty if there are none.
 
     Raises:
         DatasetError: Several series may be meant.
@@ -155,7 +154,7 @@ def alone(path: Path, given: dict[str, Series] | None = None) -> Found:
 
 
 def unknown(path: Path) -> str:
-    """Sentence on a folder whose images are not known to be depth and colour; empty if there are none."""
+    """Sentence on a folder whose images are not recognised as depth and colour; empty if it has no images."""
     there = _there(path)
     return there and (
         f"{path} holds images in no known layout: {there}; expected colour images of 8 bit and depth images of 16 bit "
@@ -256,7 +255,7 @@ def _is_recording(series: list[Series]) -> bool:
 
 
 def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
-    """The pair of series of both kinds with the surest names that has the most pairs of images; empty if there is none.
+    """The two series with the surest names, and among these with the most pairs of images; empty if there is none.
 
     Raises:
         DatasetError: Several are alike in both.

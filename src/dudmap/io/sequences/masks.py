@@ -1,4 +1,4 @@
-"""Folders of masks: which frame each belongs to, by the name or the number of its image, or by time."""
+"""Folders of masks: assignment to frames by the name or the number of the image, or by time."""
 
 import re
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ from dudmap.io.sequences.image_numbers import LARGEST_NUMBER, NUMBER
 from dudmap.io.sequences.images import read_mask
 
 WORDS = re.compile(r"[\W_]*(?:masks?|colou?r|rgb|depth|image|img|frame|left)[\W_]*", re.IGNORECASE)
-"""Words in names of images and masks that do not tell which frame they belong to."""
+"""Words in names of images and masks that do not identify the frame."""
 Images = Sequence[tuple[Path, Path]]
-"""Files of the colour and the depth image of every frame; empty where a recording is one file."""
+"""Files of the colour and the depth image of every frame; empty if the recording is one file."""
 
 
 class MaskFolder:
-    """Folder of masks (PNG, 255 = dynamic), each of the frame whose image has its name, its number, or is near in time.
+    """Folder of masks (PNG, 255 = dynamic), assigned to frames by name, by number or by time.
 
     A mask ``000030.png``, ``30.png``, ``rgb_000030.png`` or ``frame-000030.mask.png`` belongs to the frame of colour
-    image 30. One named by a time, in any unit, belongs to the nearest frame at most 20 ms away.
+    image 30. A mask named by a time, in any unit, belongs to the nearest frame, at most 20 ms away.
 
     Args:
         path: The folder.
@@ -93,12 +93,12 @@ def stamped_masks(folder: Path) -> list[tuple[float, Path]]:
 
 
 def are_counts(masks: Sequence[Path]) -> bool:
-    """Whether masks are named by small whole numbers, which count frames and are no times."""
+    """Whether masks are named by small whole numbers, which are frame numbers and no times."""
     return bool(masks) and all(_is_count(_core(mask)) for mask in masks)
 
 
 def _of_one_form(files: list[Path]) -> list[Path]:
-    """Files of the most frequent form of name, of the forms with the word mask if there are any."""
+    """Files with the most frequent form of name; forms with the word mask have precedence."""
     forms: dict[str, list[Path]] = {}
     for file in files:
         forms.setdefault(re.sub(NUMBER, "N", file.stem), []).append(file)
@@ -106,7 +106,7 @@ def _of_one_form(files: list[Path]) -> list[Path]:
 
 
 def _core(file: Path) -> str:
-    """Name of a file without the words that all files of a kind share."""
+    """Name of a file without ``WORDS``."""
     return WORDS.sub("", file.stem)
 
 
@@ -119,7 +119,7 @@ def _is_count(name: str) -> bool:
 
 
 def _by_name(masks: list[Path], images: Images) -> dict[int, Path]:
-    """Masks by number of the frame whose colour image, or else depth image, has their name or their number."""
+    """Masks by frame number: the colour image, or else the depth image, has the same name or number."""
     found: dict[int, Path] = {}
     sides = list(zip(*images, strict=True))
     names = [{_core(file): index for index, file in enumerate(side)} for side in sides]
@@ -143,7 +143,7 @@ def _by_name(masks: list[Path], images: Images) -> dict[int, Path]:
 
 
 def _numbers(files: Sequence[Path]) -> dict[int, int]:
-    """Frames by the whole number in the names of their images, the last one that differs from frame to frame."""
+    """Frames by a whole number in the names of their images: the last number that varies."""
     rows = [re.findall(NUMBER, file.stem) for file in files]
     for place in range(1, 1 + min(map(len, rows))):
         column = [row[-place] for row in rows]
@@ -155,7 +155,7 @@ def _numbers(files: Sequence[Path]) -> dict[int, int]:
 def _by_time(
     path: Path, masks: list[Path], timestamps: NDArray[np.float64], taken: dict[int, Path], images: Images
 ) -> dict[int, Path]:
-    """Masks that are named by a time, by number of the frame; ``taken`` are the frames that have one already."""
+    """Masks named by a time, by frame number; ``taken`` are the frames that already have a mask."""
     counts = [mask for mask in masks if _is_count(_core(mask))]
     stamps = {float(_core(mask)): mask for mask in masks if mask not in counts and _is_time(_core(mask))}
     times = np.array(sorted(stamps))

@@ -27,7 +27,7 @@ def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:
-    """Matrices (N, 4, 4) of a text file with 16 numbers a pose, row by row, or 12 a line, without the row 0 0 0 1."""
+    """Matrices (N, 4, 4) of a text file: 16 numbers a pose, row by row, or 12 a line (no row 0 0 0 1)."""
     numbers = _numbers(path)
     counts = [(n, len(line.replace(",", " ").split())) for n, line in enumerate(read_text(path).splitlines(), start=1)]
     counts = [(line, count) for line, count in counts if count]
@@ -49,8 +49,8 @@ def read_matrices(path: Path) -> NDArray[np.float64]:
 def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
     """Poses by frame number of a ``.log`` file: a line of three integers, then four rows of T_world_camera.
 
-    The format is that of the Redwood data sets and of Open3D's reconstruction system. The first integer is the number
-    of the frame.
+    The Redwood data sets and Open3D's reconstruction system use this format. The first integer is the number of the
+    frame.
     """
     numbers = _numbers(path)
     if numbers.size == 0 or numbers.size % 19:

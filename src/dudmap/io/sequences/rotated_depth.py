@@ -15,28 +15,29 @@ from dudmap.errors import FrameError
 
 UNITS_PER_METRE = 8000.0
 LEAST_READINGS, LEAST_VALUES = 1000, 32
-"""Fewest readings, and fewest different values, that are judged."""
+"""Smallest number of measurements, and of different values, for a decision."""
 MOST = 0.95
-"""Share of the readings from which a property is one of the images: the others may be damaged."""
+"""Smallest share of the measurements with a property of the images: the others may be damaged."""
 NEAR_SHARE = 0.8
 """Least share of the readings below 8.19 m; their low three bits are 0."""
 FARTHEST = 10000
-"""Distance, mm, beyond which depth cameras for rooms hardly measure. Readings with low bits must be nearer: low bits
-that number persons, as in Microsoft's first driver, give farther ones. A unit is wrong if a twentieth is beyond it."""
+"""Largest distance that depth cameras for rooms measure, mm. Values with low bits must decode to nearer distances. Low
+bits that number persons (Microsoft's first driver) decode to farther ones. A unit is wrong if a twentieth of the
+distances is beyond this limit."""
 FACTORS = (2, 3, 5, 7, 11, 13)
-"""Factors of which the millimetres may not all be multiples: such images have another unit."""
+"""If all millimetres are multiples of one of these factors, the images have another unit."""
 PLAUSIBLE = (256, 8000)
-"""Median distance, mm: from the last one that 8-bit depth times 8 can be, to the farthest of a camera for rooms."""
+"""Range of the median distance, mm: from the limit of 8-bit depth times 8 to the limit of a camera for rooms."""
 DENSE = 0.9
-"""Share of the millimetres of a range that occur, up to which the steps between the values grow with the distance, as
-those of a depth camera do, and are not those of a coarse unit."""
+"""Largest share of the millimetres in a range that occur in rotated depth. The steps of a depth camera grow with the
+distance; a coarse unit has constant steps."""
 SAMPLED = 5
-"""Number of evenly spread frames that are judged."""
+"""Number of evenly spread frames in the test."""
 SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"
 
 
 class Rotated(Enum):
-    """Whether depth images are rotated: both readings may be distances in a room, and a file may give the unit."""
+    """Whether depth images are rotated. Both interpretations may be distances in a room; a file may give the unit."""
 
     NO = ""
     POSSIBLY = f"{SAID}; if distances come out eight times too large, give --depth-unit 0.000125"
@@ -59,9 +60,8 @@ def judge(count: int, read: Callable[[int], NDArray[np.floating]], units_per_met
 
     Args:
         count: Number of images.
-        read: Reads the image of a number: the values as stored, 0 for no reading. Values that are not whole are none
-            of 16 bits.
-        units_per_metre: Of the values if they are not rotated.
+        read: Returns the stored values of an image by number, 0 for no measurement. Fractions exclude 16-bit values.
+        units_per_metre: Unit of the values if they are not rotated.
         given: Whether a file or the user gives that number.
     """
     images = []
@@ -88,7 +88,7 @@ def judge(count: int, read: Callable[[int], NDArray[np.floating]], units_per_met
 
 
 def _has_eighths(values: NDArray[np.floating]) -> bool:
-    """Whether whole numbers are multiples of 8, but for those far away."""
+    """Whether the values are multiples of 8, except for far distances."""
     if len(values) == 0:
         return True
     far = values[values % 8 != 0]

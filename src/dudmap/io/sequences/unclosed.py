@@ -1,7 +1,7 @@
 """Bags that were not closed: the recorder was killed, the power failed, or a copy was cut off.
 
-The index of an MCAP file or ROS 1 bag lies at its end. A new one is made from the chunks that are complete, and read as
-if it followed them; the file itself is not changed. Content that is not as its format says is a ``ValueError``.
+The index of an MCAP file or ROS 1 bag lies at its end. A new index is made from the complete chunks and read as if it
+followed them. The file itself is not changed. Content that violates the format is a ``ValueError``.
 """
 
 import io
@@ -16,13 +16,13 @@ from dudmap.input_files import open_plain
 
 
 class CompletedFile:
-    """The first bytes of a file and others that are not in it; rosbags takes it for the path of a file.
+    """The first bytes of a file followed by bytes in memory; rosbags uses it like a path.
 
     Args:
         path: The file.
-        length: Number of bytes of it that are read.
-        tail: Bytes that are read after them.
-        head: Bytes that are read in place of its first ones.
+        length: Number of bytes of the file that are read.
+        tail: Bytes that are read after these.
+        head: Bytes that replace the first bytes of the file.
     """
 
     def __init__(self, path: Path, length: int, tail: bytes, head: bytes = b"") -> None:
@@ -97,17 +97,17 @@ def completed(path: Path) -> CompletedFile | None:
 
 
 MCAP, BAG = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
-"""First bytes of an MCAP file, which are its last ones, too, and of a ROS 1 bag."""
+"""First bytes of an MCAP file (and its last bytes), and of a ROS 1 bag."""
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
 """Operation codes of MCAP records (MCAP specification, section Records)."""
 LARGEST_CHUNK = 2**28
-"""Largest chunk or message of a bag after decompression, bytes; recorders write chunks of up to 4 MB, and one raw image
-of ``LARGEST_PIXELS`` has 200 MB."""
+"""Largest chunk or message of a bag after decompression, bytes. Recorders write chunks of up to 4 MB. A raw image of
+``LARGEST_PIXELS`` has 200 MB."""
 
 
 @dataclass
 class _Chunk:
-    """A chunk of an MCAP file: its record, all before its content, and the places of its indexes by channel."""
+    """A chunk of an MCAP file: its record, the head before its content, and the positions of its indexes by channel."""
 
     start: int
     end: int
@@ -173,7 +173,7 @@ def _completed_mcap(path: Path, file: IO[bytes]) -> CompletedFile:
 
 
 def _mcap_records(file: IO[bytes], position: int) -> Iterator[tuple[int, int, int]]:
-    """Operation code, place and length of the content of each record that is whole, up to the end of the data."""
+    """Operation code, position and length of the content of each complete record, up to the end of the data."""
     size = file.seek(0, os.SEEK_END)
     while position + 9 <= size:
         file.seek(position)
@@ -192,7 +192,7 @@ def _mcap_chunk(file: IO[bytes], start: int, length: int) -> _Chunk:
 
 
 def _fits(chunk: _Chunk, length: int) -> bool:
-    """Whether the sizes in the head of a chunk are those of its record."""
+    """Whether the sizes in the head of a chunk agree with its record."""
     head = len(chunk.head)
     return head >= 40 and head + struct.unpack("<Q", chunk.head[-8:])[0] == length
 
@@ -200,7 +200,7 @@ def _fits(chunk: _Chunk, length: int) -> bool:
 def _mcap_content(
     file: IO[bytes], chunk: _Chunk, known: dict[tuple[int, int], bytes]
 ) -> dict[int, list[tuple[int, int]]]:
-    """Times and places of the messages in a chunk, by channel; its schemas and channels are added to the known ones."""
+    """Times and positions of the messages in a chunk, by channel. Adds its schemas and channels to the known ones."""
     from rosbags.rosbag2 import storage_mcap
 
     start = chunk.start + 9 + len(chunk.head)
@@ -240,12 +240,12 @@ def _read(file: IO[bytes], start: int, length: int) -> bytes:
 Fields = dict[str, bytes]
 """Header of a record of a ROS 1 bag, in its order."""
 Entry = tuple[int, int, int]
-"""Seconds, nanoseconds and place in its chunk of a message."""
+"""Seconds, nanoseconds and position in its chunk of a message."""
 
 
 @dataclass
 class _BagChunk:
-    """A chunk of a ROS 1 bag: its record's place and header, its content's place and size, and its indexes by topic."""
+    """A chunk of a ROS 1 bag: position and header of its record, position and size of its content, indexes by topic."""
 
     start: int
     fields: Fields
@@ -255,7 +255,7 @@ class _BagChunk:
 
 
 def _completed_bag(path: Path, file: IO[bytes]) -> CompletedFile:
-    """The last chunk is written anew: it may lack its size, which recorders fill in at its end, and its indexes."""
+    """A ROS 1 bag with a new index. The last chunk is rewritten, since its size and its indexes may be missing."""
     records = _bag_records(file, len(BAG))
     _, header, _, _ = next(records, (0, Fields(), 0, 0))
     chunks: list[_BagChunk] = []
@@ -299,7 +299,7 @@ def _completed_bag(path: Path, file: IO[bytes]) -> CompletedFile:
 
 
 def _bag_records(file: IO[bytes], position: int) -> Iterator[tuple[int, Fields, int, int]]:
-    """Place, header, and place and length of the content of each record that is whole."""
+    """Position, header, and position and length of the content of each complete record."""
     size = file.seek(0, os.SEEK_END)
     while position + 8 <= size:
         length = _unsigned(_read(file, position, 4))
@@ -328,8 +328,8 @@ def _bag_fields(data: bytes) -> Fields:
 def _bag_content(
     file: IO[bytes], chunk: _BagChunk, connections: dict[int, bytes]
 ) -> tuple[dict[int, list[Entry]], bytes]:
-    """Times and places of the messages in a chunk by topic, and its content as far as it is whole; the topics in it are
-    added to the known ones."""
+    """Times and positions of the messages in a chunk by topic, and its complete content. Adds its topics to the known
+    ones."""
     from rosbags.rosbag1.reader import decompressors
 
     packed, name = _read(file, chunk.content, chunk.length), chunk.fields["compression"].decode("ascii", "replace")

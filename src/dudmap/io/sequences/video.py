@@ -15,7 +15,7 @@ MARK = b"ftyp"
 
 
 EXACT = 1e-5
-"""Largest error of a number that is computed from a time; a frame left out in an hour changes the mean rate more."""
+"""Largest error of a frame number computed from a time. One missing frame in an hour changes the mean rate more."""
 FAR = 60
 """Frames ahead up to which decoding all frames costs less than a search."""
 
@@ -23,9 +23,9 @@ FAR = 60
 class Video:
     """Frames of an MP4 file by number.
 
-    Frames that are asked for in order are decoded one after the other. Others are searched for in videos of a constant
-    rate, where the time of a frame tells its number; elsewhere, or where the search ends at another frame, all frames
-    are decoded from the beginning.
+    Frames in increasing order are decoded one after the other. In videos of a constant rate, the time of a frame gives
+    its number, and other frames are found by seeking. If the rate varies, or if seeking ends at another frame, all
+    frames are decoded from the beginning.
 
     Args:
         path: The file.
@@ -58,7 +58,7 @@ class Video:
         self._next = 0
 
     def _jump(self, index: int) -> None:
-        """Go to a frame that is not near, or to the beginning."""
+        """Seek a distant frame, or restart at the beginning."""
         import cv2
 
         self._open()
@@ -72,14 +72,14 @@ class Video:
             self._open()
 
     def _finds(self, index: int) -> bool:
-        """Whether a search for a frame ends there."""
+        """Whether seeking a frame arrives at this frame."""
         import cv2
 
         self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
         return self._next_is(index)
 
     def _next_is(self, index: int) -> bool:
-        """Whether the time of the next frame is that of this number at the mean rate."""
+        """Whether the time of the next frame matches this number at the mean rate."""
         import cv2
 
         rate = self._capture.get(cv2.CAP_PROP_FPS) / 1000
