@@ -31,7 +31,7 @@ def default_parameters() -> dict[str, Any]:
 
 
 def config_of(values: Mapping[str, Any], range_name: str = "room") -> Config:
-    """Configuration of dotted keys; those that have the default value leave the choice to the preset and the range.
+    """Configuration of dotted keys. Keys with the default value leave the choice to the preset and the range.
 
     Raises:
         ConfigError: A value is invalid.
@@ -55,15 +55,15 @@ class Session:
 
     Args:
         config: All parameters.
-        saved_map: Run folder to go on in, None for a new map.
+        saved_map: Run folder to continue in, None for a new map.
         localize: Only find the camera in the saved map.
         watch: Look for changes against the saved map.
         ignore: Image, white at the pixels that never count; None counts all.
 
     Attributes:
         slam: The system; None before the first pair.
-        watch: What changed against the saved map, None without one or before the first pair.
-        processed, stale: Pairs that were processed, and pairs older than the one before, which were dropped.
+        watch: Changes against the saved map, None without one or before the first pair.
+        processed, stale: Number of processed pairs, and of pairs dropped because they are older than the one before.
 
     Raises:
         ConfigError: ``localize`` or ``watch`` without a saved map.

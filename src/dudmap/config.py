@@ -344,8 +344,8 @@ class Config(ConfigSection):
     """All parameters."""
 
     system: Literal["dudmap", "thesis"] = "dudmap"
-    """System that processes the frames: the default one, or that of the thesis as written, whose parameters are those
-    of the section ``thesis`` alone."""
+    """System that processes the frames: ``dudmap``, the default, or ``thesis``, the thesis as written, which uses the
+    parameters of the section ``thesis`` alone."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
     """Where the frames are computed: cpu, cuda, or cuda:1 for the second GPU (extra gpu); auto takes a GPU where one
     works and ``volume.adaptive`` is off; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""

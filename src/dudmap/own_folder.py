@@ -95,10 +95,10 @@ class OwnFolder:
 
 
 def check_outside(path: Path, recording: object, option: str = "--out") -> None:
-    """Check that what is to be written lies outside of a recording, whose ``path`` is its folder or file.
+    """Check that an output path lies outside of a recording, whose ``path`` is its folder or file.
 
     Raises:
-        DudmapError: It lies in it, by whatever links.
+        DudmapError: The output path lies in the recording, directly or through links.
     """
     place = getattr(recording, "path", None)
     if place is not None and path.resolve().is_relative_to(place.resolve()):

@@ -143,7 +143,7 @@ def _caches() -> Iterator[Check]:
 
 
 def _kernel_cache() -> Check:
-    """Where compiled kernels are kept, which Numba decides by trying."""
+    """Folder of the compiled kernels."""
     from dudmap.core import kernel_cache
 
     name, folder, count = "kernel cache", kernel_cache.folder(), kernel_cache.count()

@@ -1,9 +1,8 @@
 """The command line: ``dudmap COMMAND``.
 
-Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` with commands of its own
-there, which is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
-sentence. Exit codes: 1 for an error, 2 for wrong usage, 3 for a run that is of no use, 130 for Ctrl-C, 143 for SIGTERM,
-129 for SIGHUP.
+Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` there with commands of its
+own. The module is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
+sentence. Exit codes: 1 error, 2 wrong usage, 3 useless run, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
 """
 
 import ctypes

@@ -311,8 +311,10 @@ def memory_size(text: str | None) -> int | None:
 
 
 def read_config(file: Path | None, system: str | None, assignments: list[str] | None, size: float = 1.0) -> "Config":
-    """Configuration of a file or the defaults, with the system and single parameters set, for a scene of a ``size``, in
-    rooms; the thesis' system has rooms only."""
+    """Configuration from a file or the defaults, with the system and single parameters set.
+
+    ``size`` is the size of the scene relative to a room; the thesis' system allows 1 alone.
+    """
     from dudmap.config import Config
 
     config = Config.from_tree({}, size) if file is None else Config.load(file, size)

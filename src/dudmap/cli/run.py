@@ -169,7 +169,7 @@ def run_parameters(
 def for_range(
     config: "Config", parameters: o.ParameterOptions, mapped: o.MapOptions, frames: "list[Frame]"
 ) -> "Config":
-    """The configuration for the range that some frames show, unless it is given; says what was chosen."""
+    """The configuration for the given range, or for the range in some frames; prints a chosen one."""
     chosen = _config(parameters, mapped, frames)
     if chosen != config:
         say(f"{chosen.range_text}, chosen from the readings; --range room keeps those of a room", err=True)

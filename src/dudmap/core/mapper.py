@@ -71,12 +71,12 @@ class FusedFrame:
 
 
 class Bootstrap(Stateful):
-    """The first frames of a map, parts of which must be taken out of it again.
+    """The first frames of a map, parts of which must be removed again.
 
-    A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
-    not declare dynamic, and motion that is slow shows only after a while. What moved is taken out of the first frame as
-    soon as it shows, and the map begins anew with it. The frames since then are fused once slow motion can be seen,
-    without what is seen from there to have moved in them.
+    A single image shows no motion. So all pixels of the first frame count as static unless the caller declares them
+    dynamic, and slow motion appears only after a while. As soon as motion appears, its pixels are removed from the
+    first frame, and the map begins anew with this frame. The later frames are held back until slow motion can be seen.
+    Then they are fused without their moving pixels.
 
     The first frames were registered to a map that had seen little: they are remembered to be registered once more.
 
@@ -144,7 +144,7 @@ class Bootstrap(Stateful):
         return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
-        """The first frame with a mask to which what moved in it is added; None where the map holds nothing of that.
+        """The first frame with its moving pixels added to the mask; None if the map holds none of them.
 
         The later frames then count as not fused, since the map is made anew.
 
@@ -164,7 +164,7 @@ class Bootstrap(Stateful):
         return first
 
     def released(self, *, ended: bool = False) -> list[StartFrame]:
-        """The frames that are still to be fused, without what has moved until the last of them; they are forgotten.
+        """The frames held back, without the pixels that have moved since; this releases them.
 
         A frame that follows no common motion with the last one is left out. Depth without colour cannot be compared: it
         is left out, too, unless the stream has ``ended`` and no later frame will show the same.

@@ -1,4 +1,4 @@
-"""What a system gives: the result of each frame, and maps, trajectories and calibration so far."""
+"""Results of a system: the result of each frame, and maps, trajectories and calibration so far."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -35,38 +35,37 @@ class FrameResult:
     """Result of processing one frame.
 
     Attributes:
-        timestamp: Time of the depth image, seconds; on the clock of the first frames, if it was set back since.
-        state: "tracked", "lost", or "repeated" for a frame whose images, or whose depth image, are those of the frame
-            before.
+        timestamp: Time of the depth image, seconds; on the clock of the first frames if the clock was set since.
+        state: "tracked", "lost", or "repeated" if the frame has the images, or the depth image, of the frame before.
         lost_reason: Names the check that failed; empty for a tracked frame.
         rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
             else empty.
-        T_world_camera: Camera pose (4, 4); None if lost. That of a frame that repeats the one before is the same; where
-            only depth repeats it is predicted, and in the trajectory interpolated once the next frame is tracked.
+        T_world_camera: Camera pose (4, 4); None if lost. A repeated frame has the pose of the frame before. If only the
+            depth repeats, the pose is predicted; the trajectory interpolates it once the next frame is tracked.
         fused: Whether the frame changed the map.
         skipped_similar: Whether the frame was not fused because it is a redundant view.
-        dynamic_mask: (H, W) bool, dynamic pixels in the image as it was recorded.
+        dynamic_mask: (H, W) bool, dynamic pixels of the recorded image.
         dynamic_share: Share of the depth readings that lie in the mask.
         residuals: (h, w) float32 signed distances of the readings to the map, metres, at the resolution of the labels;
             NaN off the map.
-        labels: Full result of the labelling; None where it did not run.
+        labels: Full result of the labelling; None if it did not run.
         tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
         relocalized: Whether the pose comes from a recognised place after tracking was lost.
-        find_movers: Finds the moving objects; None where there are none to be found.
+        find_movers: Finds the moving objects; None if there are none.
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless, or missing in a map with colours, or rejected after a change of the
             light: its pose rests on the distances alone, and it is not fused.
         colorless: Whether the frame has no colour image: its pose rests on the distances alone.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
-        uncertain: Reason why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
-        unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
-            predicted one; see ``core/tracking/observability.py``. The frame is ``uncertain`` then.
-        repeats: What is bit for bit that of the frame before: the whole ``frame``, its ``depth`` or its ``color``. A
-            frame whose colour repeats is tracked by its distances alone (``blind``).
-        checks: Figures of all checks of the frame (``tracking/checks.py``), NaN where one is not known; empty for a
-            frame that was not registered.
+        uncertain: Reason why pose and labels of a tracked frame may be wrong, else empty. Such a frame is not fused.
+        unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the pose follows the
+            prediction (``core/tracking/observability.py``). Such a frame is ``uncertain``.
+        repeats: Part that equals the frame before bit for bit: the whole ``frame``, its ``depth`` or its ``color``. A
+            frame with repeated colour is tracked by its distances alone (``blind``).
+        checks: Values of all checks of the frame (``tracking/checks.py``), NaN if unknown; empty for a frame that was
+            not registered.
     """
 
     timestamp: float
@@ -110,7 +109,7 @@ class FrameResult:
 
     @cached_property
     def movers(self) -> tuple[Mover, ...]:
-        """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""
+        """Moving objects, by id; none in a lost frame. They are computed at the first access."""
         return () if self.find_movers is None else deepcopy(self.find_movers())
 
     def detached(self) -> "FrameResult":
@@ -118,7 +117,7 @@ class FrameResult:
         return replace(deepcopy(replace(self, find_movers=None)), find_movers=self.find_movers)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled and copied: the moving objects are found for it."""
+        """State for pickling and copying, with the moving objects."""
         return vars(self) | {"find_movers": partial(tuple, self.movers)}
 
 
@@ -138,17 +137,17 @@ class SlamArguments:
 
 
 class SlamResults:
-    """The read-only side of ``Slam``; a map that is being rebuilt after a correction is completed before it is given.
+    """The read-only side of ``Slam``; a map that is being rebuilt after a correction is completed first.
 
     Attributes:
-        config, camera: Of the system; the camera is that of the images without lens distortion.
+        config, camera: Configuration, and camera of the images without lens distortion.
         atlas: Submaps, keyframes, stored frames and poses.
         mapper: Fuses frames into it.
         monitor: How well frames fit the map.
         color_calibration: Calibration of the colour camera.
         objects: The moving objects.
-        detector: Knows what has moved.
-        prior_map: In a second pass the map of the first, else None.
+        detector: Labels moving pixels.
+        prior_map: Map of the first pass during a second pass, else None.
     """
 
     config: Config
@@ -164,48 +163,48 @@ class SlamResults:
 
     @property
     def reference(self) -> TsdfVolume:
-        """Map that frames are registered to: the current one, or in a second pass that of the first."""
+        """Map that frames are registered to: the current one, or in a second pass the map of the first pass."""
         return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     @property
     def volume(self) -> TsdfVolume:
-        """Map of the current submap, complete: where it is being rebuilt after a correction, that is done first.
+        """Complete map of the current submap; rebuilding after a correction is finished first.
 
-        Another object after a new submap was started or two were joined. ``atlas.volume`` is the map as it is.
+        A new or joined submap is another object. ``atlas.volume`` is the map in its current state.
         """
         self.atlas.complete()
         return self.atlas.volume
 
     @property
     def live_volume(self) -> TsdfVolume:
-        """Map of the current submap as it is, for viewers."""
+        """Map of the current submap in its current state, for viewers."""
         return self.atlas.volume
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses, at the time stamps of all frames tracked so far in the submap with the most frames, after all
+        """Poses of all tracked frames of the submap with the most frames, at their time stamps, after all
         corrections."""
         return self._trajectory(self.atlas.by_size()[0])
 
     def _trajectory(self, number: int) -> Trajectory:
-        """Trajectory of a submap; given poses are those of the stamps, whenever the images were taken."""
+        """Trajectory of a submap. Given poses belong to the stamps, even if the images were taken at other times."""
         given = self.arguments.poses == "given"
         return self.atlas.image_poses(number) if given else self.atlas.trajectory(number)
 
     @property
     def image_poses(self) -> Trajectory:
-        """The same at the times when the depth images were taken, where a calibration finds their stamps late."""
+        """The trajectory at the times of exposure, if a calibration finds the stamps of the depth images late."""
         return self.atlas.image_poses(self.atlas.by_size()[0])
 
     @property
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
-        """Trajectory and complete map of each submap, that with the most frames first; each has its own world."""
+        """Trajectory and complete map of each submap, the one with the most frames first; each has its own world."""
         self.atlas.complete()
         return [(self._trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
     @property
     def saved_map(self) -> SavedMap:
-        """The main map as a later run goes on in it."""
+        """The main map in the form that a later run continues."""
         return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
 
     @property
@@ -215,11 +214,11 @@ class SlamResults:
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
-        """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
+        """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of the rigid ones."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
     def finish(self) -> int:
-        """Fuse the frames that a young map holds back: the stream has ended, and no later one shows slow motion.
+        """Fuse the frames that a young map holds back: after the end of the stream no later frame shows slow motion.
 
         Only a map that is younger than 0.4 s holds frames back. Frames may follow.
 

@@ -47,18 +47,18 @@ class Slam(SlamResults, Stateful):
     Args:
         camera: Camera of the frames that will come.
         config: All parameters; None for the defaults.
-        first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
-            then registered and labelled with its map and fused into a new one, which leaves out what was taken for
-            static before it moved or before it was seen through.
-        calibration: Of the colour camera; None for registered colour. One that was estimated is used as it is; another
-            is where the estimation begins, with ``sensor.self_calibration``.
+        first_pass: A system that has processed the whole recording. All frames, passed again from the first, are
+            registered and labelled with its map and fused into a new one. The new map excludes objects that seemed
+            static before they moved or were seen through.
+        calibration: Of the colour camera; None for registered colour. An estimated one is not changed. With
+            ``sensor.self_calibration``, any other is the start of the estimation.
         live: No frame waits for a calibration, and the first poses are not estimated a second time.
-        saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
-            are lost until one is recognised in it, or a submap is started that is joined with it later.
+        saved_map: Map of an earlier run to continue; the system takes it over. All poses are in its world frame. Frames
+            are lost until one is recognised in it, or until a new submap starts, which may be joined later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
         max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results stay.
-        timed: Whether the times of the frames are those of a clock; False where they are invented.
-        poses: Role of poses that come with frames: the result (``given``), or where registration starts (``refined``).
+        timed: Whether the times of the frames are measured; False for assumed times.
+        poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
         ignore: (H, W) bool, pixels of the depth or colour image that never count: not used, not fused, never dynamic.
     """
 
@@ -166,11 +166,11 @@ class Slam(SlamResults, Stateful):
         Args:
             frame: Depth and colour, in the order of arrival; prepared or not, the result is the same. A frame whose
                 stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
-            dynamic_mask: (H, W) bool, pixels known to be dynamic, which are left out from the first registration on.
-            T_world_camera: (4, 4) pose of the depth camera from elsewhere, see ``poses``; metres.
-            arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
-                per metre (1000 unless set: millimetres), 0 = no reading; ``timestamp`` in s; ``rgb`` (H, W, 3) uint8,
-                if there is colour. They may be changed afterwards.
+            dynamic_mask: (H, W) bool, known dynamic pixels, which are left out of all registrations and of the map.
+            T_world_camera: (4, 4) given pose of the depth camera, see ``poses``; metres.
+            arrays: ``depth``, ``timestamp`` and ``rgb`` instead of a frame. ``depth`` (H, W) is float32 in metres or
+                uint16 with ``camera.depth_scale`` units per metre (default 1000: millimetres), 0 = no measurement.
+                ``timestamp`` is in seconds. ``rgb`` (H, W, 3) is uint8, optional. The arrays may be changed afterwards.
 
         Raises:
             ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.

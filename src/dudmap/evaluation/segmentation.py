@@ -121,7 +121,7 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
 
     Args:
         estimate: Run folder with masks/, or a folder of PNG files named by their time stamp.
-        reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by their time stamp, or by the
+        reference: Recording in TUM layout with mask.txt, or a folder of PNG files. Their names are time stamps, or
             numbers of the images of the run's recording.
 
     Returns:

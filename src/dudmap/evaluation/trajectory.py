@@ -230,14 +230,14 @@ def rpe(
 def body_rotation(
     estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP
 ) -> tuple[Numbers, float, float]:
-    """Rotation of the reference's body in the camera, if its poses are those of another body on the camera.
+    """Rotation between the reference's body and the camera, if the reference has poses of another body on the camera.
 
     Rotations of two bodies on one camera are ``R_body_camera`` apart: ``r_camera = R_camera_body r_body`` for the
     rotation vectors of their motions in one second.
 
     Returns:
-        R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976), and the root mean square of the
-        rotational RPE per second without and with this rotation, degrees.
+        R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976). Root mean square of the rotational
+        RPE per second without and with this rotation, degrees.
 
     Raises:
         DatasetError: The trajectories do not match in time or are shorter than a second.

@@ -145,8 +145,10 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 @contextmanager
 def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
-    """Processes compile their parts while this lasts, where there is a core and a folder for them; the function waits
-    for the first one."""
+    """Compiles parts in other processes during the block, if there are a core and a folder for them.
+
+    The yielded function waits for the first process.
+    """
     environment = os.environ | {"DUDMAP_THREADS": "1"} | kernel_cache.environment()
     useful = num_threads() > 1 and kernel_cache.folder() is not None
     commands = [[sys.executable, "-m", __name__, *parts] for parts in processes] if useful else []

@@ -133,11 +133,10 @@ def calibrate_start(
     progress: "Callable[[int, int], None]",
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Calibration | None:
-    """Calibration estimated from the first frames of a recording; None where none was made, with the reason as a
-    notice.
+    """Calibration estimated from the first frames of a recording; None without one, with the reason as a notice.
 
-    Short recordings are not calibrated. ``notice`` receives sentences on what is done and found, ``progress`` the
-    numbers of frames tracked and of all; the pixels ``ignore`` (H, W) never count.
+    Short recordings are not calibrated. ``notice`` receives sentences on progress and results, ``progress`` the number
+    of tracked frames and of all frames. The pixels ``ignore`` (H, W) never count.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
     if not has_color(sequence):
@@ -237,7 +236,7 @@ def _quick(config: Config, halvings: int) -> Config:
 
 
 def _halved(mask: "NDArray[np.bool_]", halvings: int) -> "NDArray[np.bool_]":
-    """Mask of an image halved by 2x2 blocks: those of which a pixel is masked."""
+    """Mask of an image halved by 2x2 blocks; a block is masked if any of its pixels is."""
     for _ in range(halvings):
         height, width = (size // 2 for size in mask.shape)
         mask = np.asarray(mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2).any(axis=(1, 3)), np.bool_)

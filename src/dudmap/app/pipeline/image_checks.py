@@ -45,10 +45,10 @@ NEIGHBOURHOOD = 41
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
 """Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, MAYBE, SIGNIFICANT = 0.04, 3.5, 5.0
-"""Smallest gain in the correlation of depth and colour edges by a turn, and how many standard deviations of accidental
-correlations the correlation must have to be said as possible, and as a fact; it must be the largest, too. Of 360 views
-of near walls (depth and colour without relation), 3 exceed the first limit and none the second. Of 261 turned real and
-rendered excerpts, 257 and 243 do."""
+"""Limits for a turn of depth against colour. The first is the smallest gain in the correlation of edges. The others are
+the smallest correlations for a possible and for a certain turn, in standard deviations of accidental correlations. The
+correlation must also be the largest. Of 360 views of near walls (depth and colour without relation), 3 exceed the limit
+of possible turns and none the limit of certain ones. Of 261 turned real and rendered excerpts, 257 and 243 do."""
 APART = 12
 """Shift, pixels of ``WIDTH``, from which edges of both images meet by accident alone."""
 FEWEST = 4

@@ -59,7 +59,7 @@ USUAL = (0.4, 8.0)
 
 @dataclass
 class Inspection:
-    """What a recording holds.
+    """Content of a recording.
 
     Attributes:
         name, format: Of the recording.
@@ -67,22 +67,22 @@ class Inspection:
         duration: From the first to the last depth image, seconds.
         rate: Depth images per second (of the median time between two).
         has_color: Whether there are colour images.
-        color_rate: The same for the colour images; None where their times are not known.
-        gaps: (time of the last frame before it, length) of every gap, seconds.
-        camera, color_camera: Intrinsics of the depth and of the colour camera; the same where they are registered.
-        T_color_depth: 4x4 motion between them, row by row; None where they are registered.
-        sources: Where intrinsics, depth unit and times come from: a file, a name, an option, or that they are assumed.
+        color_rate: The same for the colour images; None if their times are unknown.
+        gaps: (time of the frame before the gap, length) of every gap, seconds.
+        camera, color_camera: Intrinsics of the depth and of the colour camera; equal for registered images.
+        T_color_depth: 4x4 motion between them, row by row; None for registered images.
+        sources: Origin of intrinsics, depth unit and times: a file, a name, an option, or an assumption.
         depth_scale: Units of a 16-bit depth image per metre.
         median_depth: Of all readings of the sampled frames, metres; None without any.
         valid_depth: Share of pixels with a reading.
         depth_range: Depths that are used, metres.
-        voxel_size: Edge of a voxel, metres; both as given, or chosen from the readings.
-        too_near, too_far: Shares of the readings before and beyond ``depth_range``, which are left out.
+        voxel_size: Edge of a voxel, metres. Range and voxel size are given, or chosen from the depth.
+        too_near, too_far: Shares of the measurements below and above ``depth_range``, which are left out.
         unreadable: Reasons of the sampled frames that cannot be read.
         ground_truth: Number of true poses, 0 without.
-        repeats: Shares of the frames that repeat the one before: both images (``frame``), or ``depth`` or ``color``
-            alone; empty where they were not compared.
-        warnings: Sentences on what looks wrong.
+        repeats: Shares of the frames that repeat the frame before: both images (``frame``), or ``depth`` or ``color``
+            alone; empty if they were not compared.
+        warnings: Sentences on suspected faults.
     """
 
     name: str
@@ -110,8 +110,7 @@ class Inspection:
     warnings: list[str] = field(default_factory=list)
 
     def distinct_rate(self, stream: str) -> float | None:
-        """Images per second of the ``depth`` or ``color`` stream without those that repeat the one before; None where
-        that is not known."""
+        """Images per second of the ``depth`` or ``color`` stream without repeated images; None if unknown."""
         if self.rate is None or not self.repeats:
             return None
         return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
@@ -158,9 +157,9 @@ def inspect(
     unreadable: list[str] | None = None,
     config: Config | None = None,
 ) -> Inspection:
-    """Describe a recording and name what looks wrong; ``frames`` and ``unreadable`` are as ``sample`` returns them.
+    """Describe a recording and its suspected faults; ``frames`` and ``unreadable`` are results of ``sample``.
 
-    ``config`` says what is used of the depth; None chooses it from the frames, as ``dudmap run`` does.
+    ``config`` gives the range of the depth; None chooses it from the frames, as ``dudmap run`` does.
     """
     if frames is None:
         frames, unreadable = sample(sequence)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 STRIDE = 4
 """Rows and columns from one counted reading to the next."""
 COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
-"""What ``FrameResult`` says of a frame, of which the number of frames is counted."""
+"""Attributes of ``FrameResult`` for which frames are counted."""
 
 
 @dataclass
@@ -37,22 +37,21 @@ class RunRecord:
         lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read or had another size.
         checks: Per registered frame, its figures (``core/tracking/checks.py``).
-        repeated: Number of frames that repeat the frame before, its depth or its colour, by what repeats.
-        rejected: Number of frames that were not used for a fault of the stream, by kind; those with a readable image
-            of the right size are lost as well.
+        repeated: Number of frames that repeat the frame before, its depth or its colour, by the repeated part.
+        rejected: Number of frames rejected for a fault of the stream, by kind. Frames with a readable image of the
+            correct size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
-        readings: Numbers of depth readings, of every fourth row and column: all, and those before and beyond the depth
-            range.
+        readings: Numbers of depth measurements in every fourth row and column: all, below and above the depth range.
         depth_limits: Depths that are used, metres.
-        counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
+        counts: Numbers of frames by attribute of ``FrameResult``, and of ``degenerate`` frames, in which not all
             directions of motion are observable.
-        warnings: Sentences on what looked wrong in the recording before the run.
+        warnings: Sentences on faults of the recording that were suspected before the run.
         masked: Number of frames with an external mask, None without external masks.
         fused_at_end: Number of frames that a young map held back until the end, and that were fused then.
         dropped: Number of frames dropped by a live run, None otherwise.
-        spent: Seconds, and seconds of processor time, of what belongs to the run and came before this process or pass.
+        spent: Seconds, and seconds of processor time, of the run before this process or pass.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -124,7 +123,7 @@ class RunRecord:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
     def add_readings(self, depth: NDArray[np.float32]) -> None:
-        """Count the readings of a frame (H, W), and those that the depth range leaves out."""
+        """Count the measurements of a frame (H, W), and the measurements outside of the depth range."""
         least, largest = self.depth_limits
         some = depth[::STRIDE, ::STRIDE]
         self.readings["all"] += int(np.count_nonzero(some > 0))

@@ -70,21 +70,15 @@ def run(
 ) -> RunReport:
     """Run the system over a recording, or on a camera until its stream ends or Ctrl-C, and write a run folder.
 
-    The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz and keyframes.npz
-    (what a later run needs to go on in the map), config.toml,
-    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), movers.jsonl
-    (one JSON object per frame with moving objects: timestamp, and per object id, centroid, box, velocity, speed and
-    pixels; metres, m/s, world frame), groundtruth.txt if the true trajectory is known, masks/<timestamp>.png (255 =
-    dynamic) with ``save_masks``, and movers/<id>.ply and .txt, mesh and poses of every rigid moving object, with
-    ``movers.meshes``. Submaps that could not be merged with the largest one are written as trajectory-2.txt and
-    mesh-2.ply and so on, each in its own world frame. Results of an earlier run in the same folder are removed first.
-    If the run is interrupted or fails, the results up to there are written. With ``storing`` the folder also holds
-    state.db until the run is finished, from which ``dudmap.app.pipeline.resume.resume`` continues it.
+    ``docs/files.md`` describes the files of the folder: trajectory.txt, mesh.ply, map.npz, metrics.json and others.
+    Results of an earlier run in the same folder are removed first. If the run is interrupted or fails, the results so
+    far are written. With ``storing`` the folder also holds state.db until the run is finished, from which
+    ``dudmap.app.pipeline.resume.resume`` continues it.
 
     Args:
         sequence: The recording, whose ground truth and masks are used for evaluation only; or a camera, which is closed
-            at the end. Of the frames that arrive while one is processed, those of the last 0.1 s wait; older ones are
-            counted as ``dropped``.
+            at the end. Frames that arrive during processing wait for at most 0.1 s; older ones are counted as
+            ``dropped``.
         config: All parameters.
         out: The run folder; created if needed.
         max_frames: Process only this many frames.
@@ -98,29 +92,28 @@ def run(
             would distort the times. The result does not depend on it.
         live: Replay the recording as if it were a camera.
         record: MCAP file for all frames of a camera that arrive, processed or not.
-        passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
-            first, so that objects that were in view from the start also leave the map. The last complete pass is
-            written.
-        poses: Poses of the frames, which are the result, or where registration starts; given_poses.txt is their copy.
-            Frames without one are left out of the first kind.
-        calibration: Of the colour camera; None takes that of the recording or the camera.
+        passes: 2 processes the recording twice. The second pass compares every frame with the final map of the first
+            one. So objects that are in view from the start also leave the map. The last complete pass is written.
+        poses: Poses of the frames: the result, or the start of registration; given_poses.txt is their copy. If they are
+            the result, frames without a pose are left out.
+        calibration: Of the colour camera; None takes the calibration of the recording or the camera.
         calibrate: Estimate the calibration from the start of the recording first.
-        saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
+        saved_map: Map of an earlier run to continue, which is taken over; all poses are in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
-        max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
-            wait on disk. None keeps the whole map in memory. It changes no result.
+        max_memory: Largest resident memory of the process, bytes. Distant parts of the map wait on disk. None keeps the
+            whole map in memory. It changes no result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
         storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
-        warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
+        warnings: Sentences on suspected faults of the recording (``pipeline.inspection``), for metrics.json.
 
     Raises:
-        ConfigError: ``passes`` is not 1 or 2, or 2 with a camera or ``saved_map``; ``localize`` without a
-            ``saved_map``; ``storing`` with a camera; an option that the configured system does not have.
+        ConfigError: ``passes`` is not 1 or 2, or it is 2 with a camera or ``saved_map``. ``localize`` lacks a
+            ``saved_map``. ``storing`` is used with a camera. The configured system lacks an option.
         CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
-        DudmapError: Another process writes into the folder, it cannot be written or lies in the recording, the
-            recording cannot be used, or no frame could be tracked.
-        KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names what was
-            saved.
+        DudmapError: The folder cannot be written, lies in the recording, or is in use by another process. The recording
+            cannot be used, or no frame could be tracked.
+        KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names the saved
+            files.
     """
     from dudmap.app.pipeline.calibration import ASSUMED, calibrate_start
 

@@ -49,7 +49,7 @@ FILES = (
 IGNORED = "ignored.png"
 """Copy of the mask of the pixels that never count."""
 FACES = 20_000
-"""Most triangles that tell the direction against gravity, as in ``diff``: they take a tenth of a second."""
+"""Largest number of triangles for the direction against gravity, as in ``diff``: they take a tenth of a second."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",

@@ -120,7 +120,7 @@ class FrameImages:
 
 
 def shading(normals: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Brightness (H, W), 0..1, of a view with these normals (H, W, 3), world frame, in the light beside the camera."""
+    """Brightness (H, W), 0..1, of a view with these normals (H, W, 3), world frame, with a light near the camera."""
     return (0.25 + 0.7 * np.clip(normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)).astype(np.float32)
 
 

@@ -224,7 +224,7 @@ def _farthest(run: RunContent, trajectory: Trajectory) -> float:
 
 
 def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour (H, W, 3) and depth (H, W) in metres of the map; shaded where the map has no colours."""
+    """Colour (H, W, 3) and depth (H, W) in metres of the map; shading if the map has no colours."""
     seen = run.volume.raycast(T, camera)
     color, known = seen.color, seen.depth > 0
     if known.any() and np.median(color[known].reshape(-1, 3), axis=0).tolist() == [GREY] * 3:

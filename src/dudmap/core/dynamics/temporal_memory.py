@@ -56,7 +56,7 @@ class TemporalMemory(Stateful):
 
     Args:
         config: ``settle_time`` and ``start_seconds``.
-        reference_depth: That of the sensor, metres.
+        reference_depth: Reference depth of the sensor, metres.
     """
 
     _last: Remembered[RememberedFrame | None] = None

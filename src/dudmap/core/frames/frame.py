@@ -28,15 +28,14 @@ GREY = 192
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Depth and colour image of about one instant, which are not copied here; ``Slam`` copies what it keeps.
+    """Depth and colour image of about one instant. They are not copied here; ``Slam`` copies the arrays that it keeps.
 
     Attributes:
         timestamp: Seconds, of the depth image.
-        depth: (H, W) float32, metres along the optical axis, 0 where there is no reading.
-        color: (H, W, 3) uint8, red green blue; of another size where the colour camera is another one. None for depth
-            without colour: the frame is then registered by its distances alone.
-        color_timestamp: Seconds, of the colour image; None if that is not known. It is used where a calibration of the
-            colour camera is.
+        depth: (H, W) float32, metres along the optical axis, 0 = no measurement.
+        color: (H, W, 3) uint8, red green blue; a separate colour camera may have another size. None for depth without
+            colour, which is registered by its distances alone.
+        color_timestamp: Seconds, of the colour image; None if unknown. Used with a calibration of the colour camera.
     """
 
     timestamp: float
@@ -50,12 +49,12 @@ class Frame:
         return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
 
     def copy(self) -> "Frame":
-        """The frame with copies of its images, which nobody else changes."""
+        """The frame with copies of its images, so that the caller may change the originals."""
         return replace(self, depth=np.array(self.depth), color=None if self.color is None else np.array(self.color))
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) uint8; ``GREY``, of the size of ``depth``, where the frame has none."""
+        """Colours (H, W, 3) uint8; ``GREY`` in the size of ``depth`` for a frame without colour."""
         return np.full((*self.depth.shape, 3), GREY, np.uint8) if self.color is None else self.color
 
     @classmethod
@@ -66,11 +65,11 @@ class Frame:
         timestamp: float = np.nan,
         depth_scale: float = 1000.0,
     ) -> "Frame":
-        """Frame of copies of two images as a sensor, a file or another program gives them.
+        """Frame of copies of two images from a sensor, a file or another program.
 
         Args:
-            depth: (H, W), along the optical axis, registered to colour: floating point in metres, where 0 and values
-                that are not finite mean no reading, or uint16 in units of ``depth_scale``, where 0 means no reading.
+            depth: (H, W), along the optical axis, registered to colour. Floating point is metres; 0 and values that are
+                not finite mean no measurement. uint16 is in units of ``depth_scale``; 0 means no measurement.
             rgb: (H, W, 3) uint8, red green blue; None for depth without colour.
             timestamp: Seconds.
             depth_scale: Units of uint16 depth per metre; 1000 = millimetres. Not used for floating point.
@@ -105,7 +104,7 @@ _Prepared = TypeVar("_Prepared")
 
 
 def given_frame(frame: _Prepared | None, arrays: FrameArrays, depth_scale: float) -> "_Prepared | Frame":
-    """The frame, or that of the ``arrays`` (see ``Frame.from_arrays``) where these are given in place of it.
+    """The frame, or a frame made of ``arrays`` (see ``Frame.from_arrays``).
 
     Raises:
         ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.

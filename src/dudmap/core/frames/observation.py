@@ -14,17 +14,17 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
 CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
-"""Every so many pixels, across and down, tell from which intensity on colours are saturated: the brightest of the least
-share of those with a saturated channel."""
+"""Sampling of the saturation limit: the step across and down, and a share of the pixels with a saturated channel. The
+limit is the largest intensity of this darkest share."""
 HALVING_BAND = 0.02
-"""Readings this far (share of the depth, at least of the reference depth) behind the nearest of a 2x2 block belong to
-the same surface."""
+"""Largest distance of a surface's measurements behind the nearest one of a 2x2 block, as a share of the depth (at least
+of the reference depth)."""
 CELLS = 40
-"""Corners across the image: the strongest of each cell."""
+"""Cells across the image; the strongest corner of each cell is used."""
 WINDOW = 11
-"""Edge of the window that a corner is matched by, pixels of an image 320 wide."""
+"""Edge of the window for matching a corner, pixels of an image 320 wide."""
 FLOW_WIDTH = 320
-"""Image width that windows and flow of corners are given for; they grow in proportion to the width of an image."""
+"""Image width to which windows and flow of corners refer; they grow in proportion to the image width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +36,15 @@ class Observation:
         camera: Camera of all images here; without lens distortion.
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
         intensity: (H, W) float32, 0..1.
-        rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Those of a colour camera that is not
-            synchronous are so only once the camera's motion is known (``core/tracking/color_motion.py``).
-        recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
-        color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
+        rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Images of an asynchronous colour camera
+            are registered once the camera's motion is known (``core/tracking/color_motion.py``).
+        recorded_rgb: (h, w, 3) uint8 of a separate colour camera, not registered; None if equal to ``rgb``.
+        color_offset: Time stamp of the colour image minus time stamp of the depth image, seconds; 0 if unknown.
         depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
         has_color: Whether the frame has a colour image; ``rgb`` and ``intensity`` are of one grey otherwise.
         ignored: (H, W) bool, pixels that never count, which have no depth; None for none.
-        reference_depth: That of the sensor, metres.
-        sources: (H, W) int32, number of the recorded pixel that each pixel shows then; None for its own.
+        reference_depth: Reference depth of the sensor, metres.
+        sources: (H, W) int32, index of the recorded pixel that each pixel shows after this; None for its own.
     """
 
     timestamp: float
@@ -76,7 +76,7 @@ class Observation:
 
     @cached_property
     def ceiling(self) -> float:
-        """Intensity from which on a channel of the colour is saturated, 1 where none is."""
+        """Smallest intensity with a saturated colour channel, 1 if there is none."""
         full = (self.rgb[::CEILING_STRIDE, ::CEILING_STRIDE] == 255).any(axis=2)
         if not full.any():
             return 1.0
@@ -96,7 +96,7 @@ class Observation:
 
     @property
     def as_recorded(self) -> Frame:
-        """Depth of the observation and colour as it was recorded."""
+        """Depth of the observation and the recorded colour."""
         color = self.rgb if self.recorded_rgb is None else self.recorded_rgb
         color = color if self.has_color else None
         return Frame(self.timestamp, self.depth, color, self.timestamp + self.color_offset)
@@ -142,8 +142,7 @@ class Level:
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with gain and offset applied, comparable to those of the map; black where they are saturated
-    and the map is not."""
+    """Colours (H, W, 3) with gain and offset applied, comparable to the map; black if only the image is saturated."""
     import cv2
 
     gain, offset = exposure
@@ -155,9 +154,11 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
 
 
 def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.0) -> tuple[float, float]:
-    """Range of the map's intensities that neither an image of this gain and offset saturates, whose own limit is
-    ``ceiling``, nor the map, whose limit is ``other``; all of them if the exposures hardly differ, since both saturate
-    the same pixels then."""
+    """Range of the map's intensities that are saturated neither in the map nor in an image of this gain and offset.
+
+    The saturation limit of the image is ``ceiling``, of the map ``other``. The range is infinite if the exposures
+    hardly differ, since the same pixels are saturated in both.
+    """
     gain, offset = exposure
     if 1 / LARGE_GAIN < gain < LARGE_GAIN:
         return -np.inf, np.inf
@@ -167,8 +168,8 @@ def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.
 def saturated(
     level: Level, exposure: tuple[float, float], difference: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_] | None:
-    """Pixels (h, w) bool that the image saturates, or the map if its intensities less those of the image are given;
-    None where the exposures hardly differ."""
+    """Saturated pixels (h, w) bool of the image, and of the map if ``difference`` (map minus image) is given; None if
+    the exposures hardly differ."""
     darkest, brightest = shown_range(exposure, level.ceiling)
     if brightest == np.inf:
         return None
@@ -180,7 +181,7 @@ def saturated(
 
 
 def unsaturated(level: Level, exposure: tuple[float, float]) -> Level:
-    """Level with gain and offset applied to its intensities, NaN where they are saturated and the map's are not."""
+    """Level with gain and offset applied to its intensities; NaN if only the image is saturated."""
     lit, dark = exposed(level, exposure), saturated(level, exposure)
     return lit if dark is None else replace(lit, intensity=np.where(dark, np.float32(np.nan), lit.intensity))
 

@@ -25,8 +25,8 @@ def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
 
 
 def equally_exposed(before: Pyramid, after: Pyramid) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Grey values (h, w) of two images in which corners are found again: if the light has changed, the darker image in
-    the exposure of the brighter one, and both cut to the range that neither saturates."""
+    """Grey values (h, w) of two images for matching corners. If the light has changed, the darker image gets the
+    exposure of the brighter one, and both are clipped to their common unsaturated range."""
     pair = [before, after]
     dark, bright = sorted(pair, key=lambda pyramid: float(pyramid.coarse.intensity.mean()))
     darker, brighter = dark.coarse.intensity, bright.coarse.intensity

@@ -19,11 +19,11 @@ from dudmap.errors import FrameError
 HOLE_NOISE = 0.01
 """Readings around a small hole may always differ by this much, reference depths."""
 STEEPEST = 9.5
-"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+"""Tangent of the largest angle of incidence that sensors measure, 84 degrees."""
 BORDER = 0.02
 """Share of its width by which the colour image is continued at its borders; readings beyond have no colour."""
 TYPICAL_DEPTH = 2.0
-"""Distance at which it is decided what the colour camera sees, reference depths."""
+"""Distance for the test which pixels the colour camera sees, reference depths."""
 DEPTH_MIN = 1e-3
 """Smallest lower limit of the depth, metres: 0 means no reading."""
 
@@ -31,17 +31,18 @@ DEPTH_MIN = 1e-3
 class Preprocessor:
     """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
-    The bilateral filter is separable (columns, then rows), which the exact one is not. Measured on 640x480 readings of
-    two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm on
-    a desk at 1 m; error against the temporal mean of a fixed camera's static pixels, over squared depth: median 1.52
-    against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
+    The bilateral filter is separable (columns, then rows), which the exact one is not. It was measured on 640x480 depth
+    of two Kinect-type recordings, with radius 6 and one thread. It takes 1.2 ms against 7 ms for all 169 taps, with an
+    rms difference of 0.7-1.2 mm on a desk at 1 m. The error was measured against the temporal mean of a fixed camera's
+    static pixels, over squared depth. Its median is 1.52 against 1.50 mm, its 95 % quantile 7.07 against 7.05 mm
+    (unfiltered 1.65 and 7.32).
 
-    The camera is that of the depth images, and of the colour images without a ``calibration``. Colours that were not
-    taken together with the depth are left as they were recorded, scaled to the size of the depth image. Readings that
-    the colour camera does not see are left out: a map is registered by both.
+    ``camera`` is the camera of the depth images, and without a ``calibration`` also of the colour images. Colour images
+    of other times than the depth stay unregistered, scaled to the size of the depth image. Pixels that the colour
+    camera does not see are left out, since a map is registered by both.
 
-    ``ignore`` is a mask (H, W) bool of pixels that never count, see ``IgnoredRegion``: they get no depth, not that of a
-    filled hole either, and the colours at their border.
+    ``ignore`` is a mask (H, W) bool of pixels that never count, see ``IgnoredRegion``. They get no depth, not even from
+    hole filling, and the colours at their border.
     """
 
     def __init__(

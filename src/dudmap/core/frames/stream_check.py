@@ -34,7 +34,7 @@ LONGEST_MEMORY = 1.0
 Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 """Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""
 Repeats = Literal["", "frame", "depth", "color"]
-"""What a frame repeats of the one before, bit for bit."""
+"""The part of a frame that equals the frame before bit for bit."""
 
 
 class Rejection(NamedTuple):
@@ -153,8 +153,8 @@ class StreamCheck(Stateful):
 
 
 def repeated(before: Images, after: Images) -> Repeats:
-    """What the images of a frame repeat of the one before; a depth image without readings does not. Depth without
-    colour that repeats is a ``frame`` that does."""
+    """The part of a frame that repeats the frame before. Empty depth images do not repeat. Repeated depth without
+    colour is a repeated ``frame``."""
     depth = _equal(before[0], after[0]) and bool(after[0].any())
     if before[1] is None or after[1] is None:
         return "frame" if depth and before[1] is after[1] else "depth" if depth else ""

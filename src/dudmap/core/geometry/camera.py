@@ -28,8 +28,8 @@ class Camera:
         cx, cy: Principal point in pixels.
         width, height: Image size in pixels.
         depth_scale: Units of 16-bit depth images per metre; 1000 = millimetres, the unit of most sensors.
-        distortion: Coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the Brown-Conrady model, the last three of its
-            denominator (thesis eq. 3.87, 3.88); empty for none.
+        distortion: Coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the Brown-Conrady model (thesis eq. 3.87, 3.88).
+            k4 to k6 form its denominator. Empty for none.
     """
 
     fx: float

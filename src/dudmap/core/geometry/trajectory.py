@@ -111,7 +111,7 @@ class Trajectory:
 
         Args:
             path: The file.
-            format: ``tum``, ``euroc`` or ``kitti``, if it is not to be recognised.
+            format: ``tum``, ``euroc`` or ``kitti``; None recognises it.
             timestamps: (N,) seconds of the poses of a file without times (KITTI).
             optional: Leave out rows that are no pose, and count them in ``remarks``.
 

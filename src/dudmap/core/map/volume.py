@@ -91,8 +91,8 @@ class TsdfVolume(PagedMap):
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
         backend: Compute device, of this map alone; None takes the CPU.
-        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the blocks
-            farthest from the view wait on disk. None keeps all in memory.
+        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process. The farthest
+            blocks wait on disk. None keeps all in memory.
         extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
@@ -355,8 +355,8 @@ class TsdfVolume(PagedMap):
 
     @property
     def min_weight(self) -> int:
-        """Smallest weight of a voxel that mesh and views use: that of the configuration; in a map of few frames one for
-        every second frame, since a reading counts at least once."""
+        """Smallest weight of a voxel for mesh and views: the configured one. In a map of few frames it is half their
+        number, since every measurement has at least weight 1."""
         return min(self.config.min_weight, (self.num_frames + 1) // 2 or self.config.min_weight)
 
     def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:

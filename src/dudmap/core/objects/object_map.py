@@ -12,8 +12,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
 EXTENT = 1.0
-"""The window of an object's map is that of a camera with readings up to this, reference depths: a cube of about 2.5 m
-in a room."""
+"""Depth that the window of an object's map covers, reference depths: a cube of about 2.5 m in a room."""
 MIN_FRAMES = 10
 """Fewest registered frames that prove an object rigid."""
 MIN_DURATION = 0.5

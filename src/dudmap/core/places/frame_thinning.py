@@ -16,8 +16,7 @@ from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE
 from dudmap.core.state import Remembered, Stateful
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
-"""Views within this distance (reference depths) and angle (deg) of each other show the same: half of what
-separates keyframes."""
+"""Largest distance (reference depths) and angle (deg) between equal views: half the spacing of keyframes."""
 MIN_KEPT = 256
 """Kept frames of which none are removed: 50 MB at 640x480. Recordings of some minutes give fewer."""
 

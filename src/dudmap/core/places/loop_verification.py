@@ -28,7 +28,7 @@ LOCAL_FRAMES = 8
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
 """Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
 DRIFT_ALLOWANCE = 0.05
-"""Drift that is believed after any path, reference depths and radians."""
+"""Drift that is allowed after any path, reference depths and radians."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,10 @@ one is stored with a frame, so that the rebuilding ends."""
 MAX_ADDED = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
-"""Depth of the point by which views are compared, reference depths: the middle of what a camera sees indoors."""
+"""Depth of the point for comparing views, reference depths: the middle of an indoor view."""
 NEAR = 3.0
-"""Largest distance, reference depths, between the point that a stored frame looks at and that of the view for the frame
-to be added to the provisional map: what others see is out of view, or is added as the camera goes there."""
+"""Largest distance between the points in the middle of the view and of a stored frame, reference depths. Nearer frames
+are added to the provisional map. Others show surface out of view; they are added when the camera approaches."""
 SPACING = 0.3
 """Smallest distance, reference depths, between the points that two added frames look at: nearer ones see the same."""
 
@@ -105,7 +105,7 @@ def nearest_views(
 def view_distances(
     Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], unit: float = 1.0
 ) -> NDArray[np.float64]:
-    """Distances (n,) of what poses (n, 4, 4) look at from what a camera looks at, metres; ``unit``: reference depth."""
+    """Distances (n,) between the view points of poses (n, 4, 4) and of a camera, metres; ``unit``: reference depth."""
     return np.linalg.norm(_looked_at(Ts, unit) - _looked_at(T_world_camera, unit), axis=-1)
 
 

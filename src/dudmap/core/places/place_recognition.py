@@ -234,8 +234,11 @@ class KeyframeDatabase(Stateful):
     def match(
         self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None, min_inliers: int | None = None
     ) -> list[PlaceMatch]:
-        """Keyframes (``among`` these, None = all) that a frame with these features may show, with the frame's pose; the
-        poses are distinct, those with more inliers first. ``min_inliers`` None: as configured."""
+        """Keyframes that match a frame with these features, each with the frame's pose; distinct poses, most inliers
+        first.
+
+        ``among`` limits the keyframes (None = all). ``min_inliers`` None takes the configured number.
+        """
         among = self.keyframes if among is None else among
         fewest = self.config.min_inliers if min_inliers is None else min_inliers
         if len(features) < fewest or not among:

@@ -35,8 +35,8 @@ class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
     A lost frame is compared with the last tracked one and with all keyframes of the atlas. Each candidate pose is
-    verified by registering the frame against the map of the candidate's submap. The atlas is read only: switching it to
-    the submap in which the frame was found, and starting a new submap, are left to the caller.
+    verified by registering the frame against the map of the candidate's submap. The atlas is not changed: the caller
+    switches to the submap of the frame or starts a new submap.
 
     """
 
@@ -84,9 +84,9 @@ class Relocalizer(Stateful):
     ) -> Relocalization | None:
         """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
 
-        Candidates in the current submap are tried first: the pose by the last tracked frame, then those with more
-        matching features. The first is taken that its registration confirms and whose registration is accepted. The
-        view's timer receives the time of feature matching as stage ``recognise``.
+        Candidates in the current submap are tried first: the pose by the last tracked frame, then poses in the order of
+        their matching features. The result is the first pose whose registration confirms it and is accepted. The view's
+        timer receives the time of feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:
@@ -120,10 +120,10 @@ class Relocalizer(Stateful):
     def wants_new_submap(self, view: FrameView) -> bool:
         """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
-        That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
-        readings for a map and, unless it has no colour, enough features for a keyframe, and it is not of people: see
-        ``_shows_static_world``. It is compared with the last lost image, in which fast people are found again, and with
-        one LONGEST_BASELINE older, since when slow people have moved.
+        Three conditions must hold. The camera has been lost for ``submaps.patience`` seconds. The frame has enough
+        depth for a map and, if it has colour, enough features for a keyframe. It does not show people
+        (``_shows_static_world``): it is compared with the last lost image to find fast people, and with an image
+        LONGEST_BASELINE older to find slow ones.
         """
         config, observation = self.config.submaps, view.observation
         if not self.may_start_submaps or self._lost_since is None:

@@ -54,8 +54,8 @@ class Limits:
         max_dynamic_share: Configured largest share of dynamic readings.
         mode: Key of STRICTNESS.
         mostly_dynamic: Most of the readings are dynamic.
-        blind: The image says nothing.
-        residual_mm, overlap, color: What was usual in the frames before; NaN where it is not known yet.
+        blind: The image carries no information.
+        residual_mm, overlap, color: Usual values of the frames before; NaN if not known yet.
     """
 
     config: TrackerConfig

@@ -94,7 +94,7 @@ class FrameView:
     def of(
         cls, observation: Observation, config: Config, detector: DynamicDetector, *, now: bool = True
     ) -> "FrameView":
-        """A preprocessed frame with its pyramid and segments, computed ``now`` or when they are asked for."""
+        """A preprocessed frame with its pyramid and segments, computed ``now`` or at the first use."""
         _ = observation.num_readings  # cached there for the result
         levels = cache(lambda: Pyramid.of(observation, observation.camera, config))
         if now:
@@ -176,7 +176,7 @@ class PoseEstimate:
 
     @classmethod
     def at_origin(cls, gain: float = 1.0, T_world_camera: NDArray[np.float64] | None = None) -> "PoseEstimate":
-        """Estimate of the frame that a map is made of, whose colours times a gain are those of its map; it defines the
+        """Estimate of the first frame of a map. Its colours times ``gain`` are the colours of the map. It defines the
         world frame unless its pose (4, 4) is given."""
         T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera
         return cls(TrackingResult(T_world_camera, (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0))

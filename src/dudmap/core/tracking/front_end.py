@@ -87,7 +87,7 @@ class FrontEnd(Stateful):
         return view, estimate, verdict
 
     def _is_relit(self, view: FrameView) -> bool:
-        """Whether the light differs from that of the map, as far as the mean intensity of a whole image tells it."""
+        """Whether the mean intensity of the image shows another light than in the map."""
         mean = float(view.pyramid.coarse.intensity.mean())
         return self._brightness is None or not mean / LARGE_GAIN < self._brightness < LARGE_GAIN * mean
 

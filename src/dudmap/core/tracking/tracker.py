@@ -165,9 +165,9 @@ class Tracker:
             static_weights: Per level (h, w) float32 in [0, 1]; None weighs every pixel 1.
             first_level: Index of the first of these levels in the configuration.
             exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
-            color_weight: Weight of the intensity term; None takes that of the configuration.
-            relit: Whether the light may differ from that of the map; else a large gain is that of an image that shows
-                something else, and is not applied.
+            color_weight: Weight of the intensity term; None takes the configured weight.
+            relit: Whether the light may differ from the light of the map. If not, a large gain comes from an image of
+                another surface and is not applied.
         """
         volume.look_at(T_init)
         T, iterations, system, settled, seen = T_init, 0, None, True, None
@@ -211,7 +211,7 @@ class Tracker:
         weights: NDArray[np.float32],
         exposure: tuple[float, float] | None = None,
     ) -> TrackingResult:
-        """Result at a pose (4, 4) that is not changed; the exposure is fitted where it is not given."""
+        """Result at a fixed pose (4, 4); the exposure is fitted unless it is given."""
         volume.look_at(T_world_camera)
         parameters, fitted = self.parameters(volume.band), exposure is None and self.config.exposure
         curve = exposure or (1.0, 0.0)
@@ -316,7 +316,7 @@ class Tracker:
             level: The image.
             T_world_camera: (4, 4).
             weights: (h, w) float32 static weights in [0, 1].
-            color_weight: Weight of the intensity term; None takes that of the configuration.
+            color_weight: Weight of the intensity term; None takes the configured weight.
         """
         parameters = self.parameters(volume.band, color_weight)
         return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations

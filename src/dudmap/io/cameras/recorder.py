@@ -34,8 +34,8 @@ class Recorder:
     """Writes frames without loss to an MCAP file that ``dudmap run`` and ROS 2 read.
 
     ``put`` never waits: if the disk is too slow for the camera, frames are left out and counted. The file is written
-    beside its final place and moved there when it is complete. Until then it lies in ``<name>.recording``, where all
-    but the last ``UNSAVED`` seconds can be read if the process is killed or the power fails.
+    into ``<name>.recording`` and moved to its final place when it is complete. If the process is killed or the power
+    fails, all but the last ``UNSAVED`` seconds can be read there.
 
     Args:
         path: The file; it must not exist and end in .mcap.

@@ -290,8 +290,10 @@ class McapWriter:
         self._writer.write(self._connections[topic], nanoseconds, self._store.serialize_cdr(message, kind))
 
     def flush(self) -> int:
-        """Complete the chunk that is begun and write it, so that it can be read if the file is never closed; returns
-        the handle of the file."""
+        """Complete and write the current chunk, so that it is readable if the file is never closed.
+
+        Returns the handle of the file.
+        """
         storage: Any = self._writer.storage
         if storage.chunk.msgs:
             storage.close_chunk()

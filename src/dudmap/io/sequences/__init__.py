@@ -68,20 +68,20 @@ class Recording(ABC):
     """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame when asked for it.
 
     A format sets the times, the cameras and their sources in its constructor, and reads a frame in ``_frame``.
-    Constructors take the options of the format, too; they raise a ``DatasetError`` for a recording that is damaged or
-    of another kind, and a ``MissingExtraError`` where a package is missing.
+    Constructors also take the options of the format. They raise a ``DatasetError`` for a recording that is damaged or
+    of another kind, and a ``MissingExtraError`` if a package is missing.
 
     Args:
         path: The folder or file.
-        camera: Intrinsics of the depth images that replace those of the recording.
+        camera: Intrinsics of the depth images, which replace the recording's intrinsics.
 
     Attributes:
         format: Name of the format, for people.
         options: Names of the options of ``open_sequence`` that the format has.
-        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
-            that they are assumed.
-        remarks: Sentences on what was left out because no run needs it, or assumed.
-        timed: Whether the times were read or their rate was given; False where they are invented.
+        sources: Origin of ``intrinsics``, ``depth unit`` and ``times``: a file, a data set's name, an option, or an
+            assumption.
+        remarks: Sentences on data that were left out as unnecessary, and on assumptions.
+        timed: Whether the times were read or their rate was given; False for assumed times.
         has_color: Whether there are colour images; without, the ``color`` of all frames is None.
         gravity: Directions against gravity that were measured, if they are; reading them may raise a ``DatasetError``.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
@@ -330,7 +330,7 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
 
 
 def _places_by_content(path: Path) -> list[Path]:
-    """Folders whose images are depth and colour by their content, else those of depth alone: a folder or below it."""
+    """The folder or subfolders whose images are depth and colour by their content, else depth alone."""
     from dudmap.io.sequences.image_series import alone, by_content, unknown
 
     def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:

@@ -42,21 +42,21 @@ FIRST_TRANSFORMS = 300
 
 
 class RosBag(Recording):
-    """Recording in a ROS bag, opened through its index: neither images nor poses are read before they are asked for.
+    """Recording in a ROS bag, opened through its index: images and poses are read when they are used.
 
-    The time of a frame is that in the header of its depth message; colour is associated one to one, nearest first, at
-    most 20 ms apart. A bag without colour topics is a recording of depth alone. In compressed bags the times are those
-    of recording less the median delay of the first messages. Where headers hold no increasing times, the times of
-    recording are taken. A message that was recorded at the very time of another one of its topic is left out.
+    The time of a frame is the stamp in the header of its depth message. In compressed bags it is the time of recording
+    minus the median delay of the first messages. If the stamps do not increase, it is the time of recording. Colour is
+    associated one to one, nearest first, at most 20 ms apart. A bag without colour topics is a recording of depth
+    alone. If two messages of a topic have the same time of recording, one is left out.
 
-    Intrinsics come from the camera_info beside the image topics. Depth and colour of one frame of reference and equal
-    intrinsics are registered; else ``calibration`` holds the colour camera and the motion between both from /tf_static.
-    Lenses with more than five coefficients (rational, fisheye) are rectified when an image is read. The true trajectory
-    is that of the depth camera in the frame ``world`` of /tf, if there is one.
+    Intrinsics come from the camera_info topics of the images. Depth and colour are registered if their frame of
+    reference and intrinsics are equal. Otherwise ``calibration`` holds the colour camera and its motion to depth from
+    /tf_static. Lenses with more than five coefficients (rational, fisheye) are rectified when an image is read. The
+    ground truth is the trajectory of the depth camera in the frame ``world`` of /tf, if there is one.
 
     Args:
         path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
-        camera: Intrinsics of the depth images that replace those of the bag.
+        camera: Intrinsics of the depth images, which replace the bag's intrinsics.
         topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
     """
 
@@ -135,7 +135,7 @@ class RosBag(Recording):
 
     @cached_property
     def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What the IMU measured, None without one; read from the bag when first asked for."""
+        """Gravity measured by the IMU, None without one; read from the bag at the first use."""
         with foreign(DatasetError, f"the accelerations in {self.path}"):
             return gravity_of(self._bag, self._rotation_of)
 

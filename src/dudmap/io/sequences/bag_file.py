@@ -205,7 +205,7 @@ def _mcap_entries(part: Any, connection: "Connection") -> Iterable[tuple[int, by
 
 
 def _opened(make: Callable[[Any], Any], path: Path) -> tuple[Any, bool]:
-    """An open reader of rosbags, and whether the file was not closed and has an index made anew."""
+    """An open reader of rosbags, and whether the file was unclosed and has a new index."""
     reader = make(path)
     try:
         reader.open()

@@ -33,7 +33,7 @@ REGISTERED_NAME = re.compile(r"aligned|depth_registered|depth_to_(rgb|color)|hw_
 
 
 class Topics(NamedTuple):
-    """Connections of the two images and, where there are any, of their camera_info; and the world frame of /tf.
+    """Connections of the two images and of their camera_info, if any; and the world frame of /tf.
 
     Without colour both images are the depth image.
     """
@@ -68,7 +68,7 @@ def chosen_topics(text: str | None) -> dict[str, str]:
 def find_topics(
     connections: "Sequence[Connection]", chosen: dict[str, str], bag: str, first: "Callable[[Connection], Any]"
 ) -> Topics:
-    """Topics that are chosen, and for the rest those that are recognised by their names, else by their encodings.
+    """The chosen topics; the other ones are recognised by their names, else by their encodings.
 
     ``first`` gives the first message of a topic.
     """

@@ -1,4 +1,4 @@
-"""Recordings of pairs of image files: what all folder formats share."""
+"""Recordings of pairs of image files: base class of all folder formats."""
 
 import re
 from collections.abc import Iterable, Sized
@@ -31,14 +31,14 @@ FRAME_RATE = 30.0
 class ImageFolder(Recording):
     """Base class of recordings whose frames are a colour file and a depth file each, or, without colour, a depth file.
 
-    A format says what its files are called (``color_files`` and so on) or how they pair (``_find_pairs``), and
-    optionally its cameras where no file does (``published``), where the truth is (``_find_ground_truth``) and how an
-    image is stored (``_read_depth``).
+    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``). Optionally
+    it defines cameras for recordings without a file of intrinsics (``published``), the ground truth
+    (``_find_ground_truth``) and the storage of an image (``_read_depth``).
 
     Args:
         path: The folder.
-        camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``;
-            colour images of another size than depth keep their own camera.
+        camera: Intrinsics that replace the recording's, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``. Colour
+            images of another size than depth keep their own camera.
 
     Raises:
         DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
@@ -166,7 +166,7 @@ class ImageFolder(Recording):
         return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics of a file of a usual name, else those of the data set, else of a file of any name that fits."""
+        """Intrinsics from a file of a usual name, else of the data set, else from a file of any name that fits."""
         return camera_search.known(self.path, self._published(), self._sizes)
 
     def _sizes(self) -> tuple[tuple[int, int], tuple[int, int]] | None:

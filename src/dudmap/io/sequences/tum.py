@@ -27,14 +27,15 @@ class TumSequence(ImageFolder):
     Without rgb.txt, and without a folder rgb/, it is a recording of depth alone.
 
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
-    associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
+    associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is the timestamp of its depth
+    image.
 
-    Intrinsics come from ``camera``, else from a file, else from the name (freiburg1-3) of the folder, or of the bag in
-    the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``), which a renamed folder keeps. The published
-    distortion of freiburg1 and 2 is deliberately left out: it describes the colour lens, but the driver reprojected the
-    depth as if that lens had no distortion, and undistorting both images would distort correct depth. On 240 frames of
-    freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are
-    applied to both images.
+    Intrinsics come from ``camera``, else from a file, else from a name with freiburg1-3. This is the name of the
+    folder, or of the bag in the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``), which survives a
+    renamed folder. The published distortion of freiburg1 and 2 is deliberately left out. It describes the colour lens,
+    but the driver reprojected the depth for a lens without distortion. Undistorting both images would distort correct
+    depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
+    intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
     """
 
     format = "TUM RGB-D"
