@@ -9,7 +9,7 @@ SHARE = 0.2
 
 
 class Plated:
-    """A sequence with the plate at the lower edge of its images; ``region`` (H, W) is where it is."""
+    """A sequence with the plate at the lower edge of its images; ``region`` (H, W) are its pixels."""
 
     def __init__(self, sequence, seed=0, distance=0.35):
         self.name, self.camera, self.calibration = sequence.name, sequence.camera, None

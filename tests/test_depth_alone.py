@@ -1,4 +1,4 @@
-"""Depth without colour: it is tracked by its distances, fused, marked, and what is no colour is refused."""
+"""Depth without colour is tracked by its distances, fused and marked. Arrays that are no colour image are refused."""
 
 import json
 from dataclasses import replace

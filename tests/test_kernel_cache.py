@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, and that all works where nothing can be kept: no home, a read-only installation.
+"""The folder of compiled kernels, and runs without one: no home folder, a read-only installation.
 
 The subprocesses run a copy of the package in a read-only folder. Root may write everywhere, so that its processes give
 up that right (setpriv) first.
@@ -113,7 +113,7 @@ def test_a_run_without_home_and_cache_gives_what_any_run_gives(stranger, tmp_pat
 
 @pytest.fixture
 def kernel(tmp_path, monkeypatch):
-    """Defines a kernel anew and gives the brightness of a white pixel by it."""
+    """Defines a new kernel and returns the brightness of a white pixel by it."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     kernel_cache._say_once.cache_clear()
 

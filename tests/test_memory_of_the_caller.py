@@ -43,7 +43,7 @@ def frames():
 
 
 def poison(value, seen=None):
-    """Overwrite all arrays in a value, and in what it holds."""
+    """Overwrite all arrays in a value and in its members."""
     seen = set() if seen is None else seen
     if id(value) in seen or value is None or isinstance(value, str | int | float | bool | Camera):
         return
@@ -63,7 +63,7 @@ def poison(value, seen=None):
 
 
 def outcome(slam, results):
-    """What a system has found: poses, masks and mesh."""
+    """Results of a system: poses, masks and mesh."""
     mesh = slam.volume.extract_mesh()
     return [
         *(result.state for result in results),

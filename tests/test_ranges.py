@@ -62,7 +62,7 @@ def test_what_is_given_is_not_scaled():
 
 @pytest.mark.parametrize("size", [0.2, 2.5])
 def test_a_scaled_scene_is_tracked_as_a_room(size: float):
-    """Tracked frames, errors, mesh and labels agree with those of the room."""
+    """Tracked frames, errors, mesh and labels agree with the room."""
     results = {}
     for factor in (1.0, size):
         slam, frames, truth = frames_of(factor, movers=("person",))

@@ -56,7 +56,7 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
 def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
     """Size of the scene in some depth images (H, W), metres, relative to a room (1).
 
-    The voxel size of other scenes becomes 1/500 of the median depth, or 1/600 of the 98 % quantile if that is larger,
+    The voxel size of other scenes is the larger of 1/500 of the median depth and 1/600 of the 98 % quantile. It is
     clipped to 2 mm to 5 cm.
     """
     import numpy as np

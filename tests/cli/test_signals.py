@@ -53,7 +53,7 @@ def check_run_folder(out, said):
 
 
 def end_live(room, folder, wait):
-    """Send SIGTERM to a live run and check what it leaves."""
+    """Send SIGTERM to a live run and check its results."""
     process = live_recording(room, folder, wait)
     process.terminate()
     _, said = process.communicate(timeout=240)

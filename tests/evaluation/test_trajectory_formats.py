@@ -250,7 +250,7 @@ def test_marker_poses_of_bonn_become_camera_poses_and_camera_poses_stay(tmp_path
     assert raw["reference_format"] == "TUM"
     assert raw["rpe_rot_rmse_deg_per_s"] > 5
     assert "poses of another body than the camera" in raw["hints"][0]
-    # what dudmap writes into a folder of this name are camera poses already
+    # files of dudmap in a folder of this name hold camera poses already
     Trajectory.load(tmp_path / "estimate.txt").save(folder / "groundtruth.txt")
     out = figures(tmp_path / "estimate.txt", "--reference", folder)
     assert out["ate_rmse_m"] == pytest.approx(0, abs=1e-6)

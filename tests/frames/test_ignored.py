@@ -1,4 +1,4 @@
-"""Pixels that never count: what they show changes nothing, and they are never called moving."""
+"""Pixels that never count: their content changes nothing, and they are never labelled as moving."""
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ def results(recording, **given):
 
 
 def test_what_an_ignored_plate_shows_changes_nothing(room):
-    """The same poses, masks and mesh, bit for bit, whatever the plate looks like and wherever it is."""
+    """The same poses, masks and mesh, bit for bit, for any texture and distance of the plate."""
     plated, other = Plated(room), Plated(room, seed=1, distance=0.7)
     region = plated.region
     slam, found = results(plated, ignore=region)
@@ -46,7 +46,7 @@ def test_what_an_ignored_plate_shows_changes_nothing(room):
     cameras = np.array([result.T_world_camera[:3, 3] for result in found])
     nearest = np.linalg.norm(mesh.vertices[:, None] - cameras[::5], axis=2).min()
     assert nearest > 0.5  # metres; the plate is nearer
-    _, counted = results(plated)  # without a mask the plate is what moves
+    _, counted = results(plated)  # without a mask the plate moves
     assert np.mean([result.dynamic_mask[region].mean() for result in counted[1:]]) > 0.9
 
 

@@ -107,7 +107,7 @@ def test_frames_without_a_given_pose_are_left_out_and_wrong_ones_refused(room):
 
 
 def written(convention, Ts):
-    """The numbers of a file in a convention: those that it turns into these poses."""
+    """The numbers of a file in a convention that give these poses."""
     Ts = Ts @ np.linalg.inv(AXES[convention.axes]) if convention.axes else Ts.copy()
     Ts = se3.inverse(Ts) if convention.inverse else Ts
     if convention.millimetres:

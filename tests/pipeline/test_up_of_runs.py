@@ -1,5 +1,5 @@
-"""A run tells which direction is up: the same short scan with the camera upright, rolled by 90 degrees, and hung upside
-down, with gravity that was measured and without."""
+"""A run finds the upward direction: a short scan with the camera upright, rolled by 90 degrees, and hung upside down.
+Each is tried with and without measured gravity."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A run that is of no use says so in its last line, why, and what to try; the exit code is 3."""
+"""The last line of a useless run names the cause and a remedy; the exit code is 3."""
 
 import json
 from typing import Any

@@ -307,7 +307,7 @@ def test_files_that_only_look_like_bags_are_not_recognised(tmp_path):
 
 
 def named_otherwise(path, kind, depth_encoding="16UC1", k=K):
-    """A bag whose depth topic tells by its encoding alone what it is, as that of an OAK camera."""
+    """A bag of an OAK camera, whose depth topic is recognised by its encoding alone."""
     bag = BagWriter(path, kind)
     for index in range(5):
         stamp = START + 0.1 * index

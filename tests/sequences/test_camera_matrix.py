@@ -216,7 +216,7 @@ def test_the_inverse_lens_of_realsense_is_inverted(folder, name):
     np.testing.assert_allclose(pixel.ravel(), [8, 40], atol=0.02)
 
 
-# -- what does not fit, and what contradicts ---------------------------------------------------------------------------
+# -- files that do not fit, and contradictory files --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("size", "factor"), [((128, 96), 2.0), ((96, 72), 1.5), ((32, 24), 0.5)])

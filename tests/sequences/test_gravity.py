@@ -22,7 +22,7 @@ def tilted(forward, roll=0.0):
 
 
 def still(sequence, gravity):
-    """The mean direction in the world of a run whose camera does not move: that of the camera."""
+    """The mean direction in the world of a run with a camera at rest is the direction in its axes."""
     poses = Trajectory(sequence.timestamps, np.tile(np.eye(4), (len(sequence), 1, 1)))
     return gravity.in_world(poses)
 
@@ -53,7 +53,7 @@ def test_an_odometry_without_rotations_brings_no_gravity(tmp_path):
 
 
 def test_worlds_of_arkit_scenes_and_polycam(tmp_path):
-    """In ARKitScenes z is up, in Polycam y is; the camera axes are those of the poses read as truth."""
+    """In ARKitScenes z is up, in Polycam y is; the camera axes agree with the ground truth."""
     for layout, up in ((arkit_scenes, (0, 0, 1)), (polycam, (0, 1, 0))):
         folder, _ = write(layout, tmp_path / layout.__name__)
         sequence = open_sequence(folder)

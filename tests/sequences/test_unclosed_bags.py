@@ -59,7 +59,7 @@ def unindexed(data):
 
 
 def check(path, full, least):
-    """Compare what is found in a file with the whole recording."""
+    """Compare the content of a file with the whole recording."""
     found = open_sequence(path)
     assert least <= len(found) < len(full)
     np.testing.assert_array_equal(found.timestamps, full.timestamps[: len(found)])

@@ -120,7 +120,7 @@ def run(
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     ours = config.system == "dudmap"
-    if ours and (calibration != "auto" or not live):  # what has been estimated beforehand is not estimated again
+    if ours and (calibration != "auto" or not live):  # no second estimation of a calibration
         config = config.override(["sensor.self_calibration=false"])
     given_by = None if poses is None else given_poses(poses, recording, poses_as, refine=refine)
     storing = (

@@ -80,7 +80,7 @@ class _Cache(caching.FunctionCache):
         try:
             try:
                 super().save_overload(sig, data)
-            except (EOFError, caching.pickle.UnpicklingError):  # the list of what is stored is damaged
+            except (EOFError, caching.pickle.UnpicklingError):  # the index of stored forms is damaged
                 self.flush()
                 super().save_overload(sig, data)
         except OSError as error:
@@ -131,7 +131,7 @@ def _private() -> Path | None:
         temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}
         if os.name != "posix" or str(base) not in temporary:  # not the current folder, Python's last resort
             return None
-        if base.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:  # others may rename what is in it
+        if base.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:  # other users may rename its content
             return None
         path = base / f"dudmap-{os.getuid()}"
         path.mkdir(mode=0o700, exist_ok=True)

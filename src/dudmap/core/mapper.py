@@ -75,13 +75,13 @@ class Bootstrap(Stateful):
 
     A single image shows no motion. So all pixels of the first frame count as static unless the caller declares them
     dynamic, and slow motion appears only after a while. As soon as motion appears, its pixels are removed from the
-    first frame, and the map begins anew with this frame. The later frames are held back until slow motion can be seen.
+    first frame, and the map is rebuilt from this frame. The later frames are held back until slow motion can be seen.
     Then they are fused without their moving pixels.
 
     The first frames were registered to a map that had seen little: they are remembered to be registered once more.
 
     Args:
-        refines: Whether they are; else they are not remembered for it.
+        refines: Whether the first frames are remembered for a second registration.
         second_pass: The map of the first pass shows motion: frames are held back only until the stream ends.
 
     Attributes:
@@ -146,11 +146,11 @@ class Bootstrap(Stateful):
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
         """The first frame with its moving pixels added to the mask; None if the map holds none of them.
 
-        The later frames then count as not fused, since the map is made anew.
+        The later frames then count as not fused, since the map is rebuilt.
 
         Args:
-            moving_before: (h, w) bool, label resolution, what a later image shows to have moved in the first; None if
-                that is not known.
+            moving_before: (h, w) bool, label resolution, pixels of the first image that a later image shows as moving;
+                None if unknown.
         """
         if self.first is None or moving_before is None:
             return None
@@ -225,8 +225,8 @@ class Mapper:
         self._localize = localize
 
     def revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
-        """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
-        can be seen, fuse the frames that were held back until then."""
+        """Rebuild the map from the first frame without pixels that a later image shows as moving. Once slow motion can
+        be seen, fuse the frames held back."""
         self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
         if not self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
             self._fuse_held(self._bootstrap.released(), view.timer)

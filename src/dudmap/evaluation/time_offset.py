@@ -108,7 +108,7 @@ def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
     H = np.swapaxes(a, 1, 2) @ b
     singular = np.linalg.svd(H, compute_uv=False)
     if H.shape[-1] == 3:
-        singular[:, 2] *= np.sign(np.linalg.det(H))  # -1 where the best orthogonal matrix is a reflection
+        singular[:, 2] *= np.sign(np.linalg.det(H))  # -1 if the best orthogonal matrix is a reflection
     else:
         singular = H[..., 0]  # numbers are not turned: their correlation keeps its sign
     spreads = (a**2).sum(axis=(1, 2)) * (b**2).sum(axis=(1, 2))

@@ -17,8 +17,8 @@ CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
 """Sampling of the saturation limit: the step across and down, and a share of the pixels with a saturated channel. The
 limit is the largest intensity of this darkest share."""
 HALVING_BAND = 0.02
-"""Largest distance of a surface's measurements behind the nearest one of a 2x2 block, as a share of the depth (at least
-of the reference depth)."""
+"""Largest distance between measurements of one surface in a 2x2 block, as a share of the depth. Below the reference
+depth it is a share of that."""
 CELLS = 40
 """Cells across the image; the strongest corner of each cell is used."""
 WINDOW = 11

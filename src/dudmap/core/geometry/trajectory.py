@@ -116,7 +116,7 @@ class Trajectory:
             optional: Leave out rows that are no pose, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing or its format is not clear; it holds no pose, no times, or, unless
+            DatasetError: The file is missing or its format is not clear. It holds no pose, no times, or, unless
                 ``optional``, a row that is no pose.
         """
         path = Path(path)

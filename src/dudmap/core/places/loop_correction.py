@@ -19,9 +19,9 @@ ODOMETRY_NOISE = 0.002, 0.02
 LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a motion measured at a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
-"""Limits of the misfit of the new pass's frames to the map of the old one: a ratio to the misfit to their own map, plus
-an offset. A correction with a larger misfit is rejected. The offset of distances is the noise of the measured motion.
-The offset of intensities is in units of the range 0..1.
+"""Limits of the misfit of the new pass's frames to the old pass's map. The ratio refers to the misfit to their own map;
+the offset is added. A correction with a larger misfit is rejected. The offset of distances is the noise of the measured
+motion. The offset of intensities is in units of the range 0..1.
 
 The correct correction of a walk of 300 m round a corridor gives a ratio of 1.1. Motions with added errors of 2 cm and 1
 degree, or of 5 cm, gave more than 2.

@@ -122,8 +122,8 @@ class Relocalizer(Stateful):
 
         Three conditions must hold. The camera has been lost for ``submaps.patience`` seconds. The frame has enough
         depth for a map and, if it has colour, enough features for a keyframe. It does not show people
-        (``_shows_static_world``): it is compared with the last lost image to find fast people, and with an image
-        LONGEST_BASELINE older to find slow ones.
+        (``_shows_static_world``). Comparison with the last lost image finds fast people; comparison with an image
+        LONGEST_BASELINE older finds slow ones.
         """
         config, observation = self.config.submaps, view.observation
         if not self.may_start_submaps or self._lost_since is None:

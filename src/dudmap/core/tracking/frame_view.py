@@ -75,8 +75,8 @@ class FrameView:
         segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them.
         timer: Collects the processing time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
-        blind: The image is textureless although the first image of the map was not, or the light has changed too much:
-            the pose rests on the distances alone, and the frame is not fused.
+        blind: The image is textureless although the first image of the map was not, or the light has changed too much.
+            The pose rests on the distances alone, and the frame is not fused.
         color_velocity: (6,) twist of the camera per second with which the colours were registered.
         colors: Returns the observation with its colours registered; None where those it has are.
     """

@@ -40,8 +40,8 @@ class MotionModel(Stateful):
     """
 
     T_world_camera: Remembered[NDArray[np.float64]]
-    _T_given: Remembered[NDArray[np.float64] | None] = None  # given pose of the frame that comes
-    _T_world_given: Remembered[NDArray[np.float64]]  # world of the given poses in that of the map
+    _T_given: Remembered[NDArray[np.float64] | None] = None  # given pose of the next frame
+    _T_world_given: Remembered[NDArray[np.float64]]  # world of the given poses in the world of the map
     _timestamp: Remembered[float] = 0.0
     _velocity: Remembered[NDArray[np.float64]]
     _initialized: Remembered[bool] = False

@@ -201,7 +201,7 @@ class ExportOptions:
         resolution: Edge of the cells of grids, metres.
         heights: Lower and upper end of the robot above the floor, metres.
         sequence: Recording that the run was made from; None for the one that the run names.
-        camera: Intrinsics of that recording, as ``--camera`` takes them; None for those of the run.
+        camera: Intrinsics of that recording, as ``--camera`` takes them; None for the run's intrinsics.
         every: Every so many frames of the recording are exported.
     """
 

@@ -336,7 +336,7 @@ def _places_by_content(path: Path) -> list[Path]:
     def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:
         if kinds(place):
             return [place]
-        if levels == 0 or (kinds is alone and unknown(place)):  # depth beside other images is not alone
+        if levels == 0 or (kinds is alone and unknown(place)):  # other images may be colour
             return []
         folders = (below for below in sorted(place.iterdir()) if below.is_dir())
         return [found for below in folders for found in search(below, kinds, levels - 1)]

@@ -1,7 +1,7 @@
 """Cameras in the content of a file of any name: text, JSON, YAML, NumPy arrays.
 
-A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths with a principal point under any usual
-name. The caller tests whether the numbers fit the images.
+A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1. Or it is focal lengths with a principal point under any
+usual name. The caller tests whether the numbers fit the images.
 """
 
 import re
@@ -216,7 +216,8 @@ def _by_place(numbers: list[Any]) -> Values:
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Matrix K (3, 3), rows fx s cx, 0 fy cy, 0 0 1, of 9, 12 or 16 numbers by rows or columns; else None."""
+    """Matrix K (3, 3), rows fx s cx, 0 fy cy, 0 0 1; None for other values. They are 9, 12 or 16 numbers by rows or
+    columns."""
     flat = _flat(value)
     if flat is None or len(flat) not in (9, 12, 16):
         return None

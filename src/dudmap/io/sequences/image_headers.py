@@ -133,8 +133,8 @@ def content(data: bytes) -> str:
     """Kind of the values of an image by its header.
 
     Returns:
-        ``depth`` (one channel of 16 bits or floats), ``color`` (8-bit colours), ``gray`` (8-bit intensities), ``other``
-        (such as palettes), or an empty text for data that are no image.
+        ``depth`` (one channel of 16 bits or floats), ``color`` (8-bit colours), ``gray`` (8-bit intensities), or
+        ``other`` (such as palettes). Empty for data that are no image.
     """
     try:
         if data.startswith(PNG):

@@ -29,8 +29,8 @@ class NumberedSequence(ImageFolder):
 
     Words in the names of files and folders, the content, or two patterns tell which images are depth and colour
     (``image_series``). Equal numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms.
-    Depth: 16 bit, or float metres. The ground truth is groundtruth.txt, or matrices camera to world: one per frame in
-    poses.txt, or files in a folder ``pose`` or ``poses`` with the numbers of the images.
+    Depth: 16 bit, or float metres. The ground truth is groundtruth.txt, or matrices camera to world. These are one per
+    frame in poses.txt, or numbered like the images in a folder ``pose`` or ``poses``.
 
     Args:
         path: The folder.

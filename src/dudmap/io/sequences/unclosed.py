@@ -178,7 +178,7 @@ def _mcap_records(file: IO[bytes], position: int) -> Iterator[tuple[int, int, in
     while position + 9 <= size:
         file.seek(position)
         kind, length = struct.unpack("<BQ", file.read(9))
-        if kind in (0, DATA_END, FOOTER) or position + 9 + length > size:  # zeros follow where the power failed
+        if kind in (0, DATA_END, FOOTER) or position + 9 + length > size:  # a power failure leaves zeros
             return
         yield kind, position + 9, length
         position += 9 + length
