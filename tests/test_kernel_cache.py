@@ -91,7 +91,7 @@ def test_doctor_names_the_folder_that_is_used(stranger, tmp_path):
 
 
 def test_a_run_without_home_and_cache_gives_what_any_run_gives(stranger, tmp_path):
-    for file in (filtering.__file__, threads.__file__, formulas.__file__):  # what is compiled already
+    for file in (filtering.__file__, threads.__file__, formulas.__file__):  # kernels that are already compiled
         kept = Path(kernel_cache._Locator.from_function(cache_of, file).get_cache_path())
         copied = stranger.place / "site" / Path(file).relative_to(Path(dudmap.__file__).parents[1])
         private = stranger.place / "tmp" / f"dudmap-{os.getuid()}"

@@ -63,7 +63,7 @@ class Session:
     Attributes:
         slam: The system; None before the first pair.
         watch: Changes against the saved map, None without one or before the first pair.
-        processed, stale: Number of processed pairs, and of pairs dropped because they are older than the one before.
+        processed, stale: Numbers of processed pairs, and of pairs dropped as older than the one before.
 
     Raises:
         ConfigError: ``localize`` or ``watch`` without a saved map.

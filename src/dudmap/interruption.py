@@ -78,7 +78,7 @@ def postponed() -> Iterator[None]:
 
 @contextmanager
 def recognised() -> Iterator[None]:
-    """Replace the error that Numba raises for a request during a kernel ("result with an exception set").
+    """Replace the ``SystemError`` that a request during a Numba kernel causes.
 
     Raises:
         KeyboardInterrupt: Instead of that error.

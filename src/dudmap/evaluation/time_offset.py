@@ -31,7 +31,7 @@ LARGEST_HINT = CHUNK * STEP / 2
 class TimeOffset(NamedTuple):
     """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
 
-    ``unexplained`` is ``1 - r^2``, 0 for equal motions and 1 for unrelated ones. r is the correlation of the aligned
+    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. Here r is the correlation of the aligned
     positions or of the angles of rotation. If both are defined, ``unexplained`` is the mean of both.
     """
 
