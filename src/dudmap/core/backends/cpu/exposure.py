@@ -24,10 +24,11 @@ def fit_exposure(
     """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
 
     Auto-exposure changes all intensities at once; without this model such a change would look like motion. Saturated
-    pixels tell nothing and are left out. A fit that changes the median or the contrast by more than LARGE_GAIN only
-    tells that the light has changed, or that the image shows something else: its prior outweighs the low contrast of a
-    dark image, and pixels beside their place flatten it. The quartiles of both images then give gain and offset
-    wherever the pixels lie; a second fit corrects them by less than LARGE_GAIN, or not at all.
+    pixels tell nothing and are left out. If the fit changes the median or the contrast by more than LARGE_GAIN, the
+    light has changed, or the image shows something else: the prior of the fit outweighs the low contrast of a dark
+    image, and pixels off their place flatten it. The quartiles of both images then give another gain and offset
+    wherever the pixels lie, which a second fit corrects by less than LARGE_GAIN, or not at all. The pair with the
+    smaller median error is returned.
 
     Args:
         intensity: (h, w) float32 of the image.
@@ -62,12 +63,13 @@ def fit_exposure(
     brightening = gain + offset / max(nth(x, middle), LOWEST)
     if 1 / LARGE_GAIN < min(gain, brightening) and max(gain, brightening) < LARGE_GAIN:
         return gain, offset
-    gain = (nth(y, high) - nth(y, low)) / max(nth(x, high) - nth(x, low), LOWEST)
-    offset = nth(y, middle) - gain * nth(x, middle)
-    change, shift = _fit(gain * x + offset, y)
+    other = (nth(y, high) - nth(y, low)) / max(nth(x, high) - nth(x, low), LOWEST)
+    beyond = nth(y, middle) - other * nth(x, middle)
+    change, shift = _fit(other * x + beyond, y)
     if 1 / LARGE_GAIN < change < LARGE_GAIN:
-        gain, offset = change * gain, change * offset + shift
-    return gain, offset
+        other, beyond = change * other, change * beyond + shift
+    better = nth(np.abs(y - other * x - beyond), middle) < nth(np.abs(y - gain * x - offset), middle)
+    return (other, beyond) if better else (gain, offset)
 
 
 @scalar
