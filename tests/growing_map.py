@@ -26,7 +26,7 @@ class GrowingMap:
     def __init__(self):
         self.camera = Camera(**CAMERA)
         self.volume = TsdfVolume(WALL_CAMERA, CONSTANT.model_copy(update={"min_weight": 1}), depth_max=4.0)
-        self.atlas = types.SimpleNamespace(volume=self.volume)
+        self.live_volume = self.volume
         self.trajectory = types.SimpleNamespace(timestamps=np.array([0.0]), Ts_world_camera=np.eye(4)[None])
 
     def step(self, k):

@@ -274,7 +274,10 @@ def test_what_looks_wrong_is_said_before_the_run(slam, recording):
 def test_ctrl_c_saves_and_says_so(slam, recording):
     slam.script = {3: KeyboardInterrupt()}
     said = sentence_of("run", recording, "--out", "out", code=130)
-    assert said == "dudmap: interrupted after 3 frames; the trajectory and the map up to there are in out"
+    assert said == (
+        "dudmap: interrupted after 3 frames; the trajectory and the map up to there are in out; "
+        "dudmap run --resume out goes on"
+    )
     assert len(Trajectory.load("out/trajectory.txt")) == 3
 
 

@@ -176,4 +176,5 @@ def on_device(volume, backend):
         blocks.coords[: blocks.num_entries], blocks.free_count[: blocks.num_entries], blocks.entry_of[slots],
         blocks.geometry[slots], blocks.colors[slots],
     )  # fmt: skip
+    other.num_frames = volume.num_frames
     return other

@@ -236,9 +236,7 @@ def test_a_black_image_with_valid_depth_changes_the_surface_like_any_other():
     for other in maps[1:]:
         assert np.array_equal(maps[0][1], other[1])
         assert np.array_equal(maps[0][2], other[2])
-    voxels = np.abs(maps[0][1]) / CONSTANT.voxel_size
-    assert np.abs(maps[1][3] - maps[0][3] / 2)[voxels < 2.4].max() <= 0.5
-    assert np.array_equal(maps[1][3][voxels > 2.6], maps[0][3][voxels > 2.6])  # there the first colour stays
+    assert np.array_equal(maps[1][3], maps[0][3])  # black may be a want of light: it paints nothing
     assert not maps[2][3].any()
 
 

@@ -241,6 +241,9 @@ def test_among_many_maps_one_other_picture_makes_a_place_another_one():
 
 def test_a_map_without_a_surface_is_left_out():
     (wall, of_wall), nothing = striped_wall(False), TsdfVolume(SMALL, VolumeConfig(voxel_size=0.04))
+    depth = np.zeros(SMALL.shape, np.float32)
+    depth[SMALL.height // 2, SMALL.width // 2] = 1.0
+    nothing.integrate(Frame(0.0, depth), np.eye(4))  # one reading makes no triangle
     empty = MapSurface(nothing, surface_points(nothing, np.zeros((1, 3)), 100))
     pair = decided(MapSurface(wall, of_wall), empty, [Hypothesis(np.eye(4), 3, 100)])
     assert pair.T_a_b is None

@@ -224,7 +224,7 @@ def test_kept_frames_are_evenly_spaced(tmp_path, count, known):
     observer = Thumbnails()
     observer.start(None, tmp_path, number)
     read = type(
-        "Read", (), {"frame": type("F", (), {"color": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})}
+        "Read", (), {"frame": type("F", (), {"rgb": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})}
     )
     for index in range(count):
         mask = np.zeros((2, 2), bool)

@@ -44,7 +44,8 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
     out = []
     for key in keys():
         value = attrgetter(key)(base)
-        if key in without or key in chosen:
+        foreign = key.startswith("thesis.") != (base.system == "thesis")
+        if key in without or key in chosen or foreign:
             continue
         if isinstance(value, tuple):
             ends = [[_scaled(element, factor) for element in value] for factor in (1 / ratio, ratio)]
