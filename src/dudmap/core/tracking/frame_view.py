@@ -138,10 +138,17 @@ class FrameView:
         return TrackedImage(self.timestamp, T_world_camera, self.pyramid, self.segmentation(), **attributes)
 
     @property
+    def brightness(self) -> float:
+        """Mean intensity of the pixels with a depth, or of all if none has one: an object before a dark background is
+        not dark."""
+        coarse = self.pyramid.coarse
+        return float((coarse.intensity[coarse.depth > 0] if coarse.depth.any() else coarse.intensity).mean())
+
+    @property
     def first_gain(self) -> float:
         """Gain with which the frame begins a map: cameras often start before their exposure has settled, and the
         colours of a map, whose exposure later frames get, are stored in steps of 1 / 255."""
-        mean = float(self.observation.intensity.mean())
+        mean = self.brightness
         return 1.0 if self.textureless or EXPOSED[0] <= mean <= EXPOSED[1] else USUAL_INTENSITY / mean
 
     @property
