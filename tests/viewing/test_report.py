@@ -223,9 +223,7 @@ def test_kept_frames_are_evenly_spaced(tmp_path, count, known):
     number = count if known else None
     observer = Thumbnails()
     observer.start(None, tmp_path, number)
-    read = type(
-        "Read", (), {"frame": type("F", (), {"rgb": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})}
-    )
+    read = type("Read", (), {"frame": type("F", (), {"rgb": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})})
     for index in range(count):
         mask = np.zeros((2, 2), bool)
         observer.frame(index, read, FakeResult(float(index), dynamic_mask=mask), 1.0)

@@ -22,6 +22,10 @@ _KINDS: dict[str, Any] = {
 """Numba's choices of a folder, by names that had an underscore before Numba 0.62."""
 
 
+_DAMAGED: type[Exception] = vars(caching)["pickle"].UnpicklingError
+"""Error of Numba about a damaged file."""
+
+
 class KernelCacheWarning(UserWarning):
     """Compiled kernels do not last."""
 
@@ -72,7 +76,7 @@ class _Cache(caching.FunctionCache):
         """The compiled form for a signature, None if it has to be compiled."""
         try:
             return super().load_overload(sig, target_context)
-        except (OSError, EOFError, caching.pickle.UnpicklingError):
+        except (OSError, EOFError, _DAMAGED):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
@@ -80,7 +84,7 @@ class _Cache(caching.FunctionCache):
         try:
             try:
                 super().save_overload(sig, data)
-            except (EOFError, caching.pickle.UnpicklingError):  # the index of stored forms is damaged
+            except (EOFError, _DAMAGED):  # the index of stored forms is damaged
                 self.flush()
                 super().save_overload(sig, data)
         except OSError as error:
