@@ -231,7 +231,7 @@ def test_the_images_of_the_quick_pass_are_halved_and_its_result_is_for_whole_one
     whole_sequence = Walls([])
     whole_sequence.camera = whole
     whole_sequence.timestamps = np.arange(5) / (2.0 / INTERVAL)  # twice as fast as needed
-    excerpt = _Excerpt(whole_sequence, given, 1, 5)
+    excerpt = _Excerpt(whole_sequence, given, 1, 5, 1.0)
     excerpt._sequence = [Frame(n / FPS, depth, color) for n in range(5)]
     assert len(excerpt) == 3
     frame = excerpt[2]
