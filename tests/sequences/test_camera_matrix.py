@@ -103,7 +103,7 @@ def intrinsics_of(sequence):
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
-NOT_READ = {("depths_and_images/", config_beside), ("rgbd-frames/", config_beside)}
+NOT_READ = [("depths_and_images/", config_beside), ("rgbd-frames/", config_beside)]
 """The camera lies two folders above the images: it may be of another recording. At most 15 % may stand here."""
 PAIRS = [(layout, camera) for layout in LAYOUTS for camera in CAMERAS if (layout, camera) not in NOT_READ]
 
