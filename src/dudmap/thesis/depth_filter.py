@@ -40,6 +40,6 @@ def bilateral(D: NDArray[np.float32], alpha: float, sigma_s: float, radius: int)
         sigma_s: Pixels.
         radius: Half width of the square window N(u_k), pixels.
     """
-    out = np.empty_like(D)
-    run_bands(lambda start, stop: filter_rows(start, stop, D, alpha, sigma_s, radius, out), bands(len(D), ROWS))
+    out, padded = np.empty_like(D), np.pad(D, radius)
+    run_bands(lambda start, stop: filter_rows(start, stop, padded, alpha, sigma_s, radius, out), bands(len(D), ROWS))
     return out

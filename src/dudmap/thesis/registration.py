@@ -68,18 +68,14 @@ def sobel(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.f
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
-def point_jacobian(X: Array) -> Array:
-    """Derivative of a point by the twist xi = (omega, upsilon), (n, 3, 6), of points X (n, 3) (eq. 4.35).
+def chain(gradient: Array, X: Array) -> Array:
+    """Derivative (n, 6) by the twist xi = (omega, upsilon) of a function with a gradient (n, 3) at points X (n, 3).
 
-    Reading: the matrix holds the coordinates of the point, not of the twist.
+    The product of the gradient and the Jacobian (-hat(X), I) of a point is (X x gradient, gradient) (eq. 4.34, 4.35).
+    Reading: the matrix of eq. 4.35 holds the coordinates of the point, not of the twist.
     """
-    out = np.zeros((len(X), 3, 6))
-    x, y, z = X.T
-    out[:, 0, 1], out[:, 0, 2] = z, -y
-    out[:, 1, 0], out[:, 1, 2] = -z, x
-    out[:, 2, 0], out[:, 2, 1] = y, -x
-    out[:, :, 3:] = np.eye(3)
-    return out
+    (x, y, z), (a, b, c) = X.T, gradient.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
 def robust_weight(psi: Array, estimator: str, rho: float) -> Array:
@@ -122,18 +118,20 @@ class Registration:
         Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As in
         the text after it, both conditions must hold. A step that does not reduce the error is rejected.
         """
-        damping, error = self.config.lambda_0, self.error(residuals(volume, level, T, self.config.d_max), labels)
-        H, g = self.normal_equations(volume, level, T, labels)
+        found = residuals(volume, level, T, self.config.d_max)
+        damping, error = self.config.lambda_0, self.error(found, labels)
+        H, g = self.normal_equations(volume, level, T, found, labels)
         for _ in range(self.config.iterations):
             if not np.isfinite(error):
                 break
             delta = self.step(H, g, damping)
             trial = exponential(delta) @ T
-            trial_error = self.error(residuals(volume, level, trial, self.config.d_max), labels)
+            found = residuals(volume, level, trial, self.config.d_max)
+            trial_error = self.error(found, labels)
             if trial_error < error:
                 T, error, damping = trial, trial_error, max(damping / FACTOR, SMALLEST_DAMPING)
                 if np.linalg.norm(delta) > self.config.stop:
-                    H, g = self.normal_equations(volume, level, T, labels)
+                    H, g = self.normal_equations(volume, level, T, found, labels)
             else:
                 damping *= FACTOR
             if np.linalg.norm(delta) <= self.config.stop:
@@ -160,24 +158,22 @@ class Registration:
         return float(rho @ (psi**2 + self.config.upsilon * e_c**2)) / len(psi)
 
     def normal_equations(
-        self, volume: TsdfVolume, level: Level, T: Array, labels: NDArray[np.bool_] | None
+        self, volume: TsdfVolume, level: Level, T: Array, found: Residuals, labels: NDArray[np.bool_] | None
     ) -> tuple[Array, Array]:
-        """J^T J (6, 6) and J^T f (6,) of both terms (eq. 4.43, 4.46, 4.47).
+        """J^T J (6, 6) and J^T f (6,) of both terms (eq. 4.43, 4.46, 4.47) from the residuals ``found`` at T.
 
         Readings: eq. 4.46 and 4.47 have rho(psi) before the sums; it weighs each pixel. Eq. 4.38 differentiates a sum
         of squares; J_c is the derivative of V_I - I. The gradient of V_I is replaced by the image gradient, which
         equals it after registration (eq. 4.36, 4.37 differentiate images).
         """
-        found = residuals(volume, level, T, self.config.d_max)
         eta = gradient(volume, level, T)
         used = _used(found, labels) & np.isfinite(eta).all(axis=-1)
         p, eta = level.camera.backproject(level.depth)[used].astype(np.float64), eta[used].astype(np.float64)
         if len(p) < MIN_PIXELS:
             return np.zeros((6, 6)), np.zeros(6)
         psi, e_c = found.psi[used].astype(np.float64), found.e_c[used].astype(np.float64)
-        dX = point_jacobian(p @ T[:3, :3].T + T[:3, 3])
-        J_p = np.einsum("ni,nij->nj", eta, dX)  # eq. 4.34
-        J_c = np.einsum("ni,nij->nj", self._color_gradient(level, p, used) @ T[:3, :3].T, dX)
+        X = p @ T[:3, :3].T + T[:3, 3]
+        J_p, J_c = chain(eta, X), chain(self._color_gradient(level, p, used) @ T[:3, :3].T, X)
         has_color = np.isfinite(e_c)
         J_c[~has_color], e_c[~has_color] = 0, 0
         rho = robust_weight(psi, self.config.estimator, self.config.rho)[:, None]
