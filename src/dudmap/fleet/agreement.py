@@ -1,4 +1,4 @@
-"""Agreement of two maps at a relative pose: how much of the surface of one the other confirms, denies, or never saw."""
+"""Agreement of two maps at a relative pose: the surface of one that the other confirms, denies, or never saw."""
 
 from dataclasses import dataclass
 
@@ -11,45 +11,44 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.map_samples import EMPTY, IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
 CELL = 0.25
-"""Edge of the cells in which the mean colours of the surfaces are compared, metres."""
+"""Edge of the cells in which mean surface colours are compared, metres."""
 MIN_CELL_POINTS = 8
-"""Points of a cell from which its mean colour is compared."""
+"""Fewest points of a cell with a mean colour."""
 MIN_COLORED = 200
-"""Points with colours in both maps from which their colours can be compared at all."""
+"""Fewest points with colours in both maps for a comparison of colours."""
 MAX_COLOR_DIFFERENCE = 20.0
-"""Largest difference of the mean colours of a cell that agree, in each channel, after the gain of that channel."""
+"""Largest difference of a cell's mean colours that agree, per channel, after the gain of that channel, grey levels."""
 
 MIN_AREA, MIN_OVERLAP = 1.0, 0.1
-"""Surface that both maps must hold: square metres, and share of the surface of the smaller one."""
+"""Smallest common surface: square metres, and share of the surface of the smaller map."""
 CLEAR_DISTANCE = 0.1
-"""Surface denied by free space must be farther than this from all surface of the other map, metres: drift, noise and a
-bent map shift surface by centimetres, what is another place by decimetres."""
+"""Smallest distance of denied surface from all surface of the other map, metres. Drift, noise and a bent map shift
+surface by centimetres; another place differs by decimetres."""
 MAX_DENIED = 0.01
-"""Largest share of the compared surface that free space may deny. Runs of one place have up to 0.0014 (a real desk, two
-parts of one recording) or 0 to 0.006 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12,
-floors of a building with other plants and boxes 0.006 to 0.024."""
+"""Largest share of the compared surface that lies in free space of the other map. Measured: two runs of one place 0 to
+0.006; rendered rooms with moved furniture 0.0185 to 0.12. Floors of a building with other plants and boxes have 0.006
+to 0.024."""
 MAX_CHANGED = 0.5
-"""The same share of two visits between which things may have been moved. More is another
-place, or one that was emptied."""
+"""The same share for two visits between which things may have moved; above it, the place is another or was emptied."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
-"""Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
-have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
+"""Smallest correlation of intensities, and smallest share of cells with agreeing colours. Two maps of one rendered room
+have 0.995 and 1.0. Other textures on small things give 0.86 and 0.80, on all walls 0.48 and 0.44."""
 MAX_OTHER_COLOR, MAX_OTHER_SHARE = 0.1, 0.003
-"""Largest surface whose colours may disagree, square metres, for pairs among many runs, most of which do not show one
-place; or this share of the common surface, if that is more. Look-alikes differ by single things, a picture of
-30 x 30 cm, however much else is the same: a share alone lets them pass where much is seen. Floors of a rendered
-building with the same walls and doors and other pictures have 0.35 m2 and more, maps of one floor up to 0.05 m2."""
+"""Largest surface with disagreeing colours, square metres, or this share of the common surface if that is more. It
+applies to pairs among many runs, most of which show different places. Similar places differ by single things such as a
+picture; a mere share would accept them if much is seen. Similar floors of a rendered building have at least 0.35 m2,
+maps of one floor up to 0.05 m2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What two maps say about each other's surface.
+    """Comparison of the surfaces of two maps.
 
     Attributes:
-        area: Surface that both maps hold at the same place, square metres (mean of both directions).
-        overlap: That surface over all surface of the smaller map.
-        denied: Share of the compared surface that lies in known free space of the other map, larger of both directions,
-            counted where a camera came near enough for that to be certain.
+        area: Surface that both maps have at the same place, square metres (mean of both directions).
+        overlap: That surface as a share of the smaller map's surface.
+        denied: Share of the compared surface in known free space of the other map, the larger of both directions. Only
+            surface near enough to a camera counts.
         color_correlation: Correlation of the intensities of the common surface.
         color_share: Share of the cells of the common surface whose mean colours agree.
         other_color: Common surface in the other cells, square metres.
@@ -64,14 +63,14 @@ class Agreement:
 
     @property
     def enough(self) -> bool:
-        """Whether both maps hold enough of one surface to be compared."""
+        """Whether the common surface is large enough for a comparison."""
         return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
 
     def rejection_reason(self, many: bool = False, changed: bool = False) -> str:
-        """Sentence on the first check that fails, empty if the maps can be joined.
+        """Sentence on the first check that fails, empty if the maps can be merged.
 
-        ``many``: a pair among many runs; ``changed``: things may have been moved, painted or lit in other ways between
-        two visits, which then is no reason.
+        ``many``: The pair is one of many runs. ``changed``: Two visits, between which things may have moved, been
+        painted or lit differently; these differences are then no reason.
         """
         if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
@@ -80,7 +79,7 @@ class Agreement:
         return self.color_reason(many, 0.0 if changed else MIN_COLOR_SHARE)
 
     def color_reason(self, many: bool, min_share: float = MIN_COLOR_SHARE) -> str:
-        """Sentence on how the colours disagree, empty if they agree, at least in a share of the cells."""
+        """Sentence on how the colours disagree, empty if they agree in at least ``min_share`` of the cells."""
         if self.color_correlation < MIN_CORRELATION or self.color_share < min_share:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
@@ -94,7 +93,7 @@ class Agreement:
 def agreement(
     a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
 ) -> Agreement:
-    """Compare two maps, by points on their surfaces, at a relative pose ``T_a_b`` (4, 4), world of b to world of a."""
+    """Compare two maps by surface points at a relative pose ``T_a_b`` (4, 4), world of b to world of a."""
     common_b, denied_b, color_a = _compared(a, of_a, of_b, T_a_b)
     common_a, denied_a, color_b = _compared(b, of_b, of_a, se3.inverse(T_a_b))
     area = (common_b.sum() * of_b.area_each + common_a.sum() * of_a.area_each) / 2
@@ -115,9 +114,9 @@ def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
 def _compared(
     volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """Which points (n,) of a surface a map, with a surface of its own, confirms and which it denies, and its colours
-    (m, 3) at those it confirms; behind the surface of the map it is neither: both sides of a thin plate cannot be in
-    one map.
+    """Points (n,) of a surface that a map confirms, points that it denies, and its colours (m, 3) at confirmed points.
+
+    Points behind the surface of the map are neither, because a map need not hold both sides of a thin plate.
     """
     points = transformed(T, surface.points)
     samples = sample_map(volume, points)
@@ -134,8 +133,8 @@ def _color_agreement(
     colors_b: NDArray[np.float64],
     areas: NDArray[np.float64],
 ) -> tuple[float, float, float]:
-    """Correlation of the intensities of points (n, 3), share of their cells with agreeing mean colours, and area of the
-    points in the others."""
+    """Correlation of the intensities of points (n, 3), share of their cells with agreeing mean colours, and the area of
+    points in the other cells."""
     known = (colors_a.max(axis=1) > 0) & (colors_b.max(axis=1) > 0)
     if np.count_nonzero(known) < MIN_COLORED:
         return 0.0, 0.0, 0.0

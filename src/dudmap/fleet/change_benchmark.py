@@ -1,4 +1,4 @@
-"""Pairs of visits drawn at random, and how well their changes are found."""
+"""Score change detection on random pairs of visits."""
 
 import json
 import tempfile
@@ -35,21 +35,21 @@ THINGS = {"box": 0.35, "bin": 0.15, "ball": 0.1, "chair": 0.15, "shelf": 0.08, "
 LARGE = ("chair", "shelf", "door")
 """Things that do not fit on a desk."""
 ONCE = ("door", "poster")
-"""Things of which a scene may have only one."""
+"""Things that occur at most once in a scene."""
 KINDS = {"moved": 0.45, "appeared": 0.275, "disappeared": 0.275}
 PATHS = ("handheld", "pan", "orbit", "dolly")
 NONE, PEOPLE, LIGHT = 0.2, 0.2, 0.3
 """Shares of the pairs without any change, with people in the second visit, and with other light."""
 SAME = 0.06
-"""Distance within which found and true surface are the same, metres: three voxels and the noise at 3 m."""
+"""Distance at which found and true surface coincide, metres: three voxels and the noise at 3 m."""
 SAME_MOTION_CM = 5.0
-"""Error of a motion below which a thing that one visit hardly saw has rightly been found as moved."""
+"""Largest motion error at which a thing hardly seen by one visit counts as correctly found to have moved."""
 LEAST_SHARE = 0.5
-"""Share of a found surface that must lie on that of a true change to be it."""
+"""Smallest share of a found surface on the surface of a true change for the two to match."""
 IOU_CELL = 0.04
-"""Edge of the cells in which the found surface is compared with the true one, metres."""
+"""Edge of the cells that compare found and true surface, metres."""
 SMALL = 0.15
-"""Longest edge below which a thing counts as small, metres."""
+"""Longest edge of a small thing, metres."""
 FRAMES, FPS, SIZE = 60, 12.0, (320, 240)
 
 
@@ -76,7 +76,7 @@ def draw_pair(seed: int, number: int) -> dict[str, Any]:
 
 
 def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[TrueChange]]:
-    """Recordings and true changes of a pair; things that find no free place are left out."""
+    """Recordings and true changes of a pair, without things that find no free place."""
     while True:
         try:
             return visits(**pair)
@@ -86,24 +86,24 @@ def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[T
             pair = pair | {"changes": pair["changes"][:-1]}
 
 
-def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path, told: str = "") -> list[Path]:
-    """Run folders of both visits; those of an earlier call that was told the same are kept."""
+def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path, arguments: str = "") -> list[Path]:
+    """Run folders of both visits; reuses runs of an earlier call with the same ``arguments``."""
     folders, note = [out / "before", out / "after"], out / "pair.json"
-    if note.is_file() and note.read_text(encoding="utf-8") == told:
+    if note.is_file() and note.read_text(encoding="utf-8") == arguments:
         return folders
     for recording, folder in zip(recordings, folders, strict=True):
         run(recording, config, folder, progress=False)
-    write_text(note, told)
+    write_text(note, arguments)
     return folders
 
 
 def score_pair(
     changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_before: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """What was found of each true change, the false changes, and how far surface and motion agree.
+    """Match found to true changes; return matches with their errors, and the kinds of false changes.
 
-    ``T_scene_before`` (4, 4) brings the found changes to the frame of the true ones. Things that the truth calls
-    unknown count neither as missed nor as false.
+    ``T_scene_before`` (4, 4) maps the found changes to the frame of the true ones. True changes of kind "unknown" count
+    neither as missed nor as false.
     """
 
     def surface(one: TrueChange | Change) -> NDArray[np.float64]:
@@ -128,7 +128,7 @@ def score_pair(
             continue
         row: dict[str, Any] = {"thing": true.thing, "kind": true.kind, "size": true.size, "found": None}
         if not true.common and mine and {c.kind for c in mine[:2]} <= {"disappeared", "appeared"}:
-            row["kind"] = mine[0].kind  # it showed other sides: nobody can know that it is one thing
+            row["kind"] = mine[0].kind  # both visits saw different sides: the identity of the thing is not observable
             mine = mine[:1] + [c for c in mine[1:2] if c.kind == mine[0].kind] + mine[2:]
         false += [c.kind for c in mine[1:]]
         if mine:
@@ -137,7 +137,7 @@ def score_pair(
             if motion is not None and not np.array_equal(true.T_after_before, np.eye(4)):
                 error = _motion_error(true, T_scene_before @ motion.T_after_before @ se3.inverse(T_scene_before))
                 error |= {"sigma_cm": 100 * motion.sigma[0], "sigma_deg": float(np.degrees(motion.sigma[1]))}
-                if error["motion_cm"] < SAME_MOTION_CM:  # seen by both visits, though one saw little
+                if error["motion_cm"] < SAME_MOTION_CM:  # both visits saw it, though one saw little
                     row["kind"] = "moved"
                 row |= {"ambiguous": True} if motion.ambiguous else error
         things.append(row)
@@ -146,13 +146,13 @@ def score_pair(
 
 
 def _iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Cells that two surfaces (n, 3) both reach over those that any does."""
+    """Intersection over union of the cells of two surfaces (n, 3)."""
     cells = [{tuple(row) for row in np.floor(points / IOU_CELL).astype(int).tolist()} for points in (a, b)]
     return len(cells[0] & cells[1]) / max(len(cells[0] | cells[1]), 1)
 
 
 def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
-    """Errors of a motion at the centre of a thing: its place, and its turn unless it is symmetric."""
+    """Position error at the centre of a thing, and rotation error, 0 for symmetric things."""
     off = T @ se3.inverse(true.T_after_before)
     at = true.T_after_before[:3] @ np.append(true.at, 1)
     moved = 100 * float(np.linalg.norm(off[:3, :3] @ at + off[:3, 3] - at))
@@ -160,12 +160,12 @@ def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
 
 
 def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Path | None = None) -> dict[str, Any]:
-    """Render, run and compare one pair, whose run folders may be kept in a folder; returns a row."""
+    """Render, run and compare one pair; return its row. ``keep`` is a folder that keeps the run folders."""
     recordings, truth = rendered_pair(pair)
     row: dict[str, Any] = {"scene": pair["scene"], "seed": pair["seed"], "people": pair["people"]}
     with tempfile.TemporaryDirectory() as folder:
-        told = json.dumps(pair | {"config": config.to_toml()}, sort_keys=True)
-        folders = run_pair(recordings, config, keep or Path(folder), told)
+        arguments = json.dumps(pair | {"config": config.to_toml()}, sort_keys=True)
+        folders = run_pair(recordings, config, keep or Path(folder), arguments)
         start = time.perf_counter()
         try:
             changes = compared(folders[0], folders[1], min_size).changes
@@ -178,8 +178,10 @@ def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Pa
 def measure_insertions(
     recording: Recording, seed: int, count: int, config: Config, min_size: float, done: Callable[[dict[str, Any]], None]
 ) -> list[dict[str, Any]]:
-    """Rows of so many things that are put into the second half of a real recording, or cut out of it: every other pair
-    is compared the other way round."""
+    """Insert ``count`` things into the second half of a real recording; return their rows.
+
+    In every other row the halves are swapped, so that the thing disappears.
+    """
     rng, middle, rows = np.random.default_rng([seed, 35]), len(recording) // 2, []
     halves = range(middle), range(middle, len(recording))
     with tempfile.TemporaryDirectory() as folder:
@@ -206,7 +208,7 @@ def measure_insertions(
 
 
 def _stood(visit: Visit, rng: np.random.Generator, size: float) -> list[Primitive]:
-    """A box on a level surface in view of a visit, where nothing is in its way."""
+    """A box on a level surface in view of a visit, with free space around it."""
     up, mesh, camera = vertical(visit), visit.mesh, visit.volume.camera
     level = np.flatnonzero(mesh.normals @ up > 0.95)
     for vertex in rng.permutation(level)[:5000]:
@@ -238,10 +240,10 @@ def measure_changes(
     given: dict[str, Any] | None = None,
     keep: Path | None = None,
 ) -> tuple[list[dict[str, Any]], str]:
-    """Rows of so many pairs and the table; changes.md, .csv and .json are written to ``out``.
+    """Measure ``count`` pairs; write changes.md, .csv and .json to ``out``; return the rows and the table.
 
-    The pairs are rendered ones, with arguments of ``visits`` that are ``given`` instead of drawn, or with a recording
-    its halves, see ``measure_insertions``. Run folders of rendered ones are kept in ``keep`` and used again.
+    The pairs are rendered, or are the halves of ``recording`` (``measure_insertions``). ``given`` overrides drawn
+    arguments of ``visits``. ``keep`` is a folder that keeps the runs of rendered pairs for reuse.
     """
     rows = [] if recording is None else measure_insertions(recording, seed, count, config, min_size, done)
     for number in range(count) if recording is None else ():
@@ -257,7 +259,7 @@ def measure_changes(
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Figures over all pairs."""
+    """Metrics over all pairs."""
     things = [thing for row in rows for thing in row["things"]]
     large = [thing for thing in things if thing["size"] >= SMALL]
     small = [thing for thing in things if thing["size"] < SMALL]
@@ -299,6 +301,6 @@ def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown of the figures."""
+    """Markdown table of the metrics."""
     lines = [f"| {name} | {'-' if value is None else value} |" for name, value in figures(rows).items()]
     return "\n".join(["| figure | value |", "|---|---:|", *lines])

@@ -1,8 +1,8 @@
-"""Surface that stands where it stood and has other colours: a poster, a screen, a painted wall.
+"""Surface that stayed in place and got other colours: a poster, a screen, a painted wall.
 
-Light changes the brightness of surface smoothly; paint changes it where light does not. So the colours of both visits
-are averaged over small cells, which leaves out what a pose that is off by a pixel does, and a gain is fitted to the
-cells around each. What then differs by more than the spread of all cells explains has other colours.
+Light changes brightness smoothly; paint changes it abruptly. The colours of both visits are averaged over small cells,
+which removes errors of a pose that is off by a pixel. A gain is fitted to the cells around each cell. The remaining
+difference marks other colours if it exceeds the spread of all cells.
 """
 
 import numpy as np
@@ -14,25 +14,24 @@ from dudmap.fleet.change_evidence import CONFIRMED, DEVIATIONS, Evidence
 from dudmap.fleet.change_objects import Piece, connected, facing, is_wide
 
 CELL, CELL_VOXELS = 0.05, 4
-"""Edge of the cells in which colours are averaged, metres, and in voxels at least: several pixels."""
+"""Smallest edge of the cells in which colours are averaged, metres and voxels: several pixels."""
 AROUND = 0.6
-"""Radius in which the light is taken to be even, metres; a poster fills less than half of it."""
+"""Radius of constant light, metres; a poster fills less than half of it."""
 LEAST_POINTS, LEAST_AROUND = 6, 12
-"""Vertices of a cell whose colour is compared, and cells around it from which the light is known."""
+"""Fewest vertices of a compared cell, and fewest cells around it that determine the light."""
 LEAST_DIFFERENCE = 20.0
-"""Smallest difference of the colours of a cell, grey levels, as of cells that agree when maps are joined."""
+"""Smallest difference of changed cell colours, grey levels; the limit of agreeing cells in a merge."""
 CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0
-"""What light alone does not do: a difference of the shares of red, green and blue, or a correlation so low of textures
-with at least this standard deviation (grey levels)."""
+"""Changes that light alone does not cause: this difference of the shares of red, green and blue, or a lower correlation
+of textures. Textures have at least this standard deviation (grey levels)."""
 SOLID = 0.7
-"""Share of the surface within the extent of a change that must have other colours: highlights
-are scattered."""
+"""Smallest recoloured share of the surface within a change's extent: highlights are scattered."""
 
 
 def recolored_pieces(
     found: Evidence, voxel_size: float, min_size: float, solid: float = SOLID
 ) -> list[tuple[Piece, float]]:
-    """Pieces of the own mesh with other colours, and the share of their surface that has them."""
+    """Pieces of the own mesh with other colours, and the recoloured share of their surface."""
     known = np.flatnonzero((found.state == CONFIRMED) & (found.other_color.max(axis=1) > 0))
     known = known[found.mesh.colors[known].max(axis=1) > 0]
     if len(known) < LEAST_AROUND * LEAST_POINTS:
@@ -59,7 +58,9 @@ def recolored_pieces(
         is_large = piece.area > min_size**2 and is_wide(piece.points, min_size, min_size)
         rows = found.mesh.colors[piece.vertices].astype(float), found.other_color[piece.vertices].astype(float)
         vertices, cosines = facing(found, piece)
-        is_sharp = np.median(found.blur[vertices] / np.maximum(cosines, 1e-3)) < edge  # pixels on it are smaller
+        is_sharp = (
+            np.median(found.blur[vertices] / np.maximum(cosines, 1e-3)) < edge
+        )  # pixels on it are smaller than a cell
         if share > solid and is_large and is_sharp and _is_paint(*rows, light):
             out.append((piece, float(share)))
     return out
@@ -78,7 +79,7 @@ def _different(centres: NDArray[np.float64], own: NDArray[np.float64], other: ND
 
 
 def _is_paint(own: NDArray[np.float64], other: NDArray[np.float64], light: NDArray[np.float64]) -> bool:
-    """Whether the colours (n, 3) of a piece differ as light, with gains (3,), does not make them."""
+    """Whether colours (n, 3) of a piece differ by more than light with gains (3,) explains."""
     shares = [(colors + 8) / (colors + 8).sum(axis=1, keepdims=True) for colors in (own, other * light)]
     if np.abs(np.median(shares[0], axis=0) - np.median(shares[1], axis=0)).max() > CHROMA:
         return True

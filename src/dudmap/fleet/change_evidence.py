@@ -1,9 +1,11 @@
-"""What two maps of one place say about each other's surface: confirmed, seen through, of another colour, or not seen.
+"""Compare the surface of one map with another map of the same place.
 
-Every vertex of the mesh of one map is looked up in the other one. It is denied where the other map has seen free space,
-farther from its own surface than the noise of both explains: a voxel, and three standard deviations of the local noise.
-That is the larger of the sensor's at the distance of the camera, and of the distances between the two surfaces in the
-same part of the place, which hold the error of the alignment and the bending of the maps as well.
+Every vertex of one mesh is looked up in the other map. It is confirmed, denied, behind a surface, or not seen. A vertex
+is denied if the other map has free space there and no surface within the noise of both maps.
+
+This noise is one voxel plus three standard deviations of the local noise. The local noise is the larger of two: the
+sensor's at the camera's distance, and the spread of the distances between both surfaces nearby. The latter includes
+errors of the alignment and the bending of maps.
 """
 
 from dataclasses import dataclass
@@ -25,38 +27,38 @@ from dudmap.core.places.saved_map import SavedMap
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, MapSamples, sample_map, transformed
 
 UNKNOWN, CONFIRMED, DENIED, BEHIND = 0, 1, 2, 3
-"""State of a vertex: the other map did not see the place; has a surface there; saw free space; or has it behind one."""
+"""State of a vertex in the other map: not seen; on a surface; in free space; behind a surface."""
 DEVIATIONS = 3.0
-"""Standard deviations that noise may reach."""
+"""Standard deviations within which noise explains a distance."""
 MAX_VIEWS, VIEWS = 24, 3
-"""Poses of a visit that are asked what they look through, and how many of them must look through a place."""
+"""Poses of a visit that are rendered; number of them that must look through a place."""
 CELL = 0.5
-"""Edge of the cells in which the noise of the surfaces is measured, metres: the size of furniture."""
+"""Edge of the cells in which the noise between surfaces is estimated, metres: the size of furniture."""
 MIN_CELL_POINTS = 50
-"""Vertices of a cell from which its own noise is taken."""
+"""Fewest vertices of a cell with its own noise estimate."""
 MAX_NOISE = 2.0
-"""Largest local noise, in multiples of that of the whole place: a cell in which most of the surface moved by a little
-must not explain it away."""
+"""Largest local noise in multiples of the noise of the whole place. It limits a cell in which most of the surface
+moved."""
 EDGE_PIXELS = 2.0
-"""Width of a depth edge in pixels, and in voxels: readings there mix both surfaces."""
+"""Width of a depth edge in pixels, and in voxels: measurements there mix both surfaces."""
 READINGS = 2
-"""Readings of emptiness, each of the carving weight, that a place needs to count as seen to be free."""
+"""Observations of emptiness, each of the carving weight, that make a place free."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The surface of one map, judged by the other.
+    """Surface of one map with its state in the other map.
 
     Attributes:
         mesh: Surface in the common frame.
         state: (V,) uint8.
-        gap: (V,) float32, distance to the nearest surface of the other map, metres; 0 where it is within the noise.
+        gap: (V,) float32, distance to the nearest surface of the other map, metres; 0 within the noise.
         tolerance: (V,) distance that noise explains, metres.
-        blur: (V,) width of a depth edge, metres: two pixels of the camera, two voxels at least, and the noise.
-        weight: (V,) float32, of the own map there.
-        min_weight: Weight that the mesh needs.
-        other_color: (V, 3) float32, colour of the other map where it confirms, else 0.
-        cameras: (k, 3) positions of the own camera, metres, common frame.
+        blur: (V,) width of a depth edge, metres: at least two pixels and two voxels, plus the noise.
+        weight: (V,) float32, of the own map.
+        min_weight: Smallest weight of the mesh.
+        other_color: (V, 3) float32, colour of the other map at confirmed vertices, else 0.
+        cameras: (k, 3) camera positions of the own visit, metres, common frame.
     """
 
     mesh: Mesh
@@ -76,7 +78,7 @@ class Evidence:
 
     @cached_property
     def areas(self) -> NDArray[np.float64]:
-        """Surface (V,) that each vertex stands for, square metres."""
+        """Surface area (V,) per vertex, square metres."""
         a, b, c = np.moveaxis(self.points[self.mesh.faces], 1, 0)
         thirds = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
         corners = self.mesh.faces.reshape(-1)
@@ -84,21 +86,21 @@ class Evidence:
 
     @cached_property
     def parts(self) -> NDArray[np.intp]:
-        """Number (V,) of the surface to which each vertex belongs if what the other map confirms is left out."""
+        """Component number (V,) of each vertex in the mesh without confirmed faces."""
         faces = self.mesh.faces[np.all(self.state[self.mesh.faces] != CONFIRMED, axis=1)]
         return components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(self.state))
 
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """A map at its place in the common frame.
+    """A map placed in the common frame.
 
     Attributes:
         volume: The map.
         T_common_map: (4, 4).
         mesh: Its surface in the common frame.
         keyframes: (k, 4, 4) poses of its keyframes in the common frame.
-        views: (n, 4, 4) some poses of the camera all along the visit, in the common frame.
+        views: (n, 4, 4) camera poses spread over the visit, in the common frame.
     """
 
     volume: TsdfVolume
@@ -109,11 +111,11 @@ class Visit:
 
     @classmethod
     def of(cls, saved: SavedMap, T_common_map: NDArray[np.float64]) -> "Visit":
-        """A saved map at a pose (4, 4).
+        """Place a saved map at a pose (4, 4).
 
         Raises:
             MapError: The map is empty.
-            DatasetError: The trajectory beside it is damaged.
+            DatasetError: The trajectory in the folder of the map is damaged.
         """
         mesh, (R, t) = saved.volume.extract_mesh(), (T_common_map[:3, :3], T_common_map[:3, 3])
         vertices = (mesh.vertices.astype(np.float64) @ R.T + t).astype(np.float32)
@@ -126,12 +128,12 @@ class Visit:
         return cls(saved.volume, T_common_map, moved, keyframes, views[chosen])
 
     def sample(self, points: NDArray[np.float64]) -> MapSamples:
-        """The map at points (n, 3) of the common frame."""
+        """Sample the map at points (n, 3) of the common frame."""
         return sample_map(self.volume, transformed(se3.inverse(self.T_common_map), points))
 
 
 def evidence(own: Visit, other: Visit) -> Evidence:
-    """Judge the surface of a visit by the other one."""
+    """Compare the surface of a visit with the map of the other."""
     points = own.mesh.vertices.astype(np.float64)
     samples, band = other.sample(points), other.volume.truncation
     sdf = np.where(samples.state == OBSERVED, samples.sdf, np.where(samples.state == EMPTY, band, np.nan))
@@ -159,10 +161,10 @@ def evidence(own: Visit, other: Visit) -> Evidence:
 
 
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
-    """How many views (n,) of a visit look through points (n, 3) of the common frame at a surface behind them.
+    """Number of views (n,) of a visit that look through points (n, 3) of the common frame at a surface behind them.
 
-    The map remembers free space block by block, and not where a part of a block is hidden. What a view sees of the
-    map is behind space that it saw to be free, farther than a margin (n,), metres, also beside the pixel.
+    The surface must lie farther than twice a margin (n,), metres, behind the point, in the pixel and its neighbours.
+    Views are rendered because the map stores free space per block and not where part of a block is hidden.
     """
     import cv2
 
@@ -184,16 +186,18 @@ def components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
 
 
 def surface_tree(points: NDArray[np.floating]) -> KDTree:
-    """Tree of many points (n, 3) that are spread over surfaces, built in a third of the time of a balanced one."""
+    """Unbalanced tree of surface points (n, 3), built in a third of the time of a balanced one."""
     return KDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3), in the unit of these.
+    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3), in the unit of the
+    distances.
 
-    It is 1.48 times the median of the absolute distances below a limit (n,) in a cell, and at least that of all.
+    It is 1.48 times the median absolute distance below a limit (n,) in a cell, and at least that value for the whole
+    place.
     """
     near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
     if not near.any():

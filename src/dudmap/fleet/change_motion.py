@@ -1,11 +1,12 @@
-"""Whether a thing that is missing in one place is the one that is new in another: the motion between two surfaces.
+"""Find the motion of a thing between two visits: from a missing surface in one map to a new surface in the other.
 
-Motions that bring a point onto one of like colour and slope, turned about the vertical, are refined by the iterative
-closest point method, in both directions: to planes (Chen and Medioni 1992), by the intensities along the surface (Park
-et al. 2017), points near those of like colours (Johnson and Kang 1997). What stands before and after is tilted little.
-The motion is the one with the highest score of close surface with like colours, less what it would leave hanging in
-seen free space. Others that are not worse by more than chance make it ambiguous; what points and their noise leave open
-are its standard deviations.
+Start motions bring a point onto a point of similar colour and slope, with a turn about the vertical. ICP refines them
+in both directions, by point-to-plane distances (Chen and Medioni 1992) and by intensities along the surface (Park et
+al. 2017). Neighbours are searched by position and colour (Johnson and Kang 1997). A prior keeps the tilt small.
+
+The score of a motion is the close surface with similar colours minus the surface that it moves into free space. The
+highest score wins. Motions that are not significantly worse make it ambiguous. The standard deviations follow from the
+matched points and their noise.
 """
 
 from dataclasses import dataclass, replace
@@ -23,57 +24,57 @@ from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS = 20_000, 1000
-"""Pairs of points that are drawn, and those of a like colour and slope that give a motion."""
+"""Random pairs of points; start motions taken from the pairs of similar colour and slope."""
 RANKED, COARSE, FINE = 60, 300, 1500
-"""Points of a surface when starts are ranked, in the first registration, and in the last one and when it is judged."""
+"""Surface points for ranking starts, for the coarse registration, and for the fine registration and its score."""
 TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
-"""Starts that are registered and motions that are registered once more; those that differ less are one (m, degrees)."""
+"""Starts registered coarsely; motions registered finely; motions closer than this are one motion (m, degrees)."""
 ICP_ROUNDS, STOP = 20, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
 TILT = np.radians(0.3)
-"""Standard deviation of the tilt of what stands before and after: of level surfaces in a map, and of its bending."""
+"""Standard deviation of the tilt of a thing between two visits, from level surfaces in maps and their bending, radians.
+"""
 FACE = 0.1
-"""Edge of the patches whose points count as one when a motion is estimated: calibration, views from one side and the
-bending of the map shift whole faces, metres."""
+"""Edge of the patches that count as one measurement each, metres. Errors of calibration and map shift whole faces."""
 PATCH, DEVIATIONS_APART = 0.05, 2.0
-"""Edge of the patches whose scores are taken to be independent, metres, and standard errors by which their sum is
-worse by more than chance."""
+"""Edge of the patches whose scores are assumed independent, metres. Standard errors by which a worse sum is
+significant."""
 COLOR_LENGTH = 0.3
-"""Length that counts as much as the difference of black and white when the nearest point is looked for (Johnson and
-Kang 1997), in sizes of the thing."""
+"""Length equivalent to black minus white in the neighbour search (Johnson and Kang 1997), as a share of
+the size of the thing."""
 COLOR_GATE = 50.0
-"""Difference of colours at which points do not meet, grey levels."""
+"""Largest colour difference of matched points, grey levels."""
 COLOR_SCALE = 15.0
-"""Difference of colours at which the Cauchy weight of two points that meet falls to a half, grey levels."""
+"""Colour difference at which the Cauchy weight of a match falls to one half, grey levels."""
 PULL = 0.05
-"""Weight of the distance to a point against that to its plane: holds flat surfaces from sliding."""
+"""Weight of the point-to-point distance relative to point-to-plane: it keeps flat surfaces from sliding."""
 NEIGHBOURS = 12
-"""Points from which the gradient of the intensities along a surface is taken."""
+"""Points from which the gradient of the intensity along a surface is estimated."""
 DEVIATIONS, LEAST_NOISE = (2.0, 3.0), (1e-3, 4.0)
-"""Standard deviations at which the Geman-McClure weights of distances and intensities fall to a quarter, and the least
-that is assumed of each (m, grey levels)."""
+"""Residuals, in standard deviations, at which Geman-McClure weights fall to a quarter, for distances and intensities.
+Smallest standard deviations assumed (m, grey levels)."""
 LIGHT, DAMPING = 0.2, 0.02
-"""Difference of the logarithms of intensities at which the weight falls to a quarter when the light is fitted, and the
-weight of its direction per point."""
+"""Difference of log intensities at which the weight in the fit of the light falls to a quarter. Damping of the light's
+direction per point."""
 MIN_POINTS = 60
-"""Points on the other's surface below which the motion is not determined."""
+"""Fewest matched points that determine a motion."""
 LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
-"""Shares of the surface that must lie on the other's: of what would else hang in free space, and of the larger of both
-surfaces; and of the former that must be explained: what has other colours or another shape meets by chance."""
+"""Smallest shares of matched surface: of the surface that matches or lies in free space, and of the larger body.
+Smallest explained share of the former, because other shapes or colours also match by chance."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
-"""Largest median difference in one light of the colours of a thing without texture, grey levels, and of the shares of
-red, green and blue."""
+"""Largest median colour difference of an untextured thing under one light, grey levels. Largest difference of the
+shares of red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
-"""Standard deviation of the intensities, grey levels, from which on they are a texture, and the least correlation of
-two that are one: things of one make have the same texture, any others have about none."""
+"""Standard deviation of intensities above which a surface has texture, grey levels. Smallest correlation of equal
+textures; things of one make share a texture, others hardly correlate."""
 FLAT = 0.05
-"""Mean square of the normals of what meets across its two main directions, or of a flat face, from which on it is not
-known to be the same face."""
+"""Second eigenvalue of the mean outer product of normals below which the matched points are one flat face. One flat
+face may resemble another."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Surface of a thing in one map: what the other map denies, and what is beside it or belongs to it.
+    """Surface of a thing in one map: the part that the other map denies, and its surroundings.
 
     Attributes:
         points, normals: (n, 3) float64, common frame.
@@ -90,8 +91,8 @@ class Body:
 
     @classmethod
     def of(cls, found: Evidence, piece: Piece) -> "Body":
-        """The surface in the box of a piece; and its length beside it what hangs together with it and the other map
-        does not confirm: it may be hidden there."""
+        """Surface in the box of a piece, and connected points within one piece length that may be hidden in the other
+        map."""
         points, margin = found.points, float(np.median(found.tolerance[piece.vertices]))
 
         def within(far: float) -> NDArray[np.bool_]:
@@ -106,7 +107,7 @@ class Body:
 
     @cached_property
     def tree(self) -> KDTree:
-        """Of the points."""
+        """Tree of the points."""
         return KDTree(self.points)
 
     @cached_property
@@ -125,11 +126,11 @@ class Body:
         return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], np.float64)
 
     def chosen(self, rows: NDArray) -> "Body":
-        """Some of the points."""
+        """Select points."""
         return Body(self.points[rows], self.normals[rows], self.colors[rows], self.denied[rows], self.tolerance)
 
     def sample(self, count: int) -> "Body":
-        """At most so many points."""
+        """Select at most ``count`` random points."""
         if len(self.points) <= count:
             return self
         return self.chosen(np.sort(np.random.default_rng(1).choice(len(self.points), count, replace=False)))
@@ -141,12 +142,12 @@ class Motion:
 
     Attributes:
         T_after_before: (4, 4), common frame.
-        fit: Share of the surface that fits, of what must.
-        explained: Vertices of both surfaces that the motion explains, less those that it leaves in free space.
-        scores: (n,) the same of patches of the surfaces.
-        is_likely: Whether both surfaces can be those of one thing.
-        ambiguous: Why another motion is as likely, None if there is none.
-        sigma: Standard deviations of where it brings the middle of the thing (m), and of the turn (rad).
+        fit: Matched share of the surface that matches or lies in free space.
+        explained: Vertices of both surfaces that the motion explains minus vertices that it moves into free space.
+        scores: (n,) ``explained`` per patch of the surfaces.
+        is_likely: Whether both surfaces may belong to one thing.
+        ambiguous: Why another motion is equally likely, else None.
+        sigma: Standard deviations of the position of the thing's centre (m) and of the rotation (rad).
     """
 
     T_after_before: Array
@@ -158,15 +159,15 @@ class Motion:
     sigma: tuple[float, float] = (np.inf, np.inf)
 
     def is_worse(self, best: "Motion") -> bool:
-        """Whether it explains less than the best motion by more than chance (a paired t-test of the patches)."""
+        """Whether it explains significantly less than the best motion (paired t-test over patches)."""
         less = best.scores - self.scores
         return bool(less.sum() > DEVIATIONS_APART * np.sqrt(len(less)) * less.std())
 
 
 def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
-    """The motion that brings the missing surface to the new one, None if they are not one thing.
+    """Find the motion from the missing to the new surface; None if they are not one thing.
 
-    ``up`` (3,) is the direction about which things turn that stand before and after.
+    ``up`` (3,) is the vertical, about which upright things turn.
     """
     coarse, fine = (_Meeting((after, before), (missing, new), up, count) for count in (COARSE, FINE))
 
@@ -190,13 +191,13 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
 
 
 class _Meeting:
-    """Points of two bodies that lie on each other after a motion from the first to the second.
+    """Matched points of two bodies under a motion from the first to the second.
 
     Args:
-        there: The visits to which the motion, and its inverse, bring the surfaces.
+        there: Visits into which the motion, and its inverse, move the surfaces.
         bodies: The bodies.
-        up: (3,) direction about which things turn.
-        count: Points of the denied surface of each that are looked for on the other, at most.
+        up: (3,) axis about which things turn.
+        count: Most points of each denied surface that are matched.
     """
 
     def __init__(self, there: tuple[Visit, Visit], bodies: tuple[Body, Body], up: Array, count: int) -> None:
@@ -214,8 +215,11 @@ class _Meeting:
         self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
 
     def starts(self) -> list[Array]:
-        """Motions (4, 4) that bring a point of a onto one of b with a like colour: the turn about the vertical is that
-        between their normals, and any where these are vertical; those first that bring most points near others."""
+        """Candidate motions (4, 4), by decreasing number of points with a neighbour.
+
+        Each brings a point of the first body onto one of the second with a similar colour. The turn about the vertical
+        aligns their normals; it is random for vertical normals.
+        """
         (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()
         gate = max(0.1 * self.size, 3 * self.gate)
         rows, columns = rng.integers(len(a.points), size=PAIRS), rng.integers(len(b.points), size=PAIRS)
@@ -241,7 +245,7 @@ class _Meeting:
         return [out[n] for n in np.argsort(-scores, kind="stable")]
 
     def different(self, poses: list[Array], distance: float, angle_deg: float) -> list[Array]:
-        """The first of all motions (4, 4) that bring the middle of the thing to about the same place."""
+        """Motions (4, 4) without later ones that bring the centre of the thing to about the same pose."""
         centre, kept = np.eye(4), list[Array]()
         centre[:3, 3] = self.sources[0].points.mean(axis=0)
         for T in poses:
@@ -250,7 +254,7 @@ class _Meeting:
         return kept
 
     def registered(self, T: Array, gate: float) -> Array:
-        """A motion (4, 4) after the iterative closest point method, whose gate (m) shrinks."""
+        """Refine a motion (4, 4) by ICP with a shrinking gate (m)."""
         for _ in range(ICP_ROUNDS):
             pairs = self._pairs(T, max(gate, self.gate))
             if len(pairs.moved) < 10:
@@ -263,14 +267,14 @@ class _Meeting:
         return T
 
     def sigma(self, T: Array) -> tuple[float, float]:
-        """Standard deviations of a motion (4, 4): of the middle of what meets (m), and of the turn (rad)."""
+        """Standard deviations of a motion (4, 4): of the centre of the matched points (m) and of the rotation (rad)."""
         pairs, about = self._pairs(T, self.gate), np.eye(6)
         about[:3, 3:] = se3.hat(pairs.moved.mean(axis=0))
         variances = np.diag(np.linalg.inv(about.T @ self._normal_equations(pairs, T)[0] @ about))
         return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
 
     def _pairs(self, T: Array, gate: float) -> "_Pairs":
-        """What meets within a gate (m) after a motion (4, 4)."""
+        """Match points within a gate (m) under a motion (4, 4), in both directions."""
         rows = []
         for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
@@ -286,7 +290,7 @@ class _Meeting:
         return _Pairs(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
     def _normal_equations(self, pairs: "_Pairs", T: Array) -> tuple[Array, Array]:
-        """Those of a left twist of a motion (4, 4): of what meets, and of its tilt, unless it is large."""
+        """Normal equations for a left twist of a motion (4, 4), from matches and a robust prior on the tilt."""
         H, g = pairs.normal_equations()
         tilt, level = np.cross(self.up, T[:3, :3] @ self.up), np.eye(3) - np.outer(self.up, self.up)
         weight = np.square(1 / TILT / (1 + np.square(np.linalg.norm(tilt) / (DEVIATIONS[0] * TILT))))
@@ -295,7 +299,7 @@ class _Meeting:
         return H, g
 
     def judged(self, T: Array) -> Motion | None:
-        """The motion ``T`` (4, 4) with what it explains, None if nothing meets."""
+        """Score the motion ``T`` (4, 4); None if hardly a point matches."""
         rows = []
         for own, other, there, T_own in zip(self.sources, self.others, self.there, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
@@ -324,8 +328,8 @@ class _Meeting:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Moved points (n, 3) of one surface and their intensities (n,), and the points that they meet on the other with
-    its normals, intensities and the gradients of these."""
+    """Moved points (n, 3) of one surface and their intensities (n,); matched points on the other surface with normals,
+    intensities and intensity gradients."""
 
     moved: Array
     mine: Array
@@ -335,8 +339,10 @@ class _Pairs:
     slopes: Array
 
     def normal_equations(self) -> tuple[Array, Array]:
-        """Matrix (6, 6) and gradient (6,) for the twist that brings the points to the planes through the others, to
-        their intensities, both with Geman-McClure weights and by their noise, and a little to the points."""
+        """Matrix (6, 6) and gradient (6,) for the left twist that aligns the matches.
+
+        Terms: point to plane and intensity, with Geman-McClure weights scaled by their noise, and weak point to point.
+        """
         off, H, g = self.moved - self.points, 1e-9 * np.eye(6), np.zeros(6)
         share = len(np.unique(np.floor(self.moved / FACE), axis=0)) / len(self.moved)
         shade = self.shades + (off * self.slopes).sum(axis=1) - _gains(self.mine, self.shades, self.normals) * self.mine
@@ -355,8 +361,10 @@ class _Pairs:
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
-    """Gains (n,) from the intensities (n,) of a surface in one light to those in another: their logarithm is linear in
-    the normals (n, 3), as light from afar is about (Basri and Jacobs 2003)."""
+    """Gains (n,) from intensities (n,) under one light to intensities under another.
+
+    Their logarithm is linear in the normals (n, 3), as for distant light (Basri and Jacobs 2003).
+    """
     A, y = np.hstack([np.ones((len(mine), 1)), normals]), np.log((theirs + 8) / (mine + 8))
     x, damping = np.array([np.median(y), 0, 0, 0]), DAMPING * len(y) * np.diag([0, 1.0, 1, 1])
     for _ in range(3):
@@ -366,8 +374,10 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
 
 
 def _alike(mine: Array, theirs: Array, patches: NDArray[np.intp]) -> bool:
-    """Whether colours (n, 3) of two surfaces in one light are those of one thing, in the mean of patches (n,): finer
-    texture is lost far off."""
+    """Whether two surfaces under one light have the colours of one thing.
+
+    Colours (n, 3) are averaged over patches (n,), because fine texture is lost at a distance.
+    """
     patches, counts = np.unique(patches, return_inverse=True, return_counts=True)[1:]
     mine, theirs = (
         np.stack([np.bincount(patches, x) for x in colors.T], axis=1) / counts[:, None] for colors in (mine, theirs)

@@ -1,4 +1,4 @@
-"""From denied surface to things: connected pieces, which of them moved, which came, went, or got other colours."""
+"""Group denied surface into things, and select the certain and recoloured ones."""
 
 from dataclasses import dataclass
 
@@ -11,20 +11,21 @@ from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, com
 LINK = 4.0
 """Gap between pieces of one thing, voxels."""
 REACH = 0.5
-"""The same where no free space was seen between them, in lengths of the larger piece."""
+"""Gap between parts of one thing without observed free space between them, in lengths of the larger piece."""
 SLIM, OUTLINE = 0.5, 1.1
-"""Largest width of a leg in its heights, and the factor by which the outline of what was seen of a thing is widened."""
+"""Largest width of a leg relative to its height; factor that widens the observed outline of a thing."""
 LEAST_FACE = 0.3
-"""Area of a change in squares of the smallest size that is looked for; a cube shows one of its faces, partly."""
+"""Smallest area of a change in squares of the smallest size, because a cube may show part of one face."""
 LEAST_FACING = 0.1
-"""Median cosine of the angle at which a keyframe sees the surface of a change: what floats at depth edges has none."""
+"""Smallest median cosine between the normals of a change and the best keyframe's ray; artefacts at depth edges fall
+below."""
 LEAST_COVER = 0.125
-"""Share of the larger face of its box that the surface of a change fills: fragments at depth edges are scattered."""
+"""Smallest share of the larger face of its box that a change fills: fragments at depth edges are scattered."""
 CLEAR = 2.0
-"""Median gap between a change and any surface of the other map, in what noise explains: a map that is bent shifts
-surface by more than the noise, not by a multiple of it."""
+"""Smallest median gap between a change and the other surface, in noise tolerances. A bent map shifts surface by less.
+"""
 CERTAIN = 3
-"""A change is certain if half of its surface has this multiple of the weight that a mesh needs, the other half less."""
+"""A change is certain if its median weight is this multiple of the smallest weight of the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +54,17 @@ class Piece:
 
 
 def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
-    """Pieces of surface that the other map denies beyond the noise, the largest first, the smallest left out."""
+    """Pieces of surface that the other map denies beyond the noise, the largest first, without small ones."""
     pieces = connected(found, opened(found, found.state == DENIED), LINK * voxel_size)
     return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
 def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[Piece]:
-    """Pieces, the largest first, joined with smaller ones between which their own visit saw no free space (something
-    stood before the middle of one thing), and with their legs: these are seen as thin as a pixel."""
+    """Join pieces with their smaller parts and legs; return the largest first.
+
+    A part has no observed free space between it and the piece, because another thing occluded its middle. Legs are seen
+    as thin as a pixel.
+    """
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
         for n in reversed(range(len(out))):
@@ -71,12 +75,12 @@ def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[
 
 
 def is_part(piece: Piece, thing: Piece, own: Visit) -> bool:
-    """Whether a piece may be a part of a larger one: it is near, and its visit saw no free space between."""
+    """Whether a piece may be part of a larger one: it is near, and its visit saw no free space between them."""
     return gap_between(thing, piece) < REACH * thing.length and is_hidden_between(thing, piece, own)
 
 
 def carries(piece: Piece, thing: Piece, up: NDArray[np.float64]) -> bool:
-    """Whether a piece is a leg of a thing: a slim column that stands within its outline, seen along ``up`` (3,)."""
+    """Whether a piece is a leg of a thing: a slim column within its outline, seen along ``up`` (3,)."""
     across = np.linalg.svd(up[None])[2][1:].T
     leg, outline = piece.points @ across, thing.points[:: max(1, len(thing.points) // 2000)] @ across
     height = np.ptp(np.percentile(piece.points @ up, [2, 98]))
@@ -88,7 +92,7 @@ def carries(piece: Piece, thing: Piece, up: NDArray[np.float64]) -> bool:
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
-    """Whether the visit of two pieces saw no free space on half of the shortest ways from one to the other."""
+    """Whether the visit saw no free space on half of the shortest lines between two pieces."""
     some, steps = b.points[:: max(1, len(b.points) // 200)], np.linspace(0, 1, 20)[:, None]
     gap, near = KDTree(a.points).query(some)
     ways = np.argsort(gap)[: max(5, len(some) // 5)]
@@ -98,7 +102,7 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
-    """Whether a piece is large enough, wider than the depth edges there, and was seen often enough, from its front."""
+    """Whether a piece is large, wider than depth edges, and seen often enough from the front."""
     if np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
         return False
     if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
@@ -111,8 +115,7 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
 
 
 def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Some vertices (n,) of a piece and the cosine (n,) of the angle at which some view sees each best; negative from
-    behind."""
+    """Some vertices (n,) of a piece, and the cosine (n,) of its best viewing angle; negative from behind."""
     vertices = piece.vertices[:: max(1, len(piece.vertices) // 500)]
     rays = found.cameras[:, None] - found.points[vertices]
     cosines = (rays * found.mesh.normals[vertices]).sum(axis=2) / np.linalg.norm(rays, axis=2)
@@ -120,7 +123,7 @@ def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
-    """Whether points (n, 3) extend so far (m) along the first two of their principal axes."""
+    """Whether points (n, 3) extend beyond a length and a width (m) along their first two principal axes."""
     points = points[:: max(1, len(points) // 2000)]
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     low, high = np.percentile(points @ axes.T, [2, 98], axis=0)
@@ -129,7 +132,7 @@ def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
 
 
 def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Flagged vertices (V,) that are not, nor hang on, the blurred edge of surface that the other map confirms."""
+    """Remove flagged vertices (V,) on the blurred edge of confirmed surface; vertices near the remaining core stay."""
     numbers, points = np.flatnonzero(flagged), found.points
     against = (found.state == CONFIRMED) & ~flagged
     if len(numbers):
@@ -148,7 +151,7 @@ def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def connected(found: Evidence, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
-    """Groups of chosen vertices (V,) that are at most about a gap (m) from each other, the largest first."""
+    """Groups of chosen vertices (V,) with gaps of about at most ``gap`` (m), the largest first."""
     numbers, points = np.flatnonzero(chosen), found.points[chosen]
     if len(numbers) == 0:
         return []
@@ -160,13 +163,13 @@ def connected(found: Evidence, chosen: NDArray[np.bool_], gap: float) -> list[Pi
 
 
 def gap_between(a: Piece, b: Piece) -> float:
-    """Distance of the nearest points of two pieces, metres; that of their boxes if it is large."""
+    """Distance of the nearest points of two pieces, metres; the distance of their boxes if it exceeds 1 m."""
     apart = float(np.linalg.norm(np.maximum(np.maximum(a.box[0] - b.box[1], b.box[0] - a.box[1]), 0)))
     return apart if apart > 1 else float(KDTree(a.points).query(b.points)[0].min())
 
 
 def joined(pieces: list[Piece]) -> Piece:
-    """Pieces of one mesh as one."""
+    """Join pieces of one mesh."""
     return Piece(
         np.concatenate([piece.vertices for piece in pieces]), np.concatenate([piece.points for piece in pieces]),
         sum(piece.area for piece in pieces),

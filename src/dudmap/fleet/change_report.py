@@ -1,4 +1,4 @@
-"""The page on what changed: both maps in 3D with the changes in colours, and each change before and after."""
+"""Page of changes: both maps in 3D with tinted changes, and pictures of each change before and after."""
 
 import base64
 from collections.abc import Sequence
@@ -18,17 +18,17 @@ from dudmap.fleet.changes import Change
 TINTS = {
     "appeared": (60, 200, 90), "disappeared": (230, 60, 60), "moved": (60, 130, 255), "recoloured": (220, 120, 230),
 }  # fmt: skip
-"""Colour of each kind; what is unknown keeps its own."""
+"""Colour of each kind; unknown surface keeps its own."""
 STRENGTH = 0.65
-"""Share of it in the colour of changed surface."""
+"""Share of the tint in the colour of changed surface."""
 TRIANGLES = 120_000
-"""Triangles of each map in the page."""
+"""Most triangles of each map in the page."""
 PICTURES = 40
-"""Changes with pictures."""
+"""Most changes with pictures."""
 
 
 def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:
-    """The mesh of a visit, "before" or "after", with what changed in the colour of its kind."""
+    """Mesh of a visit ("before" or "after") with changes tinted by kind."""
     colors = mesh.colors.astype(np.float64)
     for change in changes:
         piece = getattr(change, side)
@@ -41,7 +41,7 @@ def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:
 def change_page(
     tree: dict[str, Any], meshes: Sequence[Mesh], visits: Sequence[Visit], poses: Sequence[NDArray[np.float64] | None]
 ) -> str:
-    """HTML text of the page; a change is pictured from a pose (4, 4) in the common frame, if there is one."""
+    """HTML text of the page. A change is rendered from its pose (4, 4) in the common frame, if it has one."""
     data, texts = [], []
     for mesh in meshes:
         about, text = packed(simplified(mesh, TRIANGLES))
@@ -74,7 +74,7 @@ def change_page(
 
 
 def motion_and_confidence(row: dict[str, Any]) -> str:
-    """Text on how far a thing moved, if it did, and the confidence."""
+    """Text on the motion of a thing, if it moved, and the confidence."""
     moved = ""
     if "distance" in row:
         moved = f", moved by {100 * row['distance']:.1f} ± {100 * row['distance_sigma']:.1f} cm"
@@ -84,7 +84,6 @@ def motion_and_confidence(row: dict[str, Any]) -> str:
 
 
 def _pictures(row: dict[str, Any], visits: Sequence[Visit], T: NDArray[np.float64]) -> Html:
-    """Both maps seen from one pose."""
     shown = []
     for name, visit in zip(("before", "after"), visits, strict=True):
         camera = visit.volume.camera.resized(

@@ -1,4 +1,4 @@
-"""Changes against the map of an earlier visit while a run goes on in it, as soon as they are certain."""
+"""Report changes against the map of an earlier visit during a run."""
 
 import json
 from pathlib import Path
@@ -26,21 +26,20 @@ WATCH_FILE = "changes.jsonl"
 CELL = 0.05
 """Edge of the cells in which evidence is counted, metres."""
 COLUMNS = 80
-"""Readings of a row of the image that are looked at."""
+"""Pixels per image row that are compared."""
 FRAMES, SECONDS = 6, 0.75
-"""Frames that must show a change in a cell, more than show the opposite, and the time that they
-must span: who walks through does not stay that long in one cell."""
+"""Frames for a change, minus frames against it, and the time they must span. The time excludes passers-by."""
 LEAST_CELLS = 3.0
-"""Cells of a change that is reported, in multiples of the cells of a face of the smallest size."""
+"""Smallest reported change in cells, in multiples of the cells on a face of the smallest size."""
 KINDS = ("appeared", "disappeared")
 
 
 class _Cells:
-    """Frames for and against a change in cells, by their centres (n, 3): what free space is asked for grows as it goes.
+    """Frames for and against a change in cells; cells are added on demand.
 
     Attributes:
         codes: (n,) int64 Morton codes, ascending.
-        score: (n,) frames for a change, less those against it.
+        score: (n,) frames for a change minus frames against it.
         first, last: (n,) seconds.
         reported: (n,) bool.
     """
@@ -51,7 +50,7 @@ class _Cells:
         self.reported = np.zeros(n, bool)
 
     def rows_of(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Rows of the cells of points (n, 3), which are added where they are new."""
+        """Rows of the cells of points (n, 3); new cells are added."""
         codes = np.unique(morton.encode(np.floor(points / CELL).astype(np.int64)))
         new = np.setdiff1d(codes, self.codes, assume_unique=True)
         if len(new):
@@ -62,26 +61,26 @@ class _Cells:
         return np.searchsorted(self.codes, codes)
 
     def count(self, rows: NDArray[np.intp], gain: int, now: float) -> None:
-        """One frame for (1) or against (-1) a change in some cells."""
+        """Count one frame for (1) or against (-1) a change in cells."""
         fresh = rows[self.score[rows] <= 0]
         self.first[fresh], self.last[rows] = now, now
         self.score[rows] = np.maximum(self.score[rows] + gain, 0)
 
     def certain(self) -> NDArray[np.intp]:
-        """Rows of the cells that are certain and not yet reported."""
+        """Rows of the cells that are certain and not reported."""
         return np.flatnonzero((self.score >= FRAMES) & (self.last - self.first >= SECONDS) & ~self.reported)
 
 
 class ChangeWatch(RunObserver):
     """Writes changes.jsonl into the run folder: an object per change with id, kind, box, centre, timestamp and frame.
 
-    One half of the frames asks for new surface in space that the earlier map saw free, the other for its surface that
-    a frame looks through. A change that later frames deny is written once more,
-    with the kind "withdrawn". ``event`` of the other observers is told each as "change".
+    Even frames search new surface in the earlier map's free space. Odd frames search surface of the earlier map that
+    the frame looks through. A change that later frames deny is written again with the kind "withdrawn". Each is passed
+    to ``event`` of the other observers as "change".
 
     Args:
-        before: The map of the earlier visit, which must not be the one that the run changes.
-        others: Observers that are told.
+        before: Map of the earlier visit; it must not be the map that the run updates.
+        others: Observers that receive the events.
         min_size: Edge of the smallest thing, metres.
     """
 
@@ -109,12 +108,12 @@ class ChangeWatch(RunObserver):
         return {"appeared": _Cells(np.empty(0, np.int64)), "disappeared": _Cells(self._codes)}
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """A frame was read and processed."""
+        """Observe a processed frame."""
         if isinstance(read.frame, Frame):
             self.look(index, read.frame, result)
 
     def look(self, index: int, frame: Frame, result: "FrameResult") -> None:
-        """Count what a frame shows, if it was tracked, and report what has become certain."""
+        """Count the evidence of a tracked frame, and report changes that are now certain."""
         T = result.T_world_camera
         if T is None or result.submap != 0 or result.state != "tracked":
             return
@@ -125,7 +124,7 @@ class ChangeWatch(RunObserver):
             self._report(kind, index, frame.timestamp)
 
     def finish(self, out: Path) -> None:
-        """End the file."""
+        """Close the file."""
         self._close()
 
     def _close(self) -> None:
@@ -158,8 +157,10 @@ class ChangeWatch(RunObserver):
     def _looked_at(
         self, points: NDArray[np.float64], depth: NDArray[np.float32], T: NDArray[np.float64]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows of the points (n, 3) behind which a depth image from a pose (4, 4) sees a surface, also beside the
-        pixel, and of those on which it sees one."""
+        """Rows of the points (n, 3) that a depth image from a pose (4, 4) looks through, and of points on its surface.
+
+        A point is looked through if the pixel and its neighbours see a surface behind it.
+        """
         assert self._slam is not None
         camera, local = self._slam.camera, transformed(se3.inverse(T), points)
         ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
@@ -177,7 +178,7 @@ class ChangeWatch(RunObserver):
         return 2 * self.volume.voxel_size + DEVIATIONS * sensor.sigma(z)
 
     def _report(self, kind: str, index: int, now: float) -> None:
-        """Write the groups of certain cells that are large enough."""
+        """Report groups of certain cells that are large enough."""
         cells = self._cells[kind]
         rows = cells.certain()
         wanted = LEAST_CELLS * (self.min_size / CELL) ** 2
@@ -200,7 +201,7 @@ class ChangeWatch(RunObserver):
             self._tell(row)
 
     def _withdraw(self, kind: str, index: int, now: float) -> None:
-        """Withdraw reported changes, most of whose cells later frames deny."""
+        """Withdraw reported changes if later frames deny most of their cells."""
         cells = self._cells[kind]
         for row in [row for row in self.reported if row["kind"] == kind]:
             rows = np.searchsorted(cells.codes, self._members[row["id"]])
@@ -216,7 +217,7 @@ class ChangeWatch(RunObserver):
             observer.event("change", **row)
 
     def _is_known(self, kind: str, box: NDArray[np.float64]) -> bool:
-        """Whether a box touches a change of the same kind that was reported: more of the same thing came into view."""
+        """Whether a box touches a reported change of its kind, as more of one thing coming into view."""
         boxes = [np.array(row["box"]) for row in self.reported if row["kind"] == kind]
         return any(np.all((box[0] < b[1] + 2 * CELL) & (b[0] - 2 * CELL < box[1])) for b in boxes)
 

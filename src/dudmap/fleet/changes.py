@@ -1,4 +1,4 @@
-"""What changed between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
+"""Changes between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,20 +28,20 @@ from dudmap.io.exporting.gravity import Floor, fitted, floor_height, level_norma
 
 Array = NDArray[np.float64]
 ON_SURFACE = 0.02
-"""Gap to a change beside which other colours are those that it has left at the border, metres."""
+"""Gap to a change, metres, within which other colours are its residue at the border."""
 LEAST_UNKNOWN = 0.25
-"""Surface of a part of the place that only one visit saw, square metres, from which on it is listed."""
+"""Smallest surface seen by only one visit that is listed, square metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A thing that changed, in the frame of the visit before.
+    """A changed thing, in the frame of the earlier visit.
 
     Attributes:
-        kind: appeared, disappeared, moved, recoloured, or unknown: surface that only one visit saw.
-        before, after: Its surface in either visit, None if it is not there.
+        kind: appeared, disappeared, moved, recoloured, or unknown (surface that only one visit saw).
+        before, after: Its surface in either visit, None if it is absent.
         confidence: 0..1, share of its surface that agrees with its kind.
-        motion: Of what moved.
+        motion: Its motion, if it moved.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class Change:
 
     @property
     def points(self) -> Array:
-        """Surface (n, 3) where it is now, or was if it is gone, metres."""
+        """Present surface (n, 3), or the former surface of a thing that is gone, metres."""
         piece = self.after if self.after is not None else self.before
         assert piece is not None
         return piece.points
@@ -63,7 +63,7 @@ class Change:
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
 
     def tree(self) -> dict[str, Any]:
-        """For a JSON file."""
+        """Values for a JSON file."""
         box, area = self.box, max(piece.area for piece in (self.before, self.after) if piece is not None)
         out: dict[str, Any] = {
             "kind": self.kind, "centre": box.mean(axis=0).round(4).tolist(), "box": box.round(4).tolist(),
@@ -86,7 +86,10 @@ class Change:
 
 
 def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[list[Change], tuple[Evidence, Evidence]]:
-    """All changes of at least a size (m), the largest first, then what is unknown; and the evidence of both visits."""
+    """Find all changes of at least ``min_size`` (m), the largest first, then unknown surface.
+
+    Also returns the evidence of both visits.
+    """
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
     missing, new = (denied_pieces(one, voxel, min_size) for one in found)
@@ -97,13 +100,13 @@ def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[li
             sides = (piece, None) if kind == "disappeared" else (None, piece)
             out.append(Change(kind, *sides, _confidence(piece, one)))
     painted = [recolored_pieces(one, voxel, min_size, solid) for one, solid in zip(found, (0.0, SOLID), strict=True)]
-    for piece, share in painted[1]:  # both visits must say so: their meshes have other vertices and other edges
+    for piece, share in painted[1]:  # both visits must agree, because their meshes have different vertices and edges
         touched = [part for change in out for part in (change.before, change.after) if part is not None]
         touches = [
             any(gap_between(piece, other) < ON_SURFACE + voxel for other in others)
             for others in ([other for other, _ in painted[0]], touched)
         ]
-        if touches == [True, False]:  # what stood on it has left its colours at the border
+        if touches == [True, False]:  # colours left at the border of another change
             out.append(Change("recoloured", None, piece, share))
     out.sort(key=lambda change: -len(change.points))
     return out + _unknown(found, voxel), found
@@ -116,14 +119,14 @@ def _moved(
     size: float,
     up: Array,
 ) -> list[Change]:
-    """Pairs of pieces that are one thing, those that explain most first; all that went along leaves the lists."""
+    """Match pairs of pieces that are one thing, the best explained first; remove their parts from ``pieces``."""
     offered = [
         [(p, Body.of(one, p), is_certain(p, one, size)) for p in side] for side, one in zip(pieces, found, strict=True)
     ]
     motions = list[tuple[Motion, Piece, Piece]]()
     for old, missing, old_certain in offered[0]:
         for now, new, now_certain in offered[1]:
-            near = gap_between(old, now) < max(old.length, now.length)  # a fragment may be of any thing farther off
+            near = gap_between(old, now) < max(old.length, now.length)  # a distant fragment may belong to any thing
             tried = (old_certain and now_certain) or ((old_certain or now_certain) and near)
             motion = motion_between(*visits, missing, new, up) if tried else None
             if motion is not None:
@@ -155,7 +158,7 @@ def _moved(
 
 
 def vertical(visit: Visit) -> Array:
-    """Unit vector (3,) of the level surfaces of a visit, or in which the cameras were held."""
+    """Vertical unit vector (3,): from level surfaces of a visit, else from how the camera was held."""
     held = -visit.keyframes[:, :3, 1].mean(axis=0)
     held /= np.linalg.norm(held)
     some = visit.mesh.faces[:: max(1, len(visit.mesh.faces) // 20_000)]
@@ -166,20 +169,19 @@ def vertical(visit: Visit) -> Array:
 
 
 def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
-    """Shares of a piece that a motion (4, 4) brings onto surface of the other visit, and into its free space."""
+    """Shares of a piece that a motion (4, 4) brings onto the other visit's surface, and into its free space."""
     points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
     on, samples = tree.query(points)[0] < limit, there.sample(points)
     return float(on.mean()), float((~on & samples.is_free(limit)).mean())
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:
-    """How far the surface lies off what noise explains: 1 less the squared tolerance over the distance."""
+    """One minus the squared median ratio of noise tolerance to distance."""
     share = found.tolerance[piece.vertices] / np.maximum(found.gap[piece.vertices], 1e-6)
     return float(np.clip(1 - np.median(share) ** 2, 0, 1))
 
 
 def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:
-    """Parts of the place that only one visit saw."""
     out = []
     for number, one in enumerate(found):
         pieces = [p for p in connected(one, one.state == UNKNOWN, 4 * voxel) if p.area > LEAST_UNKNOWN]
@@ -188,7 +190,7 @@ def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:
 
 
 def mesh_of(change: Change, found: tuple[Evidence, Evidence]) -> Mesh:
-    """Surface of a change where it is now, or was if it is gone."""
+    """Present surface of a change, or the former surface of a thing that is gone."""
     one, piece = (found[1], change.after) if change.after is not None else (found[0], change.before)
     assert piece is not None
     chosen = np.zeros(len(one.state), bool)

@@ -1,4 +1,4 @@
-"""``dudmap diff``: what changed between two run folders, as JSON, meshes and a page."""
+"""``dudmap diff``: changes between two run folders, as JSON, meshes and a page."""
 
 import json
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ from dudmap.own_folder import make_folder, remove_files
 
 CHANGES_FILE, REPORT = "changes.json", "report.html"
 WRITTEN = {"": r"changes\.json|report\.html", "changes": r"\d+\.ply"}
-"""Names of all files of a comparison by sub-folder, as regular expressions; the next one removes them first."""
+"""Regular expressions of all file names of a comparison, by sub-folder; the next comparison removes these files."""
 BEST_FRAMES = 3
-"""Frames of each visit that are named for a change."""
+"""Frames of each visit that are named per change."""
 
 
 def diff_runs(
@@ -56,15 +56,15 @@ def diff_runs(
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two runs that were compared.
+    """Comparison of two runs.
 
     Attributes:
         maps: Of both runs.
         visits: The maps in the world of the first.
-        changes: What changed.
+        changes: Changes between the visits.
         evidence: On the surface of both.
-        alignment, notes: Figures of the alignment, and what the user should know.
-        min_size: Edge of the smallest thing that is reported, metres.
+        alignment, notes: Metrics of the alignment, and messages for the user.
+        min_size: Edge of the smallest reported thing, metres.
     """
 
     maps: tuple[SavedMap, SavedMap]
@@ -120,7 +120,7 @@ def compared(before: str | Path, after: str | Path, min_size: float) -> Comparis
 
 
 def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """Figures of the alignment and the pose (4, 4) of the second map in the world of the first."""
+    """Metrics of the alignment and the pose (4, 4) of the second map in the world of the first."""
     if same:
         return {"reason": None}, np.eye(4)
     pair = compare_maps(maps[0], maps[1], changed=True)
@@ -134,7 +134,7 @@ def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], N
 
 
 def best_frames(change: Change, saved: SavedMap, visit: Visit) -> list[tuple[float, NDArray[np.float64]]]:
-    """Time and pose (4, 4) in the common frame of the keyframes whose images show a change largest and most central."""
+    """Times and poses (4, 4), in the common frame, of the keyframes that show a change largest and most central."""
     camera, box = visit.volume.camera, change.box
     centre, radius = box.mean(axis=0), np.linalg.norm(box[1] - box[0]) / 2
     scores = []
@@ -147,7 +147,6 @@ def best_frames(change: Change, saved: SavedMap, visit: Visit) -> list[tuple[flo
 
 
 def _write(out: Path, tree: dict[str, Any], found: Comparison) -> None:
-    """Write changes.json, the meshes and the page."""
     if out.exists() and not (out.is_dir() and ((out / CHANGES_FILE).is_file() or not any(out.iterdir()))):
         raise DudmapError(f"{out} exists and holds no comparison of `dudmap diff`; name another folder with --out")
     changes, visits, maps = found.changes, found.visits, found.maps
@@ -164,7 +163,7 @@ def _write(out: Path, tree: dict[str, Any], found: Comparison) -> None:
 
 
 def summary(tree: dict[str, Any]) -> str:
-    """What changed, as text."""
+    """Text summary of the changes."""
     lines = list(tree["notes"])
     for row in tree["changes"]:
         if row["kind"] == "unknown":

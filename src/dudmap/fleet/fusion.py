@@ -1,13 +1,13 @@
-"""Fusion of many maps into one on disk, a range of space at a time, and its surface as 3D Tiles 1.1 (OGC 22-025r4).
+"""Fuse many maps on disk, one range of space at a time, and write the surface as 3D Tiles 1.1 (OGC 22-025r4).
 
-The world is cut into cells of 16x16x16 blocks, which are octree nodes and so have consecutive Morton codes. A range is
-a sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses a range by itself: it adds the maps
-that reach into it one after the other, writes the blocks as a map file and the surface of every cell as a tile. Blocks
-of other ranges that touch the range are fused along with it, for the triangles at its border, and left out of the file.
+The world is cut into cells of 16x16x16 blocks. Cells are octree nodes and so have consecutive Morton codes. A range is
+a sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses one range: it adds the maps that
+reach it, writes the blocks as a map file, and the surface of every cell as a tile. Blocks of neighbouring ranges that
+touch the range are fused for the triangles at its border and not stored.
 
-The tiles are a tree of GLB files with levels of detail, whose leaves are the cells with their full surface. The surface
-of an inner tile is that of its children with the vertices in cubes of twice the size joined, so that all tiles have
-about as many triangles; a browser replaces a tile by its children when it comes near (refinement REPLACE).
+The tiles form a tree of GLB files with levels of detail. Leaves are cells with their full surface. An inner tile joins
+the vertices of its children in cubes of twice the size, so that all tiles have about as many triangles. A browser
+replaces a near tile by its children (refinement REPLACE).
 """
 
 import json
@@ -31,14 +31,14 @@ from dudmap.io.exporting.mesh_files import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn: a tile then has the axes of the map, x to
-the right and y down. The tileset, which is z up, is turned by the same matrix."""
+"""Rotation of tiles from map axes (x right, y down) to glTF. glTF is y up and readers of 3D Tiles turn it to z up; this
+undoes their turn. The same matrix turns the tileset, which is z up."""
 BITS_PER_LEVEL = 3
 
 CELL_BITS = 12
-"""Bits of the code of a block within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""
+"""Bits of a block's code within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""
 RANGE_BLOCKS = 6000
-"""Blocks with voxels at which a range ends: 110 MB of sums, and half as many again for the blocks around it."""
+"""Blocks with voxels per range: 110 MB of sums, and half as many again for the surrounding blocks."""
 MAP_FOLDER = "map"
 """Folder of the map files of the ranges."""
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -46,13 +46,13 @@ _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1)
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """A tile that was written.
+    """A written tile.
 
     Attributes:
         name: Its file is tiles/<name>.glb.
-        height: Levels below it, 0 of a leaf.
+        height: Levels below it, 0 for a leaf.
         low, high: (3,) corners of its surface, metres, world frame.
-        triangles: Their number.
+        triangles: Number of triangles.
         children: Tiles that replace it.
     """
 
@@ -65,18 +65,18 @@ class Tile:
 
 
 def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
-    """Write the GLB file of a tile, and its mesh for its parent."""
+    """Write the GLB file of a tile, and its mesh for the parent tile."""
     write_bytes(out / TILE_FOLDER / f"{name}.glb", encoded(mesh, T_GLTF_MAP))
     mesh.save(work / f"{name}.ply")
     low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
-    for child in children:  # joined vertices are means and lie inside, but for rounding
+    for child in children:  # joined vertices are means and lie inside, except for rounding
         low, high = np.minimum(low, child.low), np.maximum(high, child.high)
     return Tile(name, height, low, high, len(mesh.faces), children)
 
 
 def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path, workers: Workers) -> Tile:
-    """Write all inner tiles above some leaves, whose names are the hexadecimal codes of their cells; returns the
-    root."""
+    """Write all inner tiles above the leaves and return the root. Names of leaves are the hexadecimal codes of their
+    cells."""
     done = {leaf.name: leaf for leaf in leaves}
     inner = _inner_nodes(sorted(int(leaf.name, 16) for leaf in leaves))
     for height in sorted({height for height, _, _ in inner}):
@@ -87,9 +87,9 @@ def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path,
 
 
 def error_of(height: int, voxel_size: float) -> float:
-    """Geometric error of a tile, metres: how far joining moved its vertices at most.
+    """Geometric error of a tile, metres: largest displacement of a vertex by joining.
 
-    A vertex moves by less than the diagonal of its cube, ``sqrt(3) s 2^h``; the errors of all levels below together are
+    One level moves a vertex by less than the diagonal of its cube, ``sqrt(3) s 2^h``. All levels below together add
     less than this again.
     """
     return 0.0 if height == 0 else 2 * np.sqrt(3) * voxel_size * 2**height
@@ -118,8 +118,9 @@ def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:
 
 
 def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
-    """Inner nodes of the octree above cells, as height, name and names of the children; children come first. A node
-    with a single child is left out.
+    """Inner nodes of the octree above cells as (height, name, names of the children), children first.
+
+    Nodes with a single child are skipped.
     """
     out: list[tuple[int, str, list[str]]] = []
 
@@ -142,19 +143,18 @@ def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
 
 
 def _write_parent(voxel_size: float, out: Path, work: Path, parent: tuple[str, tuple[Tile, ...]]) -> Tile:
-    """Write an inner tile of a name and children."""
     name, children = parent
     height = 1 + max(child.height for child in children)
     whole = joined([Mesh.load(work / f"{child.name}.ply") for child in children])
     mesh = clustered(whole, voxel_size * 2**height)
-    if len(mesh.faces) == 0:  # all of it is smaller than a cube
+    if len(mesh.faces) == 0:  # the whole surface is smaller than one cube
         mesh = whole
     return write_tile(mesh, name, height, out, work, children)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedRun:
-    """A run folder and the pose (4, 4) of its world in the common one."""
+    """A run folder and the pose (4, 4) of its world in the common world."""
 
     folder: Path
     T_world_run: NDArray[np.float64]
@@ -196,8 +196,10 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
 
 
 def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
-    """Fuse a range with the parameters of ``like``, write its map file, the tiles of its cells and, into ``work``,
-    their meshes for inner tiles; the entry of the range in world.json, and the tiles."""
+    """Fuse a range with the parameters of ``like``; write its map file and the tiles of its cells.
+
+    Meshes for inner tiles go into ``work``. Returns the range's entry of world.json and the tiles.
+    """
     empty_map = like.volume()
     low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS
     reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in cells.runs]
@@ -229,7 +231,7 @@ def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tupl
 
 
 def _write_tiles(cells: CellRange, fused: FusedRange, like: TsdfVolume, out: Path, work: Path) -> list[Tile]:
-    """Full surface of every cell of the range that has one."""
+    """Write a full-resolution tile for every cell of the range that has surface."""
     volume = fused.volume(like)
     cell_of = fused.codes[fused.has_voxels] >> CELL_BITS
     own = (cell_of >= cells.first) & (cell_of <= cells.last)
@@ -245,14 +247,14 @@ def _write_tiles(cells: CellRange, fused: FusedRange, like: TsdfVolume, out: Pat
 
 
 def _occupied_cells(run: PlacedRun) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Cells that the voxels of a run reach, blocks in each, and all cells that it reaches."""
+    """Cells that the voxels of a run reach, blocks in each, and all cells that the run reaches."""
     reached = reached_blocks(run.folder, run.T_world_run.tobytes())
     near, counts = np.unique(reached.near >> CELL_BITS, return_counts=True)
     return near, counts, np.union1d(near, reached.empty >> CELL_BITS)
 
 
 def _with_neighbours(codes: NDArray[np.int64], level: int) -> NDArray[np.int64]:
-    """Codes (n, 27) of the cubes of ``2^level`` blocks around those with codes (n,) of that level, these included."""
+    """Codes (n, 27) of each cube of ``2^level`` blocks with code (n,) and of its neighbours."""
     coords = morton.decode(codes << (3 * level)) >> level
     return morton.encode((coords[:, None] + _AROUND) << level) >> (3 * level)
 

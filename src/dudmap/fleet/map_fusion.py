@@ -1,9 +1,10 @@
-"""Fusion of maps with known relative poses, a range of blocks at a time: sums of integers, divided and rounded once.
+"""Fuse maps with known relative poses, one range of blocks at a time, by exact integer sums.
 
-The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, and a weighted mean of several maps is the
-quotient of two sums: ``sdf = sum(w_i sdf_i) / sum(w_i)``. The sums are integers, so that any order and any grouping of
-the maps give the same voxels. A range is all blocks whose Morton codes lie between two numbers; neither all maps nor
-the whole result need to be in memory.
+The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean. The weighted mean of several maps is the
+quotient of two sums, ``sdf = sum(w_i sdf_i) / sum(w_i)``, rounded once. The sums are integers, so that the order and
+grouping of the maps do not change the voxels.
+
+A range is all blocks with Morton codes between two numbers. Neither all maps nor the whole result need to be in memory.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,12 +25,12 @@ VOXELS = BLOCK**3
 MAX_COUNT = 255
 """Largest weight of a voxel and number of observations of emptiness of a block."""
 MAX_STEPS = 32767
-"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
+"""Largest distance of a voxel, steps. Maps with larger steps (a wider truncation band) may exceed it."""
 _LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
 PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 """Points (27, 3) of a block, in voxels."""
 RANGE_BLOCKS = 4096
-"""Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
+"""Blocks with voxels per range of ``fuse_maps``: 75 MB of sums."""
 BATCH = 512
 """Blocks of a map that are sampled at a time: about 50 MB of samples."""
 
@@ -40,9 +41,9 @@ class FusedRange:
 
     Attributes:
         codes: (n,) int64 Morton codes.
-        has_voxels: (n,) bool; the others were seen to be empty.
+        has_voxels: (n,) bool; the other blocks are known to be empty.
         free_count: (n,) uint8 observations of emptiness.
-        geometry, colors: (m, 512) int32 packed voxels of the blocks that have some, in the same order.
+        geometry, colors: (m, 512) int32 packed voxels of the blocks with voxels, in the same order.
     """
 
     codes: NDArray[np.int64]
@@ -52,14 +53,14 @@ class FusedRange:
     colors: NDArray[np.int32]
 
     def chosen(self, keep: NDArray[np.bool_]) -> "FusedRange":
-        """Some of the blocks (n,)."""
+        """Select blocks (n,)."""
         rows = keep[self.has_voxels]
         return FusedRange(
             self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
         )
 
     def volume(self, like: TsdfVolume) -> TsdfVolume:
-        """The blocks as a map with the camera and the parameters of another."""
+        """Map of these blocks with the camera and parameters of ``like``."""
         out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
         entries = np.flatnonzero(self.has_voxels).astype(np.int32)
         coords = morton.decode(self.codes)
@@ -68,21 +69,21 @@ class FusedRange:
 
 
 def joined(parts: Sequence[FusedRange]) -> FusedRange:
-    """Blocks of several ranges, which have none in common."""
+    """Concatenate disjoint ranges."""
     names = FusedRange.__dataclass_fields__
     return FusedRange(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True, eq=False)
 class BlockSums:
-    """Sums over maps of the content of n blocks.
+    """Sums of n blocks over maps.
 
     Attributes:
         coords: (n, 3) int32 coordinates of the blocks.
         weight, distance: (n, 512) int64, sum of the weights, and of weight times distance in steps.
         shade_weight, shade: (n, 512) int64, the same of the intensities 1..255.
         color_weight, color: (n, 512) and (n, 512, 3) int64, the same of the colours in quarters of a grey level.
-        free: (n,) int64, observations of emptiness of maps in which the block has no voxels.
+        free: (n,) int64, observations of emptiness by maps in which the block has no voxels.
     """
 
     coords: NDArray[np.int32]
@@ -96,17 +97,17 @@ class BlockSums:
 
     @classmethod
     def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
-        """Sums over no map."""
+        """Zero sums."""
         n = len(coords)
         shapes = *[(n, VOXELS)] * 5, (n, VOXELS, 3), (n,)
         return cls(coords, *(np.zeros(shape, np.int64) for shape in shapes))
 
     def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
-        """Sums over some of the blocks."""
+        """Select blocks."""
         return BlockSums(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def add(self, rows: NDArray[np.intp], other: "BlockSums") -> None:
-        """Add sums over the same blocks as ``rows`` (k,) of these."""
+        """Add the sums of ``other`` to the blocks ``rows`` (k,)."""
         assert np.array_equal(self.coords[rows], other.coords)
         for name in list(self.__dataclass_fields__)[1:]:
             getattr(self, name)[rows] += getattr(other, name)
@@ -115,11 +116,10 @@ class BlockSums:
 def block_sums(
     volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None, sdf_unit: float
 ) -> BlockSums:
-    """Content of one map at blocks (n, 3) of a grid with voxels of the same size, distances in steps of ``sdf_unit``
-    metres.
+    """Sums of one map at blocks (n, 3) of a grid with voxels of the same size.
 
-    ``T_volume_grid`` (4, 4) brings the world of the grid to that of the map, whose content is interpolated trilinearly;
-    None if the grid is that of the map, whose words are taken as they are.
+    ``sdf_unit`` is the step of the distances, metres. ``T_volume_grid`` (4, 4) maps the world of the grid to the world
+    of the map, which is interpolated trilinearly. With None, both grids are equal and the voxels are copied.
     """
     if T_volume_grid is None:
         return _exact_sums(volume, coords)
@@ -139,8 +139,7 @@ def empty_counts(
 ) -> NDArray[np.int64]:
     """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``.
 
-    On another grid a block is empty if ``PROBES`` of it are: a part of it that the map never saw can be missed if it is
-    smaller than half a block.
+    On another grid a block is empty if all its ``PROBES`` are. An unseen part smaller than half a block can be missed.
     """
     if T_volume_grid is None:
         entries = hashing.find_all(volume.blocks.table, volume.blocks.coords, coords)
@@ -150,7 +149,7 @@ def empty_counts(
 
 
 def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
-    """Content of blocks (n, 3) of a map as it is."""
+    """Sums of blocks (n, 3) on the map's own grid."""
     blocks, slots = volume.blocks, volume.slots_at(coords)
     held = slots >= 0
     words = np.where(held[:, None], blocks.geometry[np.maximum(slots, 0)], 0)
@@ -163,7 +162,7 @@ def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
 def _samples(
     volume: TsdfVolume, voxels: NDArray[np.float64], T_volume_grid: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """``sample_points`` of a map at voxels (n, 3) of a grid."""
+    """Sample a map at voxels (n, 3) of a grid (``sample_points``)."""
     blocks, motion = volume.blocks, T_volume_grid[:3].copy()
     motion[:, 3] /= volume.voxel_size
     return sample_points(
@@ -173,7 +172,7 @@ def _samples(
 
 
 def _least_emptiness(volume: TsdfVolume, rows: NDArray[np.float32], states: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Observations of emptiness (n,) of blocks of whose points (n, k) all lie in blocks without voxels, 0 of others."""
+    """Smallest count of emptiness (n,) of blocks whose points (n, k) all lie in blocks without voxels; else 0."""
     empty = np.all(states == EMPTY, axis=1)
     least = np.rint(rows[..., WEIGHT].min(axis=1) / volume.config.carve_rate)
     return np.where(empty, least, 0).astype(np.int64)
@@ -187,7 +186,7 @@ def _sums(
     color: NDArray[np.int32],
     free: NDArray[np.int64],
 ) -> BlockSums:
-    """Sums of a single map from its values; an intensity or colour of 0 is unknown."""
+    """Sums of one map from its values; an intensity or colour of 0 is unknown."""
     wide = weight.astype(np.int64)
     shade_weight = wide * (shade > 0)
     color_weight = wide * np.any(color > 0, axis=-1)
@@ -198,12 +197,12 @@ def _sums(
 
 
 def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
-    """Divide the sums once.
+    """Divide the sums.
 
-    Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps``, the
-    truncation distance in steps, with the weight ``carve_rate`` per observation, so that what stood in one run and was
-    gone in the others leaves the map. A block that is then empty everywhere, by ``free_after`` observations, loses its
-    voxels.
+    Emptiness seen by one map where another has voxels counts as an observation of free space. Its distance is
+    ``free_steps`` (truncation in steps), its weight ``carve_rate`` per observation. Objects that stood in one run and
+    left before the others so disappear. A block that is then empty everywhere, by ``free_after`` observations, loses
+    its voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
     emptiness = (carve_rate * sums.free * held)[:, None]
@@ -237,8 +236,11 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
-    """Blocks of the result that a map can contribute to, as ascending Morton codes: ``near`` (n,), which its voxels
-    reach into, and ``empty`` (m,), which its blocks without voxels do; a block can be in both."""
+    """Blocks of the result that a map contributes to, as ascending Morton codes.
+
+    ``near`` (n,) contains blocks that the map's voxels reach, ``empty`` (m,) blocks that its blocks without voxels
+    reach. A block can be in both.
+    """
 
     near: NDArray[np.int64]
     empty: NDArray[np.int64]
@@ -247,7 +249,7 @@ class ReachedBlocks:
     def of(
         cls, coords: NDArray[np.integer], has_voxels: NDArray[np.bool_], T: NDArray[np.float64], block_size: float
     ) -> "ReachedBlocks":
-        """Where the points ``PROBES`` of blocks (n, 3) of a map lie when it stands at a pose (4, 4)."""
+        """Blocks reached by the points ``PROBES`` of blocks (n, 3) of a map at the pose ``T`` (4, 4)."""
         codes = morton.encode(coords)[:, None]
         if not np.array_equal(T, np.eye(4)):
             points = coords[:, None].astype(np.float64) + PROBES / BLOCK
@@ -255,7 +257,7 @@ class ReachedBlocks:
         return cls(np.unique(codes[has_voxels]), np.unique(codes[~has_voxels]))
 
     def within(self, low: int, high: int) -> "ReachedBlocks":
-        """Those with codes from ``low`` to ``high - 1``."""
+        """Blocks with codes from ``low`` to ``high - 1``."""
         return ReachedBlocks(*(part[slice(*np.searchsorted(part, [low, high]))] for part in (self.near, self.empty)))
 
 
@@ -265,11 +267,11 @@ def fused_blocks(
     like: TsdfVolume,
     maps: Iterable[tuple[TsdfVolume, NDArray[np.float64], ReachedBlocks]],
 ) -> FusedRange:
-    """Fusion of maps, one after the other in any order, in some blocks by their Morton codes.
+    """Fuse maps, in any order, into some blocks given by Morton codes.
 
-    Voxels of at least one map reach into the blocks ``near`` (n,); the other blocks ``empty`` (m,) are empty in at
-    least one. The result has camera and parameters of the map ``like``. Each of the ``maps`` comes with its pose
-    (4, 4), and enters by trilinear interpolation unless the voxels are the same.
+    Voxels of at least one map reach the blocks ``near`` (n,); the blocks ``empty`` (m,) are empty in at least one map.
+    The result has the camera and parameters of ``like``. Each of the ``maps`` comes with its pose (4, 4). Maps on the
+    same grid are copied exactly; others are interpolated trilinearly.
     """
     sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
     for volume, T, reached in maps:
@@ -292,11 +294,10 @@ def fused_blocks(
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """One map of several with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the
-    first.
+    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first.
 
-    A map whose pose is the identity enters voxel by voxel, others by trilinear interpolation. The sums are exact: on
-    the same grid any order gives the same voxels.
+    Maps with identity pose are added voxel by voxel, others by trilinear interpolation. The sums are exact: on one grid
+    the order does not change the voxels.
     """
     reached = [
         ReachedBlocks.of(one.coords[:n], one.slot_of[:n] >= 0, T, volumes[0].block_size)

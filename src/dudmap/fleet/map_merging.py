@@ -1,4 +1,4 @@
-"""Joining two saved maps: relative pose by a vote of keyframes, refinement, checks, fusion."""
+"""Merge two saved maps: relative pose by votes of keyframes, refinement, checks, fusion."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,26 +20,28 @@ from dudmap.fleet.map_samples import SurfacePoints, surface_points
 from dudmap.fleet.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.1, 4.0
-"""Two pairs of keyframes vote for the same relative pose if it differs by less than this (m, deg) where the camera of
-one of them was. The pose of one pair of keyframes is good to some centimetres and a degree (``POSITION_ERROR``)."""
+"""Two keyframe pairs vote for one relative pose if it places the camera of either within this distance (m, deg). The
+pose of one pair is accurate to some centimetres and a degree (``POSITION_ERROR``)."""
 MAX_HYPOTHESES = 5
-"""Relative poses that are returned at most."""
+"""Most relative poses returned."""
 
 SURFACE_POINTS = 20_000
-"""Points of each map's surface that the alignment and the checks use."""
+"""Surface points of each map for the alignment and the checks."""
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
-"""Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
-features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
+"""Keyframes of one map that must be recognised in the other at one relative pose. A single keyframe needs this many
+matching features. Look-alike places reach 200 and are left to the checks."""
 NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
 MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
-"""Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
-degrees: that of a relocalised frame (``relocalization.max_distance``)."""
+"""Largest correction of the features' relative pose by the surface alignment, at the middle of the common surface (m,
+deg): the limits of a relocalised frame (``relocalization.max_distance``)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """World of b to world of a (4, 4), on which some pairs of keyframes agree; numbers of the keyframes of b that were
-    recognised at it, and of the feature matches of all pairs that agree."""
+    """Relative pose ``T_a_b`` (4, 4), world of b to world of a, on which keyframe pairs agree.
+
+    ``num_keyframes`` counts the keyframes of b recognised at it, ``num_inliers`` the matching features of all pairs.
+    """
 
     T_a_b: NDArray[np.float64]
     num_keyframes: int
@@ -49,11 +51,11 @@ class Hypothesis:
 def relative_poses(
     a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
 ) -> list[Hypothesis]:
-    """Relative poses of two maps from their keyframes, best first; empty if no place of b is known in a.
+    """Relative poses of two maps from their keyframes, best first; empty if no keyframe of b is recognised in a.
 
-    Each keyframe of b is recognised among those of a (``KeyframeDatabase.match``), which were seen by ``camera``. Every
-    recognition is a vote for ``T_a_b``; votes that agree where the camera stood are averaged with the numbers of their
-    features as weights. Poses with more agreeing features come first.
+    Each keyframe of b is matched to the keyframes of a (``KeyframeDatabase.match``) with the ``camera`` of a. Every
+    match votes for ``T_a_b``. Agreeing votes are averaged, weighted by their number of features. Poses with more
+    matching features come first.
     """
     database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []
@@ -73,13 +75,13 @@ def relative_poses(
 
 
 def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
-    """Votes whose relative pose puts their own camera where that of ``vote`` does."""
+    """Votes that agree with ``vote`` on the pose of their own camera."""
     T = vote[1]
     return [other for other in votes if agree(T @ other[2], other[1] @ other[2], SAME_DISTANCE, SAME_ANGLE_DEG)]
 
 
 def _average(votes: list[tuple]) -> NDArray[np.float64]:
-    """Weighted mean of relative poses, taken where the cameras stood so that no lever arm enters."""
+    """Weighted mean of relative poses, averaged at the camera positions to avoid a lever arm."""
     weights = np.array([vote[3] for vote in votes], float)
     Ts, cameras = np.stack([vote[1] for vote in votes]), np.stack([vote[2] for vote in votes])
     T = np.eye(4)
@@ -91,12 +93,12 @@ def _average(votes: list[tuple]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class MapPair:
-    """What was found about two maps.
+    """Result of comparing two maps.
 
     Attributes:
-        T_a_b: (4, 4) world of b to world of a, None if they are not to be joined.
-        reason: Sentence on why not; empty if they are.
-        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one that was tried.
+        T_a_b: (4, 4) world of b to world of a, None if the maps are not to be merged.
+        reason: Why not, one sentence; empty if they are merged.
+        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one tried.
     """
 
     T_a_b: NDArray[np.float64] | None
@@ -107,15 +109,15 @@ class MapPair:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the surfaces lie on each other and have other colours, as two places of many that look alike.
+        """Whether the surfaces coincide in different colours, as in two similar places.
 
-        Free space alone does not count: somebody who stayed in one map, or a bent map, also makes it disagree.
+        Disagreement of free space does not count: a person who stayed, or a bent map, also causes it.
         """
         found = self.agreement
         return self.T_a_b is None and found is not None and found.enough and bool(found.color_reason(many=True))
 
     def tree(self) -> dict[str, Any]:
-        """The figures, for a JSON file."""
+        """Values for a JSON file."""
         out: dict[str, Any] = {"reason": self.reason or None}
         if self.T_a_b is not None:
             out["T_a_b"] = self.T_a_b.tolist()
@@ -130,14 +132,14 @@ class MapPair:
 
 @dataclass(frozen=True, eq=False)
 class MapSurface:
-    """A map with points on its surface, to be compared with others."""
+    """A map with surface points for comparison with others."""
 
     volume: TsdfVolume
     points: SurfacePoints
 
     @classmethod
     def of(cls, saved: SavedMap) -> "MapSurface":
-        """That of a saved map.
+        """Sample the surface of a saved map.
 
         Raises:
             MapError: The map has no surface.
@@ -149,7 +151,7 @@ class MapSurface:
 def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
     """Find the relative pose of two maps and decide whether they show the same place.
 
-    ``changed``: They are two visits, between which things may have been moved.
+    ``changed``: The maps are two visits between which things may have moved.
 
     Raises:
         MapError: A map has no surface.
@@ -161,7 +163,7 @@ def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
 
 
 def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
-    """Relative poses at which enough places of b are known in a; the other way round others may be."""
+    """Relative poses at which enough keyframes of b are recognised in a; the reverse direction may find others."""
     found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
@@ -169,8 +171,11 @@ def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
 def decided(
     a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False, changed: bool = False
 ) -> MapPair:
-    """The first of some relative poses (at least one) that passes all checks after its refinement, else why the first
-    of them does not. ``many``: The maps are two of many, most of which do not show one place."""
+    """Refine and check relative poses (at least one) in order; return the first that passes all checks.
+
+    If none passes, the result is the rejection of the first. ``many``: The maps belong to a large set in which most
+    pairs show different places.
+    """
     empty = [name for name, one in (("first", a), ("second", b)) if not len(one.points)]
     if empty:
         return MapPair(None, f"the {' and the '.join(empty)} has no surface, its mesh is empty; leave that run out")
@@ -185,12 +190,11 @@ def decided(
 
 
 def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, changed: bool) -> MapPair:
-    """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b, changed=changed)
     if not aligned.converged:
         return MapPair(None, "their surfaces cannot be aligned with each other", hypothesis, aligned)
     if aligned.stiffness < MIN_STIFFNESS:
-        return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
+        return MapPair(None, "their common surface does not determine their relative pose", hypothesis, aligned)
     correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b
     middle = b.points.points.mean(axis=0)
     moved = np.linalg.norm(correction[:3, :3] @ middle + correction[:3, 3] - middle)

@@ -1,4 +1,4 @@
-"""Samples of a map at any points of its world: distance, intensity, colour, and what is known there."""
+"""Sample a map at points of its world: distance, intensity, colour, and state."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from dudmap.core.map.volume import TsdfVolume
 __all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
 
 IN_BAND = 0.9
-"""Share of the truncation distance within which a voxel holds a distance to a surface; beyond, it is in free space
+"""Share of the truncation distance within which a voxel holds a distance to a surface; beyond it is free space
 (``SURFACE_SHARE`` in ``core/formulas/voxel.py``)."""
 NOISE_IN_BAND = 2.0
-"""Standard deviations of a reading that fit into the truncation distance where a surface is reliable enough to be
-contradicted by free space: 95 % of its readings were not farther off."""
+"""Standard deviations of depth noise that must fit into the truncation distance for free space to contradict a surface.
+Then 95 % of the measurements lie within the band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class MapSamples:
     color: NDArray[np.float32]
 
     def is_free(self, distance: float | NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each point (n,) was seen to be free, farther than a distance (n,) from any surface, metres."""
+        """Whether each point (n,) lies in observed free space, farther than ``distance`` (n,) (m) from surface."""
         return (self.state == EMPTY) | ((self.state == OBSERVED) & (self.sdf > distance))
 
 
@@ -74,8 +74,8 @@ class SurfacePoints:
         points: (n, 3) float64, metres, world frame of the map.
         intensity: (n,) float32, 0..1, 0 = unknown.
         color: (n, 3) float32, red green blue, 0..255.
-        near: (n,) bool, whether a camera came so near that its noise lies within the truncation band.
-        area_each: Surface that a point stands for, square metres.
+        near: (n,) bool, whether a camera was near enough for its noise to fit into the truncation band.
+        area_each: Surface per point, square metres.
     """
 
     points: NDArray[np.float64]
@@ -89,7 +89,7 @@ class SurfacePoints:
 
 
 def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int) -> SurfacePoints:
-    """At most ``count`` random vertices of the mesh of a map, which lie about evenly on its surface.
+    """At most ``count`` random vertices of a map's mesh, about evenly spread over its surface.
 
     ``cameras`` (k, 3) are the positions of its keyframes, metres.
 

@@ -1,4 +1,4 @@
-"""Merging of run folders: two maps of one place into a run folder, many into worlds of map parts and tiles."""
+"""Merge run folders: two maps of one place into a run folder, many into worlds of map parts and tiles."""
 
 import json
 import re
@@ -48,19 +48,19 @@ WRITTEN = {
     "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
     MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
 }  # fmt: skip
-"""Names of all files of a world by sub-folder, as regular expressions. They are removed before the next merge."""
+"""Regular expressions of all file names of a world, by sub-folder. The next merge removes these files."""
 
 
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
-    """Join the maps of two run folders into a new run folder, in the world frame of the first.
+    """Merge the maps of two run folders into a new run folder, in the world frame of the first.
 
-    Its files are those of a run: map, keyframes, mesh, config.toml of the first run, metrics.json; beside them the
-    trajectories of both runs (trajectory.txt, trajectory-2.txt, ...) and merge.json, whose content is returned. Nothing
-    is written if the maps are not to be joined.
+    The folder holds map, keyframes, mesh, metrics.json, and config.toml of the first run. It also holds the
+    trajectories of both runs (trajectory.txt, trajectory-2.txt, ...) and merge.json, whose content is returned. If the
+    maps do not match, nothing is written.
 
     Raises:
-        MapError: The maps are not to be joined; the message says why.
-        DudmapError: As of ``check_runs``, or ``out`` cannot be written.
+        MapError: The maps do not match; the message says why.
+        DudmapError: As in ``check_runs``, or ``out`` cannot be written.
     """
     a, b, out = Path(a), Path(b), Path(out)
     check_runs([a, b], out)
@@ -93,11 +93,12 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
 
 
 def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]]) -> list[list[str]]:
-    """Write the trajectories of runs, moved by the poses (4, 4) of their worlds, as trajectory.txt, trajectory-2.txt,
-    ...; names of the files of each run, since a merged run has several.
+    """Write trajectories as trajectory.txt, trajectory-2.txt, ..., transformed by the poses (4, 4) of their worlds.
+
+    Returns the file names per run; a merged run has several.
 
     Raises:
-        DatasetError: A trajectory, or the list of them in merge.json, is damaged.
+        DatasetError: A trajectory, or the list of trajectories in merge.json, is damaged.
     """
     names: list[list[str]] = []
     for folder, T in runs:
@@ -120,9 +121,9 @@ class FleetReport:
     """Result of a merge of many runs.
 
     Attributes:
-        out: Folder of the largest world; others lie in it as part-2, part-3, ...
+        out: Folder of the largest world; it holds the others as part-2, part-3, ...
         tree: Content of its world.json.
-        sentences: What the user should know: runs that were not joined, joins that contradict others.
+        sentences: Messages for the user: runs that were not joined, joins that contradict others.
     """
 
     out: Path
@@ -133,13 +134,18 @@ class FleetReport:
 def merge_fleet(
     runs: Sequence[str | Path], out: str | Path, *, workers: int = 1, note: Callable[[str], None] = lambda _: None
 ) -> FleetReport:
-    """Join the maps of any number of runs, at least two.
+    """Merge the maps of two or more runs.
 
-    The folder receives world.json (runs with their poses, ranges, pairs), map/<code>.npz (one map file per range,
-    which ``TsdfVolume.load`` reads), tileset.json and tiles/ (3D Tiles 1.1), and trajectory.txt, trajectory-2.txt, ...
-    of all runs in the world of the first. It is new, or holds a world, which is replaced. Runs that do not overlap the
-    largest group become worlds of their own in part-2, part-3, ... if at least two of them are joined. ``workers`` is
-    the number of processes; ``note`` is told what is being done.
+    The folder receives:
+
+    - world.json: runs with their poses, ranges, pairs.
+    - map/<code>.npz: one map file per range, for ``TsdfVolume.load``.
+    - tileset.json and tiles/: 3D Tiles 1.1.
+    - trajectory.txt, trajectory-2.txt, ...: all runs in the world of the first.
+
+    It must be new, or hold a world, which is replaced. Groups of at least two runs that do not overlap the largest
+    group become worlds in part-2, part-3, ... ``workers`` is the number of processes; ``note`` receives progress
+    messages.
 
     Raises:
         ConfigError: A run is named twice, or the voxels differ in size.
@@ -178,7 +184,7 @@ def merge_fleet(
 def _write_world(
     out: Path, part: list[int], folders: Sequence[Path], graph: RunGraph, like: MapHeader, crew: Workers
 ) -> dict[str, Any]:
-    """Fuse joined runs; returns the content of world.json."""
+    """Fuse joined runs; return the content of world.json."""
     work = out / WORK_FOLDER
     for folder in (out / MAP_FOLDER, out / TILE_FOLDER, work):
         folder.mkdir(parents=True)
@@ -213,7 +219,7 @@ def _check_out(out: Path) -> None:
             parts = ["", *(path.name for path in out.iterdir() if re.fullmatch(r"part-\d+", path.name))]
             places = {f"{part}/{name}".strip("/"): form for part in parts for name, form in WRITTEN.items()}
             remove_files(out, places)
-            for name in sorted(places, reverse=True):  # what a folder holds before the folder
+            for name in sorted(places, reverse=True):  # subfolders before their parent
                 if name and (out / name).exists():
                     (out / name).rmdir()
         out.mkdir(parents=True, exist_ok=True)
@@ -222,7 +228,7 @@ def _check_out(out: Path) -> None:
 
 
 def _load_kernels(like: MapHeader) -> None:
-    """Compile the kernels before any worker starts: two would write the same cache at a time."""
+    """Compile the kernels before the workers start, because two processes must not write one cache at a time."""
     words = np.full((1, VOXELS), MAX_COUNT << 8, np.int32)
     block = FusedRange(morton.encode(np.zeros((1, 3), np.int64)), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
     volume = block.volume(like.volume())
@@ -232,14 +238,12 @@ def _load_kernels(like: MapHeader) -> None:
 
 
 def _pair_entry(runs: tuple[int, int], pairs: Pairs, folders: Sequence[Path], graph: RunGraph) -> dict[str, Any]:
-    """What world.json says about a pair that was compared."""
     out = {"runs": [str(folders[run]) for run in runs]} | pairs[runs].tree()
     rejected = runs in [(join.a, join.b) for join in graph.rejected]
     return out | ({"reason": "other joins contradict it"} if rejected else {})
 
 
 def _why_not(pairs: Pairs) -> str:
-    """The most frequent reason."""
     reasons = [pair.reason for pair in pairs.values()] or ["no places look alike"]
     return max(reasons, key=reasons.count)
 

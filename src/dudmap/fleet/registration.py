@@ -1,12 +1,11 @@
-"""Relative poses of runs, in rounds: similar runs first, then those that the poses found so far bring together.
+"""Relative poses of runs, in rounds: similar runs first, then runs that overlap at the poses found so far.
 
-A pair is compared by features, surfaces and checks, from candidates by place recognition or from the poses of all.
+Candidate pairs come from place recognition or from the pose graph; features, surfaces and checks decide on each pair.
 
-Places are recognised by VLAD (Jegou et al. 2010): the differences of a keyframe's features to their nearest visual
-words, summed by word, each sum normalised (Arandjelovic and Zisserman 2013) and the whole brought to unit length. The
-words are the centres of k-means over features of all runs. The principal components of all descriptors are scaled
-towards equal variance, which lowers the weight of what many places have in common, such as doors and wallpaper
-(whitening, Jegou and Chum 2012). All are compared with all: 10,000 keyframes of 1,000 short runs in seconds.
+Places are recognised by VLAD (Jegou et al. 2010). The differences of a keyframe's features to their nearest visual
+words are summed per word. Each sum is normalised (Arandjelovic and Zisserman 2013), then the whole vector. The words
+are k-means centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components towards
+equal variance, because many places share doors and wallpaper. All keyframes are compared with all.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,36 +28,34 @@ from dudmap.fleet.run_graph import Join, RunGraph, drift_covariance, solve
 from dudmap.fleet.workers import MapHeader, Workers, keyframes_of, surface_of
 
 WORDS = 16
-"""Visual words: a descriptor then has 2048 numbers, 8 KB."""
+"""Visual words; a descriptor then has 2048 numbers, 8 KB."""
 TRAINING = 50_000
-"""Features that the words are learnt from, at most; 3000 for each word."""
+"""Most features that train the words: 3000 per word."""
 COMPONENTS, WHITENING = 256, 0.25
-"""Principal components that are kept, and the power of their variances by which they are divided; 0.5 would also raise
-those that are noise."""
+"""Principal components kept, and the exponent of their variances in the whitening; 0.5 would also amplify noise."""
 LEAST_VARIANCE = 1e-6
-"""Added to each variance, so that copies of one run do not divide by zero; the variances of all components sum to 1 at
-most."""
+"""Added to each variance because copies of one run have none; all variances sum to at most 1."""
 NEIGHBOURS, LEAST_VOTE = 20, 1e-4
-"""Runs that a keyframe votes for, more if they are equally similar, and its vote for the last of them."""
+"""Runs that a keyframe votes for, more if equally similar, and its vote for the last of them."""
 PARTNERS = 8
-"""Runs that each run is compared with; several, since look-alikes compete with the neighbours of a run."""
+"""Runs that each run is compared with; several, because similar places compete with the run's neighbours."""
 
 ALL_PAIRS = PARTNERS
-"""Number of runs up to which all pairs are compared: the index would leave out next to none."""
+"""Number of runs up to which all pairs are compared, because the index would exclude hardly any."""
 Guesses = dict[tuple[int, int], NDArray[np.float64]]
-"""Relative pose at which a pair was compared because the graph had brought it together."""
+"""Relative pose from the graph at which a pair was compared."""
 ROUNDS = 4
-"""Rounds at most; the third and fourth are small."""
+"""Most rounds; the third and fourth are small."""
 MIN_PREDICTED = 0.3
-"""Share of the smaller map that must lie in the other at the poses of the graph for a pair to be compared."""
+"""Smallest predicted overlap for a comparison, as a share of the smaller map."""
 CELL = 0.3
-"""Edge of the cells whose sharing is counted, metres: many times the error of a pose."""
+"""Edge of the cells in which overlap is counted, metres: many times the error of a pose."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
-"""A pair that disagreed at one relative pose says nothing on another that differs by more than this (m, deg)."""
+"""A rejection at one relative pose is not valid for poses that differ by more than this (m, deg)."""
 
 
 def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Visual words (WORDS, 128) of features (n, 128); the same for the same features."""
+    """Visual words (WORDS, 128) of features (n, 128), deterministic."""
     some = features[:: max(1, len(features) // TRAINING)].astype(np.float64)
     count = min(WORDS, len(some))
     words, _ = kmeans2(some, count, iter=20, minit="++", seed=1)  # pyright: ignore[reportCallIssue] (rng from 1.15 on)
@@ -78,10 +75,10 @@ def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDAr
 
 
 def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """How similar the places of each two runs are (n, n), symmetric, 0 on the diagonal, from descriptors (k, d) of
-    each.
+    """Similarity (n, n) of the places of runs from descriptors (k, d) of each; symmetric, 0 on the diagonal.
 
-    Every keyframe votes for the runs with the most similar keyframes, as far as they exceed the last of these runs.
+    Every keyframe votes for the ``NEIGHBOURS`` runs with the most similar keyframes. A vote is the similarity above
+    that of the last of these runs.
     """
     everything = _whitened(np.concatenate(runs))
     sizes = np.array([len(run) for run in runs], np.int64)
@@ -99,17 +96,17 @@ def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b: each run with those that have the most votes (n, n) in its row, at most so many."""
+    """Pairs (a, b), a < b: each run with its ``partners`` most voted runs in ``votes`` (n, n)."""
     best = np.argsort(-votes, axis=1, kind="stable")[:, :partners]
     pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(best) for b in row if votes[a, b] > 0}
     return sorted(pairs)
 
 
 def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), scaled, unit length."""
+    """Whitened principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), unit length."""
     count, size = descriptors.shape
     centred = (descriptors - descriptors.mean(axis=0)).astype(np.float64)
-    wide = count < size  # of the two products, whose eigenvalues are the same, the smaller one
+    wide = count < size  # decompose the smaller of both products; their nonzero eigenvalues are equal
     product = centred @ centred.T if wide else centred.T @ centred
     kept = max(1, min(COMPONENTS, count // 2, size))
     squares, axes = eigh(product, subset_by_index=[len(product) - kept, len(product) - 1])
@@ -120,11 +117,11 @@ def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 Pairs = dict[tuple[int, int], MapPair]
-"""What was found about pairs (a, b) of runs, a < b."""
+"""Results of comparing pairs (a, b) of runs, a < b."""
 
 
 def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
-    """The accepted relative pose of two runs, if there is one."""
+    """Join of the accepted relative pose of two runs, if there is one."""
     T, alignment, agreement = pair.T_a_b, pair.alignment, pair.agreement
     if T is None or alignment is None or agreement is None:
         return None
@@ -132,7 +129,7 @@ def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
 
 
 def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
-    """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, which are all to be compared.
+    """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, of which all pairs are compared.
 
     Raises:
         MapError: A keyframe file is damaged.
@@ -146,8 +143,10 @@ def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
 
 
 def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], workers: Workers, guesses: Guesses) -> Pairs:
-    """Relative pose of each pair of runs, or why they are not to be joined; ``guesses`` are tried before the features.
-    Pairs with the same first run are one job, which reads that run once."""
+    """Compare pairs of runs; ``guesses`` are tried before the features.
+
+    Pairs with the same first run are one job, which reads that run once.
+    """
     groups: dict[int, list[int]] = {}
     for a, b in pairs:
         groups.setdefault(a, []).append(b)
@@ -161,7 +160,7 @@ def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], worke
 
 
 def _sample(job: tuple[Path, int]) -> NDArray[np.float32]:
-    """At most so many features (n, 128) of a run, evenly spread."""
+    """Evenly spaced features (n, 128) of a run, about as many as given."""
     path, count = job
     features = np.concatenate(
         [keyframe.features.descriptors for keyframe in keyframes_of(path)] or [np.zeros((0, 128))]
@@ -174,7 +173,6 @@ def _described(job: tuple[Path, NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def _compare(job: tuple[Path, list[tuple[Path, NDArray[np.float64] | None]]]) -> list[MapPair]:
-    """Decisions on a run and others."""
     a, others = job
     header = MapHeader.read(a / MAP_FILE)
     return [_compare_two(a, b, guess, header) for b, guess in others]
@@ -185,8 +183,8 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
         pair = decided(surface_of(a), surface_of(b), [Hypothesis(guess, 0, 0)], many=True)
         if pair.agreement is not None:
             return pair
-    # a single recognised keyframe is enough: the features of a look-alike may outnumber those of the place itself, and
-    # the checks are stricter here
+    # one recognised keyframe is enough, because the checks are stricter here: a similar place may have more matching
+    # features than the place itself
     found = relative_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor)
     if not found:
         return MapPair(None, NOT_RECOGNISED)
@@ -194,10 +192,11 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
 
 
 def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str], None]) -> tuple[Pairs, RunGraph]:
-    """Relative poses of pairs of runs, and the poses of all.
+    """Relative poses of pairs of runs, and the poses of all runs.
 
-    The first round compares each run with the most similar others. Each further round compares runs that overlap at the
-    poses found so far, from these poses, and runs of the smaller groups with the next similar runs of other groups.
+    The first round compares each run with its most similar runs. Each further round compares runs that overlap at the
+    current poses, starting from these poses. It also compares runs of smaller groups with the next similar runs of
+    other groups.
 
     Raises:
         MapError: A file is damaged.
@@ -222,7 +221,7 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
 
 
 def _graph(count: int, found: Pairs, guesses: Guesses) -> RunGraph:
-    """Poses of the runs from all joins, without those that pairs brought together by them deny."""
+    """Solve the graph from all joins; solve again without joins that contradicted guesses deny."""
     joins = [join for runs, pair in found.items() if (join := join_of(runs, pair)) is not None]
     graph = solve(count, joins)
     denied = [pair for pair, guess in guesses.items() if found[pair].contradicted and _is_at(graph, pair, guess)]
@@ -250,7 +249,7 @@ def _brought_together(
 
 
 def predicted_overlap(points: Sequence[NDArray[np.float64]], cell: float) -> NDArray[np.float32]:
-    """Shares (n, n) of the cells of the smaller of two sets of points (k, 3) that both reach; 0 on the diagonal."""
+    """Common cells of two sets of points (k, 3) as a share (n, n) of the smaller set; 0 on the diagonal."""
     cells = [np.unique(morton.encode(np.floor(own / cell).astype(np.int64))) for own in points]
     sizes = np.array([len(own) for own in cells])
     _, columns = np.unique(np.concatenate(cells), return_inverse=True)
@@ -262,13 +261,13 @@ def predicted_overlap(points: Sequence[NDArray[np.float64]], cell: float) -> NDA
 
 
 def _more_partners(graph: RunGraph, similar: NDArray[np.float32], found: Pairs) -> list[tuple[int, int]]:
-    """Pairs of runs of different groups: each run of a smaller group with the next similar ones."""
+    """Pairs of runs in different groups: each run of a smaller group with its next similar runs."""
     left = similar.copy()
     for a, b in found:
         left[a, b] = left[b, a] = 0
     for part in graph.components:
         left[np.ix_(part, part)] = 0
-    left[graph.components[0]] = 0  # the others ask the largest group, not the other way round
+    left[graph.components[0]] = 0  # smaller groups query the largest group, not the reverse
     return most_similar(left, PARTNERS)
 
 

@@ -1,8 +1,8 @@
-"""Poses of many runs from relative poses of pairs: rejection by cycles, and a pose graph with robust weights.
+"""Poses of many runs from pairwise relative poses: rejection by cycles, then a robust pose graph.
 
-Relative poses around a cycle must compose to the identity. Where a cycle does not close, the relative poses in it that
-no other cycle confirms are given up, all of them if it cannot be told which one is wrong: a false join costs more than
-a missed one. What is left is optimised with a Huber kernel.
+Relative poses around a cycle must compose to the identity. If a cycle does not close, its joins that no other cycle
+confirms are rejected, because a false join costs more than a missed one. The remaining joins are optimised with a Huber
+kernel.
 """
 
 from collections import deque
@@ -20,24 +20,24 @@ from dudmap.core.places.pose_graph import Edge, optimize
 Pair = tuple[int, int]
 
 SIGMA_DISTANCE, SIGMA_ANGLE = 0.01, np.radians(0.2)
-"""Standard deviation of a relative pose of two runs at the middle of their common surface (m, rad), per axis: drift
-within the runs. The surfaces themselves determine it more exactly."""
+"""Standard deviation per axis of a relative pose of two runs, at the middle of their common surface (m, rad): drift
+within the runs. The alignment of the surfaces is more exact."""
 HALF = 0.5
-"""Overlap for which these hold. Joins of rendered runs with more than half of the smaller map in common are off by
-4.4 mm (root mean square), with 35 to 50 % by 4.9, with 25 to 35 % by 11.8, and with less by 17 mm."""
+"""Overlap at which these standard deviations hold. Joins of rendered runs err by 4.4 mm (root mean square) above half
+overlap. They err by 4.9 mm at 35 to 50 %, 11.8 mm at 25 to 35 %, and 17 mm below."""
 CHI_SQUARE = 22.46
-"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, in
+"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of a cycle's squared error, in
 standard deviations."""
 HUBER = 1.345
 """Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
 
 
 def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
-    """Edges that separate at least as many pairs ``apart`` as they are; of all minimum cuts the one with most pairs per
-    edge.
+    """Cut of a graph that separates at least as many pairs ``apart`` as it has edges; empty if there is none.
 
-    The minimum cut between two nodes is found by a maximum flow with one unit per edge (Ford and Fulkerson 1956), the
-    cut nearest to each of the two. No edge stands twice in ``edges``. Empty if there is none.
+    Of all minimum cuts between such pairs, the one with most separated pairs per edge is returned as edge indices.
+    Minimum cuts follow from maximum flow with unit capacities (Ford and Fulkerson 1956), on the side of either node.
+    ``edges`` must be unique.
     """
     if not edges or not apart:
         return set()
@@ -69,7 +69,6 @@ def _matrix(ends: np.ndarray, count: int) -> csr_array:
 
 
 def _labels(ends: np.ndarray, count: int) -> np.ndarray:
-    """Number of the component of each node."""
     return connected_components(_matrix(ends, count), directed=False)[1]
 
 
@@ -79,8 +78,8 @@ def drift_covariance(
     """Covariance (6, 6) of a relative pose (4, 4), see ``Join``: drift at the middle (3,) of the common surface.
 
     A twist about that point c becomes one about the origin of a by ``v = v_c + c x omega``, and ``exp(d) T = T exp(e)``
-    with ``e = Ad(T)^-1 d``. The standard deviation is proportional to the square of ``HALF / overlap``, the share of
-    the smaller map that is common.
+    with ``e = Ad(T)^-1 d``. The standard deviation is proportional to the square of ``HALF / overlap``, where overlap
+    is the common share of the smaller map.
     """
     shift = np.eye(6)
     shift[:3, 3:] = se3.hat(center)
@@ -94,7 +93,7 @@ def _usual_covariance() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """Relative pose of two runs: ``T_a_b`` (4, 4) brings the world of run b to that of run a.
+    """Relative pose of two runs: ``T_a_b`` (4, 4) maps the world of run b to the world of run a.
 
     Its error is ``T_a_b exp(e)`` with a twist e = (v, omega) of this covariance (6, 6).
     """
@@ -105,7 +104,7 @@ class Join:
     covariance: NDArray[np.float64] = field(default_factory=_usual_covariance)
 
     def motion(self, start: int) -> NDArray[np.float64]:
-        """World of the other run to that of ``start``."""
+        """Pose (4, 4) of the other run in the world of ``start``."""
         return self.T_a_b if start == self.a else se3.inverse(self.T_a_b)
 
     def motion_covariance(self, start: int) -> NDArray[np.float64]:
@@ -117,14 +116,18 @@ class Join:
 
 
 Cycle = list[tuple[Join, int]]
-"""Joins around a cycle, each with the run that it is left from."""
+"""Joins around a cycle, each with the run that it starts at."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunGraph:
-    """Poses of runs: the runs that are joined with each other, ascending, the largest component first; the world of
-    each run to that of the first run of its component (n, 4, 4); the joins that were used, and those that contradict
-    others."""
+    """Poses of runs.
+
+    Attributes:
+        components: Joined runs, ascending; the largest component first.
+        Ts: (n, 4, 4) world of each run to the world of the first run of its component.
+        kept, rejected: Joins that were used, and joins that contradict others.
+    """
 
     components: list[list[int]]
     Ts: NDArray[np.float64]
@@ -133,15 +136,17 @@ class RunGraph:
 
 
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
-    """Poses of ``count`` runs from relative poses of pairs; ``denied`` pairs disagree where these put them
-    (``supported``)."""
+    """Poses of ``count`` runs from pairwise relative poses.
+
+    ``denied`` are pairs whose maps disagree at the poses that these joins give (``supported``).
+    """
     kept = consistent(supported(joins, denied))
     parts, Ts = components(count, kept), np.tile(np.eye(4), (count, 1, 1))
     for nodes in parts:
         inside = [join for join in kept if join.a in nodes]
         for node, T in _chained(nodes[0], inside).items():
             Ts[node] = T
-        if len(inside) >= len(nodes):  # with fewer there is no cycle: the tree is the answer
+        if len(inside) >= len(nodes):  # without a cycle the tree is the answer
             edges = [Edge(nodes.index(j.a), nodes.index(j.b), j.T_a_b, SIGMA_DISTANCE, SIGMA_ANGLE) for j in inside]
             Ts[nodes] = optimize(Ts[nodes], edges, np.stack([join.covariance for join in inside]), HUBER)
     return RunGraph(parts, Ts, kept, [join for join in joins if join not in kept])
@@ -155,11 +160,11 @@ def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
 
 
 def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[Join]:
-    """Joins without those that at least as many pairs of runs deny as there are of them.
+    """Remove joins that at least as many pairs of runs deny.
 
-    A false join brings whole groups of runs to a wrong place, look-alike floors perhaps by several joins that agree
-    with each other. Where runs of both groups then lie at one place they disagree. So the joins between the two sides
-    of a cut are given up if at least as many pairs across it disagree.
+    False joins bring groups of runs to a wrong place, and several may agree with each other in similar places. Runs of
+    both groups that then share a place disagree. The joins across a cut are therefore rejected if at least as many
+    pairs across it disagree.
     """
     left = list(joins)
     while cut := best_cut([(join.a, join.b) for join in left], denied):
@@ -168,11 +173,12 @@ def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[
 
 
 def consistent(joins: Sequence[Join]) -> list[Join]:
-    """Joins without those that a cycle contradicts and none confirms.
+    """Remove joins that a cycle contradicts and none confirms.
 
-    Triangles that close confirm their joins. A join whose ends are connected by confirmed joins is confirmed or given
-    up, whether this cycle closes or not. Of other cycles that do not close all joins that are not confirmed are given
-    up. Joins in no cycle stay.
+    - Triangles that close confirm their joins.
+    - A join between runs that confirmed joins connect is confirmed or rejected by this cycle.
+    - In any other cycle that does not close, all unconfirmed joins are rejected.
+    - Joins in no cycle stay.
     """
     left = list(joins)
     confirmed = {id(join) for cycle in _triangles(left) if _closes(cycle) for join, _ in cycle}
@@ -193,7 +199,6 @@ def consistent(joins: Sequence[Join]) -> list[Join]:
 
 
 def _neighbours(joins: Sequence[Join]) -> dict[int, list[tuple[Join, int]]]:
-    """Joins of every run, with the other run."""
     out: dict[int, list[tuple[Join, int]]] = {}
     for join in joins:
         out.setdefault(join.a, []).append((join, join.b))

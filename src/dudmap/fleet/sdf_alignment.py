@@ -1,7 +1,7 @@
-"""Refinement of the relative pose of two maps: the surface of each is registered to the distances of the other.
+"""Refine the relative pose of two maps by registering the surface of each to the distances of the other.
 
-Points to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013), with the intensities of the
-surfaces as in the tracker (thesis eq. 4.32), in both directions, so that neither map is preferred.
+Surface points are aligned to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013).
+Intensities are aligned as in the tracker (thesis eq. 4.32). Both directions are used, so that neither map is preferred.
 """
 
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ MAX_ITERATIONS = 40
 STOP = 1e-5
 """Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
 MAD, LEAST_SHADE, LEAST_NOISE = 1.4826, 0.005, 0.05
-"""Standard deviation over the median of the absolute values; least standard deviations of an intensity, a grey level of
-255, and of a distance, voxels; steps below the latter are short enough for visits, whose colours may creep on."""
+"""Standard deviation over median absolute value; smallest standard deviations of intensity (0..1) and distance
+(voxels). Shorter steps than the latter end the alignment of visits."""
 COLOR_SHARE = 0.1
-"""Factor of the standardised intensities of visits: those of a real camera are off in the same way over whole features,
-some hundred points, by blur, light and the time between colour and depth, where distances scatter."""
+"""Factor of the standardised intensities of visits. Errors of a real camera's colours are correlated over some hundred
+points, by blur, light and timing; distances scatter independently."""
 SCALE = 0.5
-"""Residual at which the Geman-McClure weight of a distance has fallen to a quarter, voxels: about the standard
-deviation of a surface. What only one of the maps has seen from the front lies up to a truncation distance off."""
+"""Residual at which the Geman-McClure weight of a distance falls to a quarter, voxels: about a surface's standard
+deviation. Surface that only one map saw from the front is up to one truncation distance away."""
 SHRINKING = 0.5
-"""Factor by which that residual becomes smaller from step to step, from the truncation distance on."""
+"""Factor per step of that residual, which starts at the truncation distance."""
 MIN_POINTS = 500
-"""Points on the other map's surface below which the pose is not determined."""
+"""Fewest points on the other map's surface that determine the pose."""
 MIN_STIFFNESS = 0.02
-"""Smallest share of the points that must oppose a motion in every direction: the smallest eigenvalue of the normal
-matrix per point, with angles scaled by the extent of the points, in units of its largest. A plain wall has 0."""
+"""Smallest stiffness of a determined pose: smallest over largest eigenvalue of the normal matrix. Angles are scaled by
+the extent of the points. A plain wall has 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class SdfAlignment:
         T_a_b: (4, 4) world of b to world of a.
         converged: Whether the last step was short and enough points lie on the surface of the other map.
         residual: Root mean square distance of the points, weighted as in the refinement, metres.
-        stiffness: Least opposed direction over most opposed one, 0..1; see ``MIN_STIFFNESS``.
+        stiffness: Smallest over largest eigenvalue, 0..1; see ``MIN_STIFFNESS``.
         center: (3,) middle of the common surface in the world of a, metres.
     """
 
@@ -64,10 +64,11 @@ def align_maps(
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
-    It must be closer than the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a
-    scale ``c`` that shrinks from step to step (as in graduated non-convexity, Yang et al. 2020), intensities
-    the weights of the tracker. ``changed``: Things may have moved or been painted; intensities then have Geman-McClure
-    weights too, and count by their noise against that of the distances.
+    Its error must be below the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2``; the
+    scale ``c`` shrinks per step (graduated non-convexity, Yang et al. 2020). Intensities have the tracker's weights.
+
+    ``changed``: Things may have moved or been painted. Intensities then also have Geman-McClure weights, scaled by the
+    ratio of both noises.
     """
     tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
     center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation
@@ -125,7 +126,7 @@ def _rows(
     *,
     of_a: bool,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Fields of ``_Rows`` of one surface, with points (n, 3) in the world of a, in the other map.
+    """Fields of ``_Rows`` of one surface in the other map, with points (n, 3) in the world of a.
 
     Points of b move by ``v + omega x p`` in map a; map b moves so against the points of a.
     """
@@ -160,14 +161,14 @@ def _stiffness(H: NDArray[np.float64], center: NDArray[np.float64], points: NDAr
     """Smallest over largest eigenvalue of a normal matrix, about the centre of the points, angles scaled by extent."""
     extent = max(float(np.sqrt(np.mean(np.sum(np.square(points - center), axis=1)))), 1e-6)
     shift = np.eye(6)
-    shift[:3, 3:] = se3.hat(center)  # a rotation about the centre is one about the origin and a translation
+    shift[:3, 3:] = se3.hat(center)  # converts a rotation about the centre to one about the origin and a translation
     scale = np.diag([1.0, 1.0, 1.0, 1 / extent, 1 / extent, 1 / extent])
     values = np.linalg.eigvalsh(scale @ shift.T @ H @ shift @ scale)
     return float(max(values[0], 0.0) / max(values[-1], 1e-300))
 
 
 def _exposure(shade_a: NDArray[np.float64], shade_b: NDArray[np.float64]) -> tuple[float, float]:
-    """Gain and offset from the intensities of b to those of a, which give them the same mean and spread."""
+    """Gain and offset that give the intensities of b the mean and spread of a."""
     if len(shade_a) < MIN_POINTS:
         return 1.0, 0.0
     gain = float(np.clip(shade_a.std() / max(shade_b.std(), 1e-6), 0.5, 2.0))

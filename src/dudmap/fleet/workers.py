@@ -1,4 +1,4 @@
-"""The runs of a merge: what is checked before anything is computed, the processes, and what each keeps of them."""
+"""Checks of the runs of a merge, worker processes, and the data that each process caches."""
 
 import multiprocessing
 import os
@@ -36,7 +36,7 @@ MAX_RUNS = 8000
 OPEN_MAPS = 2
 """Whole maps in memory: the two of a pair."""
 SMALL_PARTS = 32
-"""Runs whose keyframes (some MB), surface points (1 MB) or lists of blocks (some MB) are in memory."""
+"""Runs in memory with keyframes (some MB), surface points (1 MB) or block lists (some MB)."""
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -44,8 +44,10 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class MapHeader:
-    """What a map file says without its voxels: the parameters of the volume, the coordinates (n, 3) of its blocks, and
-    which of them (n,) own voxels; the others are known to be empty."""
+    """A map file without its voxels: parameters, block coordinates (n, 3), and which blocks (n,) own voxels.
+
+    Blocks without voxels are known to be empty.
+    """
 
     camera: Camera
     config: VolumeConfig
@@ -56,7 +58,7 @@ class MapHeader:
 
     @classmethod
     def read(cls, path: Path) -> "MapHeader":
-        """Read a map file, whose voxels are not decompressed.
+        """Read a map file without decompressing its voxels.
 
         Raises:
             MapError: The file is damaged or not a map of this version.
@@ -75,7 +77,7 @@ class MapHeader:
 
 
 def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
-    """Check run folders that are to be merged, without reading their voxels; returns the parameters of the first map.
+    """Check run folders before a merge, without reading their voxels; return the parameters of the first map.
 
     Raises:
         ConfigError: There are too few or too many runs, one is named twice, or their voxels differ in size.
@@ -121,7 +123,7 @@ def keyframes_of(run: Path) -> list[Keyframe]:
 
 def surface_of(run: Path) -> MapSurface:
     """Map of a run with points on its surface."""
-    points = _points(run)  # opens the map if they are not known yet
+    points = _points(run)  # opens the map if the points are not cached
     return MapSurface(open_map(run), points)
 
 
@@ -141,8 +143,9 @@ def reached_blocks(run: Path, pose: bytes) -> ReachedBlocks:
 class Workers:
     """Processes with one thread each; a single one is this process.
 
-    ``peak_rss_mb`` is the peak memory of each so far, by its id, empty on Windows; ``cpu_s`` the processor time of all
-    jobs.
+    Attributes:
+        peak_rss_mb: Peak memory by process id; empty on Windows.
+        cpu_s: Processor time of all jobs.
     """
 
     def __init__(self, count: int) -> None:
@@ -160,10 +163,10 @@ class Workers:
             self._pool.shutdown(cancel_futures=True)
 
     def map(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
-        """Results of jobs, in their order.
+        """Yield the results of jobs in their order.
 
         Raises:
-            DudmapError: A worker was ended, by the system as a rule for want of memory.
+            DudmapError: The system ended a worker, usually because memory ran out.
         """
         if self._pool is None:
             measured = (_measured(function, job) for job in jobs)
@@ -184,7 +187,6 @@ class Workers:
 
 
 def _prepare() -> None:
-    """One thread for this worker."""
     import cv2
 
     os.environ["DUDMAP_THREADS"] = "1"
