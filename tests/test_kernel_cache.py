@@ -64,6 +64,10 @@ def cache_of(done):
 
 def test_without_a_folder_for_kernels_all_starts_and_says_so_once(stranger):
     done = stranger("-c", "from dudmap import Slam, run")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    program = "import numpy; from dudmap.core.backends.cpu.filtering import pad, intensities; "
+    program += "intensities(0, 1, numpy.ones((1, 1, 3), 'u1'), numpy.ones((1, 1), 'f4')); pad.stats.cache_path"
+    done = stranger("-c", program)
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.count("KernelCacheWarning") == 1
     assert "NUMBA_CACHE_DIR" in done.stderr

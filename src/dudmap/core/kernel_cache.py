@@ -9,12 +9,14 @@ import os
 import stat
 import tempfile
 import warnings
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from numba.core import caching
 from numba.core.dispatcher import Dispatcher
+
+from dudmap.core.kernel_digest import digest, layout
 
 _KINDS: dict[str, Any] = {
     kind.__name__.lstrip("_").removesuffix("CacheLocator"): kind for kind in caching.CacheImpl._locator_classes
@@ -53,12 +55,41 @@ def environment() -> dict[str, str]:
     return {"NUMBA_CACHE_DIR": str(_private())} if is_temporary() else {}
 
 
-def store(kernel: Dispatcher, stamp: str) -> None:
-    """Load the compiled forms of a kernel from the folder and store them there, until ``stamp`` changes."""
-    try:
-        vars(kernel)["_cache"] = _Cache(kernel.py_func, stamp)
-    except RuntimeError:  # Numba found no folder
-        _say_once("in memory, at each start, for one to two minutes")
+def store(kernel: Dispatcher) -> None:
+    """Load the compiled forms of a kernel from the folder and store them there, until its ``digest`` changes."""
+    vars(kernel)["_cache"] = _Store(kernel)
+
+
+class _Store(caching.NullCache):
+    """Compiled forms of one kernel. The folder is opened when the first of them is needed."""
+
+    def __init__(self, kernel: Dispatcher) -> None:
+        self._kernel = kernel
+
+    @cached_property
+    def _folder(self) -> caching._Cache:
+        try:
+            return _Cache(self._kernel.py_func, digest(self._kernel))
+        except RuntimeError:  # Numba found no folder
+            _say_once("in memory, at each start, for one to two minutes")
+            return caching.NullCache()
+
+    @property
+    def cache_path(self) -> Any:  # noqa: ANN401 - as Numba has it
+        """The folder, None if there is none."""
+        return self._folder.cache_path
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
+        """The compiled form for a signature, None if it has to be compiled."""
+        return self._folder.load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ANN401
+        """Store a compiled form."""
+        self._folder.save_overload(sig, cres)
+
+    def flush(self) -> None:
+        """Forget the compiled forms."""
+        self._folder.flush()
 
 
 class _Cache(caching.FunctionCache):
@@ -89,6 +120,9 @@ class _Cache(caching.FunctionCache):
                 super().save_overload(sig, data)
         except OSError as error:
             _say_once(f"in memory, since {self.cache_path} cannot be written ({error.strerror})")
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:  # noqa: ANN401
+        return layout(sig), codegen.magic_tuple()
 
 
 class _Locator:

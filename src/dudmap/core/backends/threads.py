@@ -6,8 +6,6 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 
 import atexit
 import gc
-import hashlib
-import inspect
 import os
 import sys
 import threading
@@ -16,7 +14,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cache, cached_property, partial, update_wrapper
 from importlib import import_module
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -110,31 +107,13 @@ if version_info.short == (0, 68):  # whose private parts these are; others compi
     _compare_flags_at_once()
 
 
-@cache
-def sources(file: str) -> str:
-    """Digest of a kernel's file and of all others whose text or constants kernels are compiled from. The times of their
-    changes do not enter it: a file that is written anew as it was costs no compilation."""
-    folder = Path(__file__).parent
-    folders = folder, folder / "cpu", folder.parent / "formulas"
-    files = {Path(file), *(path for each in folders for path in each.glob("*.py"))}
-    return hashlib.sha256(repr([(path.name, _digest(path)) for path in sorted(files)]).encode()).hexdigest()
-
-
-@cache
-def _digest(file: Path) -> bytes:
-    return hashlib.sha256(file.read_bytes()).digest()
-
-
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a kernel and stores it until one of the ``sources`` changes.
-
-    Numba itself only asks whether the file of the kernel has changed, and not those of the functions inlined into it.
-    """
+    """Decorator that compiles a kernel and stores it until its text or that of a function it inlines changes."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = njit(**(_OPTIONS | options))(function)
         if isinstance(kernel, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
-            store(kernel, sources(inspect.getfile(function)))
+            store(kernel)
         return kernel
 
     return decorate
