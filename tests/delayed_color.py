@@ -1,5 +1,6 @@
 """A recording whose colour is taken after the depth, and a self-calibration that finds it out after a few frames."""
 
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -23,4 +24,13 @@ class KnownDelay(CalibrationEstimator):
 def find_early(monkeypatch, attempts):
     """Let the self-calibration estimate after these numbers of frames."""
     monkeypatch.setattr(self_calibration, "ATTEMPTS", attempts)
+    monkeypatch.setattr(self_calibration, "USED_AFTER", 0)
     monkeypatch.setattr(self_calibration, "CalibrationEstimator", KnownDelay)
+    monkeypatch.setattr(self_calibration, "estimate_beside", _estimated)
+
+
+def _estimated(estimator, keyframes) -> Future:
+    """Result of an estimation in this process, where the class above is known."""
+    future = Future()
+    future.set_result(estimator.estimate(keyframes))
+    return future

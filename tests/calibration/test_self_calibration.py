@@ -2,7 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from threading import Event
+from threading import Event, Timer
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.faults import SensorFaults
 
 SMALL = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
-FRAMES, FIRST = 24, 12
+FRAMES, FIRST = 36, 12
 UNREGISTERED = {"color_translation": (0.04, 0.0, 0.0), "color_focal_ratio": 0.92}
 
 
@@ -44,7 +44,7 @@ class Estimator:
     def __init__(self, result: Calibration) -> None:
         self.result, self.may, self.keyframes = result, Event(), []
 
-    def __call__(self, given, sensor, workers):
+    def __call__(self, given, sensor):
         return self
 
     def estimate(self, keyframes):
@@ -56,6 +56,7 @@ class Estimator:
 @pytest.fixture
 def estimator(monkeypatch):
     monkeypatch.setattr(self_calibration, "ATTEMPTS", (FIRST,))
+    monkeypatch.setattr(self_calibration, "USED_AFTER", 0)
     made = Estimator(truth_of(recording(**UNREGISTERED)))
     monkeypatch.setattr(self_calibration, "CalibrationEstimator", made)
     with ThreadPoolExecutor(1) as beside:
@@ -73,7 +74,7 @@ def observations(count: int):
 
 
 def when_found(live: bool, estimator) -> int | None:
-    """Frame with which a result is found; live it is there from two frames after the beginning of the estimation on."""
+    """Frame with which a result is found; live it exists two frames after the estimation began."""
     if not live:
         estimator.may.set()
     calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig(), live=live)
@@ -88,10 +89,26 @@ def when_found(live: bool, estimator) -> int | None:
     return None
 
 
-def test_a_recording_waits_for_the_result_and_a_live_camera_uses_it_as_soon_as_it_is_there(estimator):
+def test_a_live_camera_uses_a_result_as_soon_as_it_exists_and_a_recording_always_at_the_same_frame(
+    estimator, monkeypatch
+):
     assert when_found(True, estimator) == FIRST + 2
-    assert when_found(False, estimator) == FIRST
+    monkeypatch.setattr(self_calibration, "USED_AFTER", 3)
+    assert when_found(False, estimator) == FIRST + 3
     assert estimator.keyframes[0] >= 2
+
+
+def test_a_frame_waits_only_for_a_result_that_is_late(estimator, monkeypatch):
+    monkeypatch.setattr(self_calibration, "USED_AFTER", 3)
+    calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig())
+    found = []
+    for observation, T, mask in observations(FIRST + 3):
+        calibrating.add(observation, T, mask, 0)
+        if calibrating._running is not None and calibrating._frames == FIRST + 3:
+            Timer(0.2, estimator.may.set).start()
+        found.append(calibrating.found() is not None)
+    assert found == [False] * (FIRST + 2) + [True]
+    assert calibrating.waits == 1
 
 
 def test_what_is_as_given_changes_nothing(estimator):
@@ -129,13 +146,12 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator, ahe
     slam = Slam(SMALL, config)
     views = [slam.prepare(faulty[index]) for index in range(FRAMES)] if ahead else faulty
     results, before = [], None
-    for index in range(FIRST + 3):
+    for index in range(FRAMES):
         results.append(slam.process(views[index]))
         if index == FIRST - 1:
             T = results[8].T_world_camera
             before = color_error(slam, exact[8], T)
-    # the first frame, of which the map is made, is not registered to it
-    assert [n for n, result in enumerate(results) if result.calibrated] == [FIRST]
+    assert sum(result.calibrated for result in results) == 1
     assert slam.calibration.tree() == estimator.result.tree()
     assert all(result.state == "tracked" for result in results)
     assert color_error(slam, exact[8], T) < 0.7 * before
@@ -145,10 +161,10 @@ def test_only_frames_since_it_is_known_that_stamps_are_late_have_poses_at_other_
     estimator.may.set()
     estimator.result = replace(Calibration.registered(SMALL), depth_late=0.02, estimated=("delay",))
     slam, frames = Slam(SMALL), recording()
-    for index in range(FIRST + 3):
-        slam.process(frames[index])
+    calibrated = [slam.process(frames[index]).calibrated for index in range(FRAMES)]
+    assert any(calibrated[FIRST:])
     images, stamps = slam.image_poses.Ts_world_camera, slam.trajectory.Ts_world_camera
-    assert (images != stamps).any(axis=(1, 2)).tolist() == [n > FIRST for n in range(FIRST + 3)]
+    assert (images != stamps).any(axis=(1, 2)).tolist() == [n > calibrated.index(True) for n in range(FRAMES)]
 
 
 def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estimator):

@@ -182,12 +182,14 @@ def test_a_map_is_painted_anew_over_many_frames_as_it_is_at_once():
         atlas, frames = walked(), 0
         before = content(atlas.volume)
         atlas.history.registered = lambda frame: replace(frame, color=255 - frame.color)
-        atlas.recolor(gradually=gradually)
+        atlas.recolor()
+        if not gradually:
+            atlas.complete()
         while atlas.repainting is not None:
             assert content(atlas.volume) == before
             atlas.continue_rebuilding()
             frames += 1
-        assert frames == (COUNT if gradually else 0)
+        assert frames == (-(-COUNT // PER_FRAME) if gradually else 0)
         painted.append(content(atlas.volume))
         assert painted[-1] != before
     assert painted[0] == painted[1]

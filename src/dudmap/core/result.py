@@ -213,6 +213,11 @@ class SlamResults:
         return replace(self.color_calibration.current)
 
     @property
+    def calibration_waits(self) -> int:
+        """Frames that waited for a calibration estimated in another process."""
+        return self.color_calibration.waits
+
+    @property
     def rigid_objects(self) -> list[RigidObject]:
         """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of the rigid ones."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})

@@ -53,7 +53,7 @@ class ThesisSlam:
         color_error: (h, w) float32 error e_c of the last registered frame (eq. 4.49); NaN without colour in the map.
     """
 
-    first_pass, localize, device = None, False, "cpu"
+    first_pass, localize, device, calibration_waits = None, False, "cpu", 0
 
     def __init__(
         self, camera: Camera, config: ThesisConfig | None = None, calibration: Calibration | None = None

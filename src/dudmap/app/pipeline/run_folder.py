@@ -207,6 +207,7 @@ def write_run_folder(
     metrics |= record.metrics() | {
         "map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes, "mesh_vertices": 0, "mesh_triangles": 0,
         "maps": len(others) + 1, "calibration": calibration.tree(),
+        "calibration_waits": slam.calibration_waits,
     }  # fmt: skip
 
     if poses is not None:

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config, SensorConfig
-from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.estimation_process import estimate_beside
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
-from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector
+from dudmap.core.calibration.keyframes import KeyframeCollector
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.calibration import Calibration
@@ -22,16 +21,26 @@ from dudmap.core.tracking.frame_view import FrameView
 ATTEMPTS = (120, 240, 480, 960)
 """Numbers of tracked frames after which the calibration is estimated from the keyframes so far: after the four seconds
 of hand-held motion that show every fault, and each time after twice as long, as more was seen."""
+USED_AFTER = 60
+"""Tracked frames between the beginning of an estimation and the use of its result: two seconds at 30 Hz, in which a
+process of its own on a second core has estimated."""
 
 
 class SelfCalibration(Stateful):
     """Estimates the calibration from time to time while frames are tracked.
 
-    Each estimate starts from the calibration as given and takes all keyframes of the current submap, whose colours are
-    kept as they were recorded, so that it does not matter with which calibration they were tracked.
+    Each estimate starts from the calibration as given. It takes all keyframes of the current submap, with their colours
+    as recorded, so that it does not depend on the calibration they were tracked with. It runs in another process.
 
-    ``live``: It is estimated beside the frames and used as soon as it is there. A recording, whose result must not
-    depend on the machine, waits for it. ``estimate`` is the last one that was finished; None before.
+    Args:
+        given: The calibration to begin with.
+        sensor: Noise of the sensor.
+        live: Use a result as soon as it exists. Otherwise it is used ``USED_AFTER`` frames later, on every machine; a
+            frame waits there only for a result that is late.
+
+    Attributes:
+        estimate: The last finished estimate; None before.
+        waits: Frames that waited for a result.
     """
 
     estimate: Remembered[Estimate | None] = None
@@ -40,6 +49,8 @@ class SelfCalibration(Stateful):
     _frames: Remembered[int] = 0
     _submap: Remembered[int] = 0
     _running: Remembered[Future[Estimate] | None] = None
+    _used_from: Remembered[int] = 0
+    waits: Remembered[int] = 0
 
     def __init__(self, given: Calibration, sensor: SensorConfig, *, live: bool = False) -> None:
         self.given = given
@@ -71,9 +82,8 @@ class SelfCalibration(Stateful):
         self._collector.add(observation, T_world_camera, dynamic_mask)
         if self._frames >= self._attempts[0] and self._running is None:
             self._attempts.pop(0)
-            estimator = CalibrationEstimator(self.given, self.sensor, 1 if self.live else num_threads())
-            start = estimate_beside if self.live else _estimated
-            self._running = start(estimator, self._collector.keyframes)
+            self._used_from = self._frames + USED_AFTER
+            self._running = estimate_beside(CalibrationEstimator(self.given, self.sensor), self._collector.keyframes)
             if not self._attempts:
                 self._collector.clear()
 
@@ -85,17 +95,11 @@ class SelfCalibration(Stateful):
 
     def found(self) -> Calibration | None:
         """A calibration that is to be used from the next frame on; None if the one in use stays."""
-        if self._running is None or not self._running.done():
+        if self._running is None or not (self._running.done() if self.live else self._frames >= self._used_from):
             return None
+        self.waits += not self._running.done()
         self.estimate, self._running = self._running.result(), None
         return self.estimate.calibration if self.estimate.calibration.estimated else None
-
-
-def _estimated(estimator: CalibrationEstimator, keyframes: list[ColorKeyframe]) -> "Future[Estimate]":
-    """Result of an estimation that is waited for."""
-    future: Future[Estimate] = Future()
-    future.set_result(estimator.estimate(keyframes))
-    return future
 
 
 class ColorCalibration(Stateful):
@@ -108,10 +112,11 @@ class ColorCalibration(Stateful):
             standard deviations are known, is kept.
         atlas: The maps and the stored frames.
         color_motion: Registers the colours of the frames.
-        live: Frames do not wait for a calibration.
+        live: Use a calibration as soon as it is estimated.
     """
 
     _estimation: Remembered[SelfCalibration | None]
+    _next: Remembered[Calibration | None] = None  # used once the current map is repainted
 
     def __init__(
         self,
@@ -123,7 +128,7 @@ class ColorCalibration(Stateful):
         *,
         live: bool,
     ) -> None:
-        self._camera, self._live = camera, live
+        self._camera = camera
         self._start = start or Calibration.registered(camera)
         self._atlas = atlas
         self._color_motion = color_motion
@@ -136,9 +141,14 @@ class ColorCalibration(Stateful):
             self._estimation = SelfCalibration(self._start, config.sensor, live=live)
 
     @property
+    def waits(self) -> int:
+        """Frames that waited for a calibration."""
+        return 0 if self._estimation is None else self._estimation.waits
+
+    @property
     def current(self) -> Calibration:
-        """The calibration in use."""
-        return self._color_motion.calibration or self._start
+        """The newest calibration."""
+        return self._next or self._color_motion.calibration or self._start
 
     def update(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
@@ -152,21 +162,22 @@ class ColorCalibration(Stateful):
             corrected: A loop was closed with the frame.
 
         Returns:
-            Whether a new calibration is in use from the next frame on, with which the maps were repainted.
+            Whether the next frame is the first with a new calibration: the maps have been repainted with it.
         """
-        if self._estimation is None or self._estimation.finished:
+        if self._estimation is None or (self._estimation.finished and self._next is None):
             return False
         with view.timer("calibrate"):
             if corrected or view.without_image:
                 self._estimation.interrupt(moved=corrected)
             else:
                 self._estimation.add(view.observation, T_world_camera, dynamic_mask, self._atlas.current)
-            found = self._estimation.found()
-            if found is None:
+            if self._next is None and (found := self._estimation.found()) is not None:
+                self._next = found
+                self._atlas.recolor()
+            if self._next is None or self._atlas.repainting is not None:
                 return False
-            self._color_motion.use(found, view.timestamp)
-            self._atlas.depth_late = found.depth_late
-            self._atlas.recolor(gradually=self._live)
+            self._color_motion.use(self._next, view.timestamp)
+            self._atlas.depth_late, self._next = self._next.depth_late, None
             return True
 
     def interrupt(self) -> None:
@@ -175,6 +186,7 @@ class ColorCalibration(Stateful):
             self._estimation.interrupt()
 
     def _registered(self, stored: Frame) -> Frame:
-        """A stored frame with its colours registered with the calibration in use."""
+        """A stored frame with its colours registered with the newest calibration."""
         velocity = self._atlas.velocity_at(stored.timestamp)
-        return self._color_motion.frame_with_colors(stored, self._camera, velocity)
+        calibration = self._next or self._color_motion.calibration
+        return self._color_motion.frame_with_colors(stored, self._camera, velocity, calibration)

@@ -138,11 +138,11 @@ class Atlas(Stateful):
         if self.history is not None:
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
-    def recolor(self, *, gradually: bool = False) -> None:
+    def recolor(self) -> None:
         """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
 
-        A saved map keeps its colours: not all its frames are stored. ``gradually`` paints the current map over the
-        frames to come, so that none of them has to wait.
+        The current map is painted over the next frames, so that none of them waits. A saved map keeps its colours,
+        because not all its frames are stored.
         """
         assert self.history is not None
         self.complete()
@@ -150,7 +150,7 @@ class Atlas(Stateful):
             if number == self.saved:
                 continue
             self.repainting = MapRebuilding.of(self.history, number, self.make_volume())
-            if not (gradually and number == self.current):
+            if number != self.current:
                 self._complete_repainting()
         self.switch_to(self.current)
 
@@ -232,8 +232,8 @@ class Atlas(Stateful):
 
     def continue_rebuilding(self) -> None:
         """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames, or with
-        the one that is painted anew, by one frame."""
-        if self.repainting is not None and self.repainting.fuse(1):
+        the one that is painted anew."""
+        if self.repainting is not None and self.repainting.fuse(PER_FRAME):
             self._complete_repainting()
         if not self.rebuildings:
             return

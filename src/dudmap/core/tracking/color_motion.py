@@ -120,17 +120,20 @@ class ColorMotion(Stateful):
             view = self._with_levels(view, velocity)
         return self._with_colors(view, velocity)
 
-    def frame_with_colors(self, frame: Frame, camera: Camera, velocity: NDArray[np.float64]) -> Frame:
+    def frame_with_colors(
+        self, frame: Frame, camera: Camera, velocity: NDArray[np.float64], calibration: Calibration | None
+    ) -> Frame:
         """A frame with its recorded colour registered to the depth.
 
         Args:
             frame: Preprocessed depth, and colour as it was recorded.
             camera: Of the depth image, without distortion.
             velocity: (6,) twist of the camera per second, its own axes.
+            calibration: Of the colour camera; None for colour that is registered already.
         """
-        if self.calibration is None:
+        if calibration is None:
             return frame
-        projection = self._projection(self.calibration, frame, velocity)
+        projection = self._projection(calibration, frame, velocity)
         return replace(frame, color=register_color(frame.rgb, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
@@ -169,7 +172,8 @@ class ColorMotion(Stateful):
 
     def _projection(self, calibration: Calibration, frame: Frame, velocity: NDArray[np.float64]) -> ColorProjection:
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
-        if frame.timestamp <= self._rectified_from:  # its depth has the rows' motion that its colours share
+        readout = calibration.depth_readout
+        if frame.timestamp <= self._rectified_from or readout != self._depth_readout:  # its depth is as recorded
             calibration = replace(calibration, depth_readout=0.0)
         return color_projection(calibration, velocity, offset)
 
