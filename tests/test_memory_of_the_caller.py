@@ -279,7 +279,7 @@ class Fresh(OneBuffer):
 class Watcher:
     """Keeps the images of the frames that a run reports."""
 
-    beside = False
+    in_background = False
 
     def __init__(self):
         self.images = []

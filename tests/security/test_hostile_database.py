@@ -65,7 +65,7 @@ def test_a_database_with_other_tables_is_not_read(statements, path):
         if "no such module" not in str(error):
             raise
         pytest.skip(str(error))
-    with pytest.raises(StateError, match="damaged or not of this program: its tables are not those of a state"):
+    with pytest.raises(StateError, match="damaged or not of this program: it has other tables than a state"):
         StateReader(path)
 
 
@@ -103,7 +103,7 @@ def test_a_tree_that_is_a_bomb(path):
 def test_a_journal_is_not_played_back(path, tmp_path):
     """A rollback journal may name another file, which SQLite deletes afterwards."""
     path.with_name("state.db-journal").write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(1000))
-    with pytest.raises(StateError, match=r"there is a state\.db-journal beside .*; remove it"):
+    with pytest.raises(StateError, match=r"found a state\.db-journal next to .*: remove it"):
         StateReader(path)
 
 

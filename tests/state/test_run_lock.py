@@ -111,11 +111,11 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
     with pytest.raises(StateError, match="was written by another version of dudmap"):
         resume(out)
     database.write_meta({"code": code_fingerprint(), "recording": "of another room"})
-    with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
+    with pytest.raises(StateError, match="the recording desk has changed since the run"):
         resume(out)
     database.write_meta({"recording": recording_fingerprint(sequence), "options": options | {"max_frames": "four"}})
     with pytest.raises(StateError, match="is damaged or not the state of a run"):
         resume(out)
     database.write_meta({"options": options, "next": 3, "frame": "of another frame"})
-    with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
+    with pytest.raises(StateError, match="the recording desk has changed since the run"):
         resume(out)

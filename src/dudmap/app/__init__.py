@@ -1,1 +1,1 @@
-"""A run: frames in, a run folder out, its state, and what a person sees of it."""
+"""A run: its processing into a run folder, its stored state, and its views for people."""

@@ -1,4 +1,4 @@
-"""Checks of an installation, each with what was found and what to do about it."""
+"""Check an installation; each check has a finding and a remedy."""
 
 import os
 import platform
@@ -17,28 +17,28 @@ from dudmap.errors import DudmapError
 from dudmap.extras import install
 
 COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
-"""What is said before a first frame where none is compiled."""
+"""Message before a first frame without compiled kernels."""
 
 PYTHON = ((3, 11), (3, 14))
-"""First version of Python that is supported, and the first that is not."""
+"""First supported version of Python, and first unsupported one."""
 PORT = 8080
 """Port of the page of --view."""
 FEATURES = ("avx2", "fma")
-"""What processors of Intel and AMD have had since 2013, and the kernels profit from."""
+"""Instruction sets of Intel and AMD processors since 2013 that speed up the kernels."""
 FREE_BYTES = 2**31
-"""Space below which a folder counts as nearly full: a map and the results of a long run."""
+"""Smallest free space of a folder: a map and the results of a long run."""
 State = Literal["good", "note", "bad"]
 
 
 @dataclass(frozen=True)
 class Check:
-    """One checked thing.
+    """Result of a check.
 
     Attributes:
-        name: What was checked.
-        state: "good"; "note" for what limits a part of the program; "bad" for what stops it.
-        found: What was found.
-        mend: What to do about it, empty if nothing.
+        name: Checked thing.
+        state: "good"; "note" limits a part of the program; "bad" stops it.
+        found: Finding.
+        mend: Remedy, empty if none is needed.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Check:
 
 
 def checks() -> Iterator[Check]:
-    """All checks, quick ones only: nothing is compiled, and nothing outside of this machine is asked."""
+    """Run all checks; all are quick: they compile nothing and use no network."""
     yield _python()
     yield from _packages()
     yield _processor()
@@ -127,7 +127,7 @@ def _caches() -> Iterator[Check]:
 
     try:
         yield _kernel_cache()
-    except ImportError:  # of Numba, which the check of the threads reports
+    except ImportError:  # the check of the threads reports a missing Numba
         pass
     try:
         archives = cache_folder()
@@ -143,7 +143,6 @@ def _caches() -> Iterator[Check]:
 
 
 def _kernel_cache() -> Check:
-    """Folder of the compiled kernels."""
     from dudmap.core import kernel_cache
 
     name, folder, count = "kernel cache", kernel_cache.folder(), kernel_cache.count()
@@ -191,7 +190,7 @@ def _port() -> Check:
 
 
 def not_writable(folder: Path) -> str:
-    """Why nothing can be written into a folder or where it would be made; empty if all is well."""
+    """Why a folder, or its nearest existing parent, cannot be written; empty if it can."""
     place = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     try:
         with tempfile.TemporaryFile(dir=place):
@@ -203,7 +202,7 @@ def not_writable(folder: Path) -> str:
 
 
 def requirements() -> list[tuple[str, str, str]]:
-    """Name, lowest version and extra (empty: required) of the packages that dudmap says it uses on this system."""
+    """Name, lowest version and extra (empty: required) of the packages that dudmap needs on this system."""
     found: dict[tuple[str, str], str] = {}
     for line in requires("dudmap") or []:
         name = re.match(r"[A-Za-z0-9._-]+", line)
@@ -214,7 +213,7 @@ def requirements() -> list[tuple[str, str, str]]:
 
 
 def installed(name: str) -> str | None:
-    """Version of an installed package; None if it is not there."""
+    """Version of an installed package; None if it is missing."""
     try:
         return version(name)
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""What is printed: names of files are shown as they are, whatever a terminal or markup would make of them."""
+"""Print text without interpreting control characters or markup in file names."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,12 +19,12 @@ def say(text: object, *, err: bool = False) -> None:
 
 
 def lines(text: str) -> str:
-    """A text whose lines are ``printable``."""
+    """Apply ``printable`` to every line of a text."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Console
-    """Console on which texts are ``printable`` and hold no markup; styles are given by ``rich.text.Text`` only."""
+    """Console that prints texts as ``printable`` and without markup; only ``rich.text.Text`` has styles."""
     from rich.console import Console  # here, as its import takes a third of the time of the program's start
 
     class PlainConsole(Console):
@@ -37,9 +37,10 @@ def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Conso
 
 @contextmanager
 def counted(name: str, *, quiet: bool, console: "Console | None" = None) -> Iterator[Callable[[int, int], None]]:
-    """Bar on stderr, if that is a terminal; gives a function that takes the number of finished frames and of all.
+    """Show a progress bar on stderr, if it is a terminal; yield a function of the numbers of finished and of all
+    frames.
 
-    A turning mark and the seconds show that the program works, also while it compiles and no frame is finished.
+    A spinner and the seconds show activity while kernels compile.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

@@ -8,17 +8,17 @@ from types import TracebackType
 from dudmap.core.objects.moving_objects import MOST_WAITING
 
 WAITING = 2
-"""Jobs that wait at most for the other thread: each holds the images of a frame."""
+"""Most jobs that wait for the other thread; each holds the images of a frame."""
 POSTPONED = MOST_WAITING
-"""Jobs that wait at most for an idle moment: those of a second. A live run without idle moments so gives up the moving
-objects of its older frames (``MovingObjects``), not frames."""
+"""Most jobs that wait for an idle moment: one second of frames. A live run without idle moments discards moving objects
+of older frames (``MovingObjects``), not frames."""
 
 
 class Background:
-    """Does jobs in the order in which they are given; an error of one is raised by a later call.
+    """Does jobs in order; a later call raises the error of a job.
 
-    They are done in another thread; those of a live run, whose frames should not have to share two cores with them, are
-    ``postponed`` until the caller has nothing else to do.
+    Another thread does them. ``postponed`` jobs of a live run wait until the caller is idle, because its frames need
+    both cores.
     """
 
     def __init__(self, *, postponed: bool = False) -> None:
@@ -37,12 +37,12 @@ class Background:
         except Exception as of_job:
             if error is None:
                 raise
-            error.add_note(f"work beside the frames failed, too: {of_job!r}")
+            error.add_note(f"background work for the frames failed, too: {of_job!r}")
         finally:
             self._thread.shutdown()
 
     def do(self, job: Callable[[], None]) -> None:
-        """Have a job done, as soon as no more than ``WAITING`` others are left (``POSTPONED``, if they are)."""
+        """Add a job, once at most ``WAITING`` others are left (``POSTPONED`` for postponed jobs)."""
         if self._postponed is None:
             self.wait(WAITING)
             self._jobs.append(self._thread.submit(job))
@@ -51,14 +51,14 @@ class Background:
             self._postponed.append(job)
 
     def next(self) -> bool:
-        """Do the first postponed job, in this thread; returns whether there was one."""
+        """Do the first postponed job in this thread; return whether there was one."""
         if self._postponed:
             self._postponed.popleft()()
             return True
         return False
 
     def wait(self, left: int = 0) -> None:
-        """Wait until so many jobs are left at most, or do them."""
+        """Wait until at most ``left`` jobs are left, or do them."""
         while len(self._jobs) > left:
             self._jobs.popleft().result()
         while self._postponed and len(self._postponed) > left:

@@ -1,4 +1,4 @@
-"""Calibration of a whole recording, and what is known of its colour camera, in sentences."""
+"""Calibrate a whole recording, and describe its colour camera in sentences."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -50,34 +50,32 @@ UNITS = {
     "vignetting": ("%", 100.0),
     "depth_readout": ("ms", 1000.0),
 }
-"""Unit of each kind of parameter in texts, and how many there are in a metre, radian, pixel or second."""
+"""Display unit of each kind of parameter, and units per metre, radian, pixel or second."""
 ASSUMED = "assumed as given, not tested"
-"""Finding on a colour camera that was not compared with any image."""
+"""Finding on a colour camera that was not compared with images."""
 
 START_FRAMES, MIN_FRAMES = 300, 90
-"""Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
-estimator compares pairs of keyframes from both halves of the time."""
+"""Frames at the start of a recording that calibrate a run, and fewest such frames. The estimator compares pairs of
+keyframes from both halves."""
 WIDTH, INTERVAL = 320, 1 / 30
-"""Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
-at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
-noise of the poses and more of the camera's shaking enter, the longer they are."""
+"""Width (pixels) and largest interval (s) of the tracked images. Compared depth images are 160 and colour images at
+most 320 wide. A keyframe's velocity is the mean over two intervals: longer ones reduce pose noise and add shake."""
 SPACING, SHORT = 0.2, 5.0
-"""Time between two keyframes, seconds, in recordings longer than ``SHORT``; the velocity of one needs the frames just
-before and after it, and the others are not read. From a shorter recording every frame is taken."""
+"""Time between two keyframes, seconds, in recordings longer than ``SHORT``. Only keyframes and their neighbours are
+read, for the velocity. From a shorter recording every frame is read."""
 GAP = 2.5
-"""Largest time between the neighbours of a keyframe, usual intervals: frames were left out where there is more."""
+"""Largest time between the neighbours of a keyframe, usual intervals; above it, frames are missing."""
 VOXEL_SIZE = 0.02
-"""Edge of the voxels of the map that these frames are tracked in, reference depths; larger ones of the configuration
-stay."""
+"""Smallest voxel size of the map that tracks these frames, reference depths."""
 
 
 def kind_of(parameter: str) -> str:
-    """The kind of a parameter, a key of ``UNITS``: all axes of a translation are one kind."""
+    """Kind of a parameter, a key of ``UNITS``; the axes of a translation are one kind."""
     return parameter.rpartition("_")[0] if parameter[-2:] in ("_x", "_y", "_z") else parameter
 
 
 def findings(estimate: "Estimate") -> list[str]:
-    """One sentence per group of parameters: estimated, tested and kept, or assumed, and the standard deviations."""
+    """One sentence per group of parameters: estimated or assumed, test result, and standard deviations."""
     out = [_shutter_finding(estimate)]
     for name, members in TESTED.items():
         evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
@@ -113,7 +111,7 @@ def _shutter_finding(estimate: "Estimate") -> str:
 
 
 def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
-    """Standard deviations of these parameters, of several axes the largest, as text."""
+    """Text of the standard deviations of parameters, the largest per kind."""
     largest: dict[str, float] = {}
     for name in members:
         largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), calibration.sigmas[name])
@@ -135,8 +133,8 @@ def calibrate_start(
 ) -> Calibration | None:
     """Calibration estimated from the first frames of a recording; None without one, with the reason as a notice.
 
-    Short recordings are not calibrated. ``notice`` receives sentences on progress and results, ``progress`` the number
-    of tracked frames and of all frames. The pixels ``ignore`` (H, W) never count.
+    Short recordings are not calibrated. ``notice`` receives sentences on progress and results, ``progress`` the numbers
+    of tracked and of all frames. Pixels ``ignore`` (H, W) are never used.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
     if not has_color(sequence):
@@ -157,8 +155,11 @@ def calibrate_start(
 
 
 def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
-    """The calibration that a recording gives, else that of registered colours; where the edges of both images
-    contradict its focal length by far, which ``notice`` is told, with that at which they agree."""
+    """Calibration given by a recording, else of registered colours, with a corrected focal length if needed.
+
+    The focal length is corrected if the edges of depth and colour clearly contradict it; ``notice`` receives a
+    sentence.
+    """
     if not has_color(sequence):
         raise DatasetError(f"{sequence.name} has no colour images: there is no colour camera to calibrate")
     given = sequence.calibration or Calibration.registered(sequence.camera)
@@ -179,10 +180,10 @@ def calibrate_sequence(
     progress: "Callable[[int, int], None]" = lambda done, total: None,
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Estimate:
-    """Track a recording quickly with the calibration as given, and estimate a better one.
+    """Track a recording quickly with the given calibration, and estimate a better one.
 
-    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do. For
-    ``notice``, ``progress`` and ``ignore`` see ``calibrate_start``.
+    The poses are estimated too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, suffice. For ``notice``,
+    ``progress`` and ``ignore`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -214,7 +215,8 @@ def calibrate_sequence(
             else:
                 mask = slam.preprocess.mask(result.dynamic_mask)
                 collector.add(read.prepared.observation, result.T_world_camera, mask)
-    keyframes = max(keyframes, collector.keyframes, key=len)  # of the longest map: poses of others cannot be compared
+    # of the longest map, because poses of different maps cannot be compared
+    keyframes = max(keyframes, collector.keyframes, key=len)
     if len(keyframes) < 2:
         raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
     notice(f"calibration: comparing {len(keyframes)} of them with each other")
@@ -225,7 +227,7 @@ def calibrate_sequence(
 
 
 def _quick(config: Config, halvings: int) -> Config:
-    """Parameters for the excerpt: voxels as large as its pixels ask for, and nothing that is only reported."""
+    """Parameters for the excerpt: larger voxels, and no output that is only reported."""
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
@@ -244,8 +246,7 @@ def _halved(mask: "NDArray[np.bool_]", halvings: int) -> "NDArray[np.bool_]":
 
 
 class _Excerpt:
-    """Frames of a recording around its keyframes, at an ``INTERVAL`` (usually ``interval`` seconds), with images halved
-    some times by 2x2 blocks."""
+    """Keyframes of a recording and their neighbours, with images halved by 2x2 blocks."""
 
     def __init__(
         self, sequence: "Sequence", given: Calibration, halvings: int, count: int, reference_depth: float
@@ -273,11 +274,11 @@ class _Excerpt:
         return replace(frame, depth=depth, color=np.asarray(color, np.uint8))
 
     def mask(self, index: int) -> None:
-        """No true mask: none is scored here."""
+        """None: no mask is scored here."""
 
 
 def _around_keyframes(timestamps: "NDArray[np.float64]", numbers: range) -> list[int]:
-    """The numbers of frames that are keyframes, and those of their neighbours."""
+    """Numbers of the keyframes and their neighbours."""
     if not len(numbers) or timestamps[numbers[-1]] - timestamps[numbers[0]] <= SHORT:
         return list(numbers)
     chosen, due = set[int](), -np.inf
@@ -289,7 +290,7 @@ def _around_keyframes(timestamps: "NDArray[np.float64]", numbers: range) -> list
 
 
 def _enlarged(found: Calibration, camera: Camera, halvings: int) -> Calibration:
-    """A calibration of halved colour images, for images of a camera's size."""
+    """Scale the calibration of halved colour images to the size of ``camera``."""
     factor, sigma = 1 << halvings, found.sigma.copy()
     sigma[mask_of(("center_x", "center_y"))] *= factor
     whole = found.camera.resized(found.camera.width * factor, found.camera.height * factor)

@@ -30,8 +30,10 @@ def process_source(
     observers: "tuple[RunObserver, ...]" = (),
     poses: "GivenPoses | None" = None,
 ) -> None:
-    """Process one frame, count it, save its mask, and report it; what no later frame waits for is done in the
-    background."""
+    """Process one frame, count it, save its mask, and report it.
+
+    Masks, images and moving objects are written in the background, because no later frame waits for them.
+    """
     index, read = source.number, source.read
     if record.dropped is not None:
         record.dropped += source.dropped
@@ -66,11 +68,11 @@ def process_source(
     record.add_readings(read.frame.depth)
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     row = record.rows[-1]
-    read = read._replace(prepared=None)  # what waits in the background holds no pyramids
+    read = read._replace(prepared=None)  # background jobs hold no pyramids
 
-    def tell(*, beside: bool) -> None:
+    def notify(*, in_background: bool) -> None:
         for observer in observers:
-            if observer.beside == beside:
+            if observer.in_background == in_background:
                 try:
                     observer.frame(index, read, result, row["total"])
                 except OSError as error:
@@ -82,15 +84,15 @@ def process_source(
                 save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
             except OSError as error:
                 display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
-        tell(beside=True)
+        notify(in_background=True)
 
     if record.dropped is None:
         record.add_movers(row, result)
         background.do(keep_images)
-    else:  # what is postponed holds no images
+    else:  # postponed jobs hold no images
         keep_images()
         background.do(partial(record.add_movers, row, result))
-    tell(beside=False)
+    notify(in_background=False)
     if result.calibrated:
         display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

@@ -70,8 +70,10 @@ def read_ahead(
     slam: "Slam | None" = None,
     start: int = 0,
 ) -> Generator[SourceFrame]:
-    """Frames ``start`` to ``count`` - 1 in order; one thread reads, and with ``slam`` prepares them, up to ``ahead``
-    frames ahead."""
+    """Yield frames ``start`` to ``count`` - 1 in order.
+
+    One thread reads, and with ``slam`` prepares them, up to ``ahead`` frames ahead.
+    """
 
     def read(index: int) -> SourceFrame:
         begin = time.perf_counter()
@@ -95,7 +97,7 @@ def read_ahead(
 
 
 class FrameQueue:
-    """Thread-safe queue between a camera and its consumer: of the newest item and those at most ``MAX_WAIT`` older."""
+    """Thread-safe queue between a camera and its consumer: the newest item and items at most ``MAX_WAIT`` older."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -114,7 +116,7 @@ class FrameQueue:
             self._changed.notify()
 
     def take(self) -> SourceFrame | None:
-        """Oldest item; waits for one that was not taken yet. None once the queue is closed and empty."""
+        """Take the oldest item, or wait for one. None once the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._held or self._closed)
             return self._held.pop(0) if self._held else None
@@ -133,11 +135,11 @@ def arriving(
     recorder: "Recorder | None" = None,
     idle: Callable[[], bool] = lambda: False,
 ) -> Generator[SourceFrame]:
-    """Frames of a camera, taken and prepared by a thread of their own; those for which the consumer leaves no room
-    (``FrameQueue``) are dropped and counted in the next one. The camera is closed at the end.
+    """Yield frames of a camera, which a thread takes and prepares; close the camera at the end.
 
-    The ``recorder`` receives all frames, dropped or not. ``idle`` is called while no frame waits: it does a few
-    milliseconds of other work and returns True, or has none.
+    Frames without room in the ``FrameQueue`` are dropped and counted in the next frame. The ``recorder`` receives all
+    frames. ``idle`` is called while no frame waits: it does a few milliseconds of other work and returns True, or has
+    none.
 
     Raises:
         CameraError: The camera stopped to deliver frames.
@@ -196,7 +198,7 @@ def _with_masks(
     slam: "Slam | None",
     ms: float = 0.0,
 ) -> FrameRead:
-    """A frame with its masks, prepared for processing where there is a system."""
+    """A frame with its masks, prepared for processing if there is a system."""
     try:
         view = None if slam is None or isinstance(frame, FrameError) else slam.prepare(frame)
     except FrameError as error:

@@ -163,4 +163,4 @@ def checked_options(*, has_poses: bool, refine: bool, saved_map: bool) -> None:
     if refine and not has_poses:
         raise ConfigError("there are no poses to refine; name them (--poses FILE, or --poses recording)")
     if has_poses and saved_map:
-        raise ConfigError("given poses have a world of their own, which is not that of --map; drop one of the two")
+        raise ConfigError("given poses are in another world frame than --map; drop one of the two")

@@ -1,4 +1,4 @@
-"""What looks wrong in the images of a recording: focal length, mirrored pairs, no texture, depth of a resting plane."""
+"""Find faults in the images of a recording: focal length, mirrored images, no texture, a resting plane in the depth."""
 
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -19,20 +19,19 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PAIRS, GAP = 12, 10
-"""Pairs of frames that are compared, and how many frames apart: a third of a second, in which a hand turns 5 to 20
+"""Frame pairs compared, and frames between the two: a third of a second, in which a hand-held camera turns 5 to 20
 degrees."""
 NEAR = 0.015
-"""Largest distance of a matched point from the common affine motion, as a share of the depth: 3 sigma of a Kinect."""
+"""Largest distance of a matched point from the affine motion, as a share of the depth: 3 sigma of a Kinect."""
 POINTS = 500
 """Features of an image of half the size."""
 LEAST_POINTS, LEAST_PAIRS = 20, 6
-"""Fewest matches of a pair, and fewest pairs that agree."""
+"""Fewest matches of a pair, and fewest agreeing pairs."""
 AGREEMENT, SHARE = 0.15, 0.6
-"""Largest deviation of a pair that agrees from the median of the pairs, as a share of it, and the least share of pairs
-that must agree."""
+"""Largest deviation of an agreeing pair from the median, as a share of the median, and smallest share of agreeing
+pairs."""
 WRONG = 0.2
-"""Smallest error of a focal length that is said: that of right ones was up to 0.12 on five real recordings, and one
-that was 20 % too short on purpose was found 25 % too short."""
+"""Smallest reported error of a focal length, relative. Correct focal lengths of five recordings erred by up to 0.12."""
 DISTANCES = 4000
 """Random pairs of points whose distances are compared."""
 
@@ -45,42 +44,41 @@ NEIGHBOURHOOD = 41
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
 """Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, MAYBE, SIGNIFICANT = 0.04, 3.5, 5.0
-"""Limits for a turn of depth against colour. The first is the smallest gain in the correlation of edges. The others are
-the smallest correlations for a possible and for a certain turn, in standard deviations of accidental correlations. The
-correlation must also be the largest. Of 360 views of near walls (depth and colour without relation), 3 exceed the limit
-of possible turns and none the limit of certain ones. Of 261 turned real and rendered excerpts, 257 and 243 do."""
+"""Limits for a turn of depth against colour: smallest gain in edge correlation; smallest correlations for a possible
+and a certain turn. The latter are in standard deviations of accidental correlations; the correlation must also be the
+largest. Of 360 unrelated pairs of depth and colour, 3 exceed the limit for possible turns and none the limit for
+certain ones. Of 261 turned excerpts, 257 and 243 do."""
 APART = 12
-"""Shift, pixels of ``WIDTH``, from which edges of both images meet by accident alone."""
+"""Shift beyond which edges coincide only by accident, pixels of ``WIDTH``."""
 FEWEST = 4
-"""Frames that a judgement needs."""
+"""Fewest frames for a judgement."""
 MAGNIFICATIONS = np.exp(np.arange(-12, 13) / 20)
-"""Focal lengths of the colour camera over those given at which its edges are compared with those of the depth: where
-the camera of the depth is given, colour cameras beside it have up to 1.7 times its focal length."""
+"""Compared ratios of the colour camera's focal length to the given one. If the depth camera's is given, colour cameras
+have up to 1.7 times its focal length."""
 REGISTERED = np.abs(np.log(MAGNIFICATIONS)) < 0.16
-"""Those that a calibration finds by itself."""
+"""Magnifications that a calibration finds by itself."""
 SHIFT = 3
-"""Largest shift of the colours, from the distance between both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
+"""Largest shift of the colours by the baseline of both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
 LOOKS = 12, 48
-"""Frames in which another magnification is looked for, and in which it must be proven."""
+"""Frames that search another magnification, and frames that must prove it."""
 PROVEN = 4.0
-"""Standard errors over the frames by which the agreement must be better with another magnification."""
+"""Smallest gain of another magnification in standard errors over the frames."""
 MAGNIFIED_GAIN = 0.01
-"""Smallest gain in that correlation by which another magnification is believed: those of registered images are below
--0.02."""
+"""Smallest gain in correlation for another magnification; registered images stay below -0.02."""
 FLAT = 0.01
-"""Largest deviation from one plane, standard deviation as a share of the depth, of a depth image without relief."""
+"""Largest standard deviation from a plane, as a share of the depth, of a depth image without relief."""
 STILL = 0.2
-"""Largest spread over the frames of the distance of a plane that does not move, in standard deviations of a reading:
-the planes of moving cameras differ by more, and those of thousands of independent readings by less."""
+"""Largest spread of the distance of a resting plane over the frames, in standard deviations of a measurement. Planes of
+moving cameras spread more; means of thousands of independent measurements spread less."""
 CHANGED = 0.05
-"""Mean difference of intensities, as a share of their mean, from which images differ by more than exposure."""
+"""Smallest mean difference of intensities, as a share of their mean, that exposure does not explain."""
 
 
 def focal_error(sequence: "Sequence") -> float | None:
-    """Given focal length over the one that keeps distances between the same points in two frames; None if unknown.
+    """Given focal length over the focal length that preserves point distances between two frames; None if unknown.
 
-    With the factor s of x and y, the squared distance s^2 (dx^2 + dy^2) + dz^2 of two points is the same in both
-    frames, which is linear in s^2. Matches are those of one affine motion, which a wrong focal length leaves affine.
+    With the factor s of x and y, the squared distance s^2 (dx^2 + dy^2) + dz^2 of two points is equal in both frames.
+    It is linear in s^2. Matches fit one affine motion, because a wrong focal length keeps the motion affine.
     """
     found, rng = [], np.random.default_rng(0)
     for index in np.unique(np.linspace(0, max(len(sequence) - 1 - GAP, 0), PAIRS).astype(int)):
@@ -97,7 +95,7 @@ def focal_error(sequence: "Sequence") -> float | None:
         flat, deep = (p - q)[:, :2].sum(axis=1), (q - p)[:, 2]
         _, axes = np.linalg.eigh(np.array([[flat @ flat, flat @ deep], [flat @ deep, deep @ deep]]))
         if flat @ flat > 0 and abs(axes[0, 1]) > 1e-6:  # else the camera did not turn
-            found.append(axes[1, 1] / axes[0, 1])  # both have errors: total least squares
+            found.append(axes[1, 1] / axes[0, 1])  # both sides have errors: total least squares
     factors = np.sqrt(np.clip(found, 0, None))
     if len(factors) < LEAST_PAIRS:
         return None
@@ -107,7 +105,7 @@ def focal_error(sequence: "Sequence") -> float | None:
 
 
 def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (N, 3) of two frames with the same appearance that fit one affine motion, each in its camera."""
+    """Matched points (N, 3) of two frames that fit one affine motion, each in its camera."""
     sift, points = SiftExtractor(POINTS), []
     seen = [sift.extract(reduced_grey(frame.rgb, frame.rgb.shape[1] // 2)) for frame in frames]
     pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0, mutual=True)
@@ -127,7 +125,7 @@ def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float6
 
 
 def image_warnings(frames: "list[Frame]") -> list[str]:
-    """Sentences on what looks wrong in some frames spread over a recording; none for fewer than four frames."""
+    """Warnings about frames spread over a recording; none for fewer than four frames."""
     frames = [frame for frame in frames if frame.color is not None]
     if len(frames) < FEWEST:
         return []
@@ -147,7 +145,7 @@ def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _turn_warnings(frames: "list[Frame]") -> list[str]:
-    """Whether the edges of depth lie on those of colour only after one of the images is turned."""
+    """Warn if edges of depth and colour coincide only after one image is turned."""
     pairs = [_edges(frame) for frame in frames if frame.depth.shape == frame.rgb.shape[:2]]
     if len(pairs) < FEWEST or len({edges.shape for edges, _ in pairs}) > 1:
         return []
@@ -166,9 +164,9 @@ def _turn_warnings(frames: "list[Frame]") -> list[str]:
 
 
 def _agreement(edges: NDArray[np.float32], steps: NDArray[np.float32]) -> tuple[float, float, float]:
-    """Mean correlation of edge images (N, h, w); its standard deviation and maximum where one of both is shifted.
+    """Mean correlation of edge images (N, h, w), and standard deviation and maximum of shifted correlations.
 
-    All frames are shifted alike: frames that show the same count as one.
+    All frames are shifted alike, because frames of one view count once.
     """
     power = np.sqrt(np.mean(edges**2, axis=(1, 2)) * np.mean(steps**2, axis=(1, 2)))
     products = np.fft.irfft2(np.fft.rfft2(edges) * np.conj(np.fft.rfft2(steps)), s=edges.shape[1:]) / edges[0].size
@@ -179,8 +177,10 @@ def _agreement(edges: NDArray[np.float32], steps: NDArray[np.float32]) -> tuple[
 
 
 def color_magnification(sequence: "Sequence") -> float | None:
-    """Focal length of the colour camera over that given (or that of the depth) at which the edges of both images agree,
-    where that is so far from 1 that no calibration would find it; None elsewhere."""
+    """Ratio of the colour camera's focal length to the given one (or the depth camera's) at which edges coincide.
+
+    None if the ratio is near 1, where the calibration finds it, or is not proven.
+    """
     given = sequence.calibration or Calibration.registered(sequence.camera)
     agreement: dict[int, NDArray[np.float32]] = {}
     found = None
@@ -200,8 +200,8 @@ def color_magnification(sequence: "Sequence") -> float | None:
 
 
 def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] | None:
-    """The magnification with the highest mean of ``agreement`` (frames, magnifications, shifts), and by how many
-    standard errors it is above that of registered images; None where one of these is as good."""
+    """Best magnification in ``agreement`` (frames, magnifications, shifts), and its gain over registered images in
+    standard errors; None if registered images are as good."""
     mean = agreement.mean(axis=0)
     best, shift = (int(n) for n in np.unravel_index(np.argmax(mean), mean.shape))
     near = np.unravel_index(np.argmax(np.where(REGISTERED[:, None], mean, -1)), mean.shape)
@@ -215,17 +215,17 @@ def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] |
 
 
 def unregistered(magnification: float) -> str:
-    """What a magnification of the colours shows."""
+    """Sentence on a magnification of the colours."""
     return f"the edges of both images agree where its focal length is {magnification:.2f} times that given or assumed"
 
 
 def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
-    """Correlations of the edges of depth and colours (magnifications, shifts) for each magnification of the colours."""
+    """Edge correlations (magnifications, shifts) of depth and colours for each magnification of the colours."""
     edges, steps = _edges(frame)
     steps, out = _flattened(steps, np.ones_like(steps)), []
     size, border = steps.shape[::-1], (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
     K_color, K_depth = given.camera.resized(WIDTH, len(edges)).K, camera.resized(WIDTH, len(steps)).K
-    rays = given.T_color_depth[:3, :3] @ np.linalg.inv(K_depth)  # of what is far away
+    rays = given.T_color_depth[:3, :3] @ np.linalg.inv(K_depth)  # rays of distant points
     for magnification in MAGNIFICATIONS.tolist():
         to_color = K_color @ np.diag([magnification, magnification, 1]) @ rays
         sampled, inside = (
@@ -243,14 +243,14 @@ def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -
 
 
 def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """An image without the mean of the neighbourhood, 0 where it is not ``seen``."""
+    """Image minus the mean of its neighbourhood, 0 outside of ``seen``."""
     size = NEIGHBOURHOOD, NEIGHBOURHOOD
     share = np.maximum(cv2.blur(seen, size), np.float32(1e-3))
     return np.asarray((image - cv2.blur(image * seen, size) / share) * seen, np.float32)
 
 
 def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Images (h, WIDTH) of the edges of the colours and of the depth of a frame."""
+    """Edge images (h, WIDTH) of the colours and the depth of a frame."""
     gray, (height, width) = _gray(frame.rgb), frame.depth.shape
     gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     edges = np.minimum(gradient / (gradient.mean() + np.float32(1e-5)), np.float32(STEEPEST))
@@ -258,17 +258,17 @@ def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """1 beside a step between two readings, else 0."""
+    """Image of depth edges: 1 next to a step between two measurements, else 0."""
     small = cv2.resize(depth, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     window = np.ones((3, 3), np.uint8)
-    near = cv2.erode(np.where(small > 0, small, 1e6).astype(np.float32), window)  # no reading is far away
+    near = cv2.erode(np.where(small > 0, small, 1e6).astype(np.float32), window)  # a missing measurement counts as far
     far = cv2.dilate(small, window)
     step = cv2.dilate(((far > (1 + STEP) * near) & (far > 0)).astype(np.uint8), window)
     return step.astype(np.float32)
 
 
 def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
-    """Whether the depth is that of one plane that rests against the camera while the colours change."""
+    """Warn if the depth images show one plane at rest while the colour images change."""
     planes = _planes(frames)
     exposed = [gray / (gray.mean() + np.float32(1e-3)) for gray in grays]
     changes = [np.abs(b - a).mean() for a, b in pairwise(exposed) if a.shape == b.shape]
@@ -279,15 +279,15 @@ def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> 
         return []
     return [
         f"all sampled depth images show the same plane at {distances.mean():.3g} m, with {1000 * sigma:.1f} mm of "
-        "noise and no relief, while the colour images change: depth does not show how the camera moves; expected depth "
-        "images of what the colour images show (look at dudmap info --sheet)"
+        "noise, while the colour images change; the depth images do not belong to them: compare both with "
+        "dudmap info --sheet"
     ]
 
 
 def _planes(frames: "list[Frame]") -> tuple[NDArray[np.float64], float] | None:
-    """Distances (N, 5) of the plane of every depth image, metres, in its middle and corners, and the standard deviation
-    of the readings about it; None if an image shows something else. In the image of a plane the inverse distance is
-    linear in row and column.
+    """Distances (N, 5) of the plane of every depth image at centre and corners, metres, and the noise about it.
+
+    None if an image is no plane. The inverse depth of a plane is linear in row and column.
     """
     distances, sigmas = [], []
     places = np.array([[0, 0, 1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, 1]], np.float64)

@@ -1,4 +1,4 @@
-"""What a recording holds, and what looks wrong in it, from its lists and a few of its frames."""
+"""Describe a recording and find faults in it, from its lists and a few frames."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 
 DEPTH_ALONE = "there are no colour images: the camera is tracked by distances alone, and the mesh has no colours"
 SAMPLES = 12
-"""Number of evenly spread frames that are read."""
+"""Evenly spread frames that are read."""
 NEAR, FAR = 0.1, 8.0
-"""Medians of the depth readings, metres, beyond which a depth unit that is only assumed is doubted."""
+"""Median depths, metres, outside of which an assumed depth unit is doubted."""
 LEAST, LARGEST = 0.05, 25.0
-"""Medians, metres, beyond which any depth unit is doubted: no depth camera measures nearer or farther most of the time.
-Wrist and desk cameras begin at 0.07 m, stereo cameras for outdoors end at 20 to 40 m."""
+"""Median depths, metres, outside of which any depth unit is doubted. Wrist and desk cameras begin at 0.07 m; outdoor
+stereo cameras end at 20 to 40 m."""
 LEFT_OUT = 0.1
-"""Share of the readings that the depth range leaves out that is worth a warning."""
+"""Share of measurements outside of the depth range that causes a warning."""
 NEAREST, FARTHEST = 0.2, 10.0
-"""Where the median lies beyond ``SEEN``: least plausible 5th and largest plausible 95th percentile of the readings,
-metres: few depth cameras measure nearer than 0.2 m, and those for rooms hardly beyond 10 m."""
+"""Smallest plausible 5th and largest plausible 95th percentile of depths, metres, if the median lies outside of
+``SEEN``. Few depth cameras measure below 0.2 m; indoor cameras hardly exceed 10 m."""
 SEEN = (0.4, 4.0)
-"""Medians, metres, within which the scale is not doubted."""
+"""Median depths, metres, at which the scale is not doubted."""
 FEW_READINGS = 0.2
-"""Share of pixels with a reading below which the depth is called sparse."""
+"""Share of pixels with depth below which depth is sparse."""
 GAP = 3.0
-"""Time between frames that counts as a gap, as a multiple of the median."""
+"""Time between frames that is a gap, as a multiple of the median."""
 LEFT_OVER = 0.02
-"""Share of the images without a partner that is worth a warning."""
+"""Share of images without a partner that causes a warning."""
 SLOW, FAST = 1.0, 0.001
-"""Median time between frames, seconds, beyond which the times are in another unit, or not of one camera."""
+"""Median time between frames, seconds, outside of which the time unit or the camera is wrong."""
 LATE = 0.015
-"""Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
+"""Median time between a frame's colour and depth image, seconds, that causes a warning: half a frame."""
 RUN = 6
-"""Number of frames in a row that are compared with each other at every sampled place."""
+"""Consecutive frames that are compared at every sampled place."""
 TUM_ENDED = 1356998400.0
-"""The year 2013, seconds since 1970: what is named as in TUM RGB-D but was taken later is of another camera."""
+"""The year 2013, seconds since 1970. Later recordings with names as in TUM RGB-D are of another camera."""
 SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
-"""Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
+"""Depth scales in use, units per metre; the first that fits replaces an implausible one."""
 USUAL = (0.4, 8.0)
 """Median depth, metres, that a proposed scale must give."""
 
@@ -65,23 +65,23 @@ class Inspection:
         name, format: Of the recording.
         frames: Number of frames.
         duration: From the first to the last depth image, seconds.
-        rate: Depth images per second (of the median time between two).
+        rate: Depth images per second (from the median interval).
         has_color: Whether there are colour images.
-        color_rate: The same for the colour images; None if their times are unknown.
+        color_rate: Colour images per second; None if their times are unknown.
         gaps: (time of the frame before the gap, length) of every gap, seconds.
-        camera, color_camera: Intrinsics of the depth and of the colour camera; equal for registered images.
+        camera, color_camera: Intrinsics of the depth and the colour camera; equal for registered images.
         T_color_depth: 4x4 motion between them, row by row; None for registered images.
         sources: Origin of intrinsics, depth unit and times: a file, a name, an option, or an assumption.
         depth_scale: Units of a 16-bit depth image per metre.
-        median_depth: Of all readings of the sampled frames, metres; None without any.
-        valid_depth: Share of pixels with a reading.
-        depth_range: Depths that are used, metres.
+        median_depth: Of all measurements of the sampled frames, metres; None without any.
+        valid_depth: Share of pixels with depth.
+        depth_range: Used depths, metres.
         voxel_size: Edge of a voxel, metres. Range and voxel size are given, or chosen from the depth.
-        too_near, too_far: Shares of the measurements below and above ``depth_range``, which are left out.
-        unreadable: Reasons of the sampled frames that cannot be read.
-        ground_truth: Number of true poses, 0 without.
-        repeats: Shares of the frames that repeat the frame before: both images (``frame``), or ``depth`` or ``color``
-            alone; empty if they were not compared.
+        too_near, too_far: Shares of the measurements below and above ``depth_range``.
+        unreadable: Errors of the sampled frames that cannot be read.
+        ground_truth: Number of ground truth poses, 0 without.
+        repeats: Shares of frames that repeat the previous one: both images (``frame``), only ``depth`` or only
+            ``color``; empty if not compared.
         warnings: Sentences on suspected faults.
     """
 
@@ -110,14 +110,14 @@ class Inspection:
     warnings: list[str] = field(default_factory=list)
 
     def distinct_rate(self, stream: str) -> float | None:
-        """Images per second of the ``depth`` or ``color`` stream without repeated images; None if unknown."""
+        """Distinct images per second of the ``depth`` or ``color`` stream; None if unknown."""
         if self.rate is None or not self.repeats:
             return None
         return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
 
 
 def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int, Frame]], list[str]]":
-    """Numbers and frames of an evenly spread selection, and the reasons of those that cannot be read."""
+    """Numbers and frames of an evenly spread selection, and the errors of unreadable frames."""
     frames, unreadable = [], []
     for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)):
         try:
@@ -128,8 +128,11 @@ def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int,
 
 
 def repeats(sequence: "Sequence") -> dict[str, float]:
-    """Shares of the frames whose images are bit for bit those of the frame before, by what repeats: ``frame``,
-    ``depth`` or ``color``; from RUN frames in a row at SAMPLES places. Empty where no two can be read."""
+    """Shares of frames with images bit-identical to the previous frame, by repeated image: ``frame``, ``depth`` or
+    ``color``.
+
+    Compared are RUN consecutive frames at SAMPLES places. Empty if no two can be read.
+    """
     from dudmap.core.frames.stream_check import repeated
 
     counts, pairs = {"frame": 0, "depth": 0, "color": 0}, 0
@@ -159,7 +162,7 @@ def inspect(
 ) -> Inspection:
     """Describe a recording and its suspected faults; ``frames`` and ``unreadable`` are results of ``sample``.
 
-    ``config`` gives the range of the depth; None chooses it from the frames, as ``dudmap run`` does.
+    ``config`` gives the depth range; None chooses it from the frames, as ``dudmap run`` does.
     """
     if frames is None:
         frames, unreadable = sample(sequence)
@@ -212,7 +215,7 @@ def inspect(
 
 
 def _unit_is_open(sequence: "Sequence") -> bool:
-    """Whether another depth unit can be given, and no remark of the recording names it."""
+    """Whether another depth unit can be given, and no remark of the recording states the unit."""
     rotated = getattr(sequence, "rotated", Rotated.NO)
     return "depth_unit" in getattr(sequence, "options", ("depth_unit",)) and rotated is Rotated.NO
 
@@ -264,7 +267,7 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_op
 
 
 def _left_out(found: Inspection, readings: NDArray[np.float32]) -> str:
-    """Sentence on the readings outside of the depth range, and the parameter that takes them in."""
+    """Sentence on measurements outside of the depth range, with the parameter that includes them."""
     least, largest = found.depth_range
     if found.too_near > found.too_far:
         share, where = found.too_near, f"nearer than {least:g} m"

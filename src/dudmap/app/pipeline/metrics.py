@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from dudmap.errors import FrameError
 
 STRIDE = 4
-"""Rows and columns from one counted reading to the next."""
+"""Step in rows and columns between counted measurements."""
 COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
-"""Attributes of ``FrameResult`` for which frames are counted."""
+"""Attributes of ``FrameResult`` whose frames are counted."""
 
 
 @dataclass
@@ -36,20 +36,20 @@ class RunRecord:
         rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
         lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read or had another size.
-        checks: Per registered frame, its figures (``core/tracking/checks.py``).
-        repeated: Number of frames that repeat the frame before, its depth or its colour, by the repeated part.
+        checks: Metrics per registered frame (``core/tracking/checks.py``).
+        repeated: Number of frames that repeat the previous frame, its depth or its colour, by the repeated part.
         rejected: Number of frames rejected for a fault of the stream, by kind. Frames with a readable image of the
             correct size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
-        movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
+        movers: Line of movers.jsonl per frame with moving objects: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
         readings: Numbers of depth measurements in every fourth row and column: all, below and above the depth range.
-        depth_limits: Depths that are used, metres.
+        depth_limits: Used depths, metres.
         counts: Numbers of frames by attribute of ``FrameResult``, and of ``degenerate`` frames, in which not all
             directions of motion are observable.
-        warnings: Sentences on faults of the recording that were suspected before the run.
+        warnings: Sentences on suspected faults of the recording.
         masked: Number of frames with an external mask, None without external masks.
-        fused_at_end: Number of frames that a young map held back until the end, and that were fused then.
+        fused_at_end: Number of frames that a young map held back until the end and then fused.
         dropped: Number of frames dropped by a live run, None otherwise.
         spent: Seconds, and seconds of processor time, of the run before this process or pass.
     """
@@ -76,12 +76,12 @@ class RunRecord:
     )
 
     def elapsed(self) -> tuple[float, float]:
-        """Seconds, and seconds of processor time, since the run began, without those between two processes of it."""
+        """Seconds, and processor seconds, since the run began, without gaps between its processes."""
         (wall, cpu), (wall_since, cpu_since) = self.spent, self._since
         return wall + time.perf_counter() - wall_since, cpu + time.process_time() - cpu_since
 
     def settle(self) -> None:
-        """Note the time so far, from which a continued run goes on."""
+        """Record the time so far; a continued run adds to it."""
         self.spent, self._since = self.elapsed(), (time.perf_counter(), time.process_time())
 
     def add(
@@ -92,7 +92,7 @@ class RunRecord:
         mask: NDArray[np.bool_] | None,
         **delays: float,
     ) -> None:
-        """Add one processed frame, which took so many milliseconds, with its true dynamic mask (H, W) if known.
+        """Add one processed frame with its times (ms) and its true dynamic mask (H, W), if known.
 
         In a live run ``delays`` are the number of frames ``dropped`` before this one, and the ``latency`` from its
         arrival to the result, ms.
@@ -131,8 +131,10 @@ class RunRecord:
         self.readings["too_far"] += int(np.count_nonzero(some > largest))
 
     def add_movers(self, row: dict[str, Any], result: FrameResult) -> None:
-        """Add the moving objects of a frame to its row of ``rows``, after those of the frames before; meanwhile another
-        thread may add later frames."""
+        """Add the moving objects of a frame to its row of ``rows``, in the order of the frames.
+
+        Another thread may add later frames meanwhile.
+        """
         start, movers = time.perf_counter(), result.movers
         if movers:
             line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in movers]}
@@ -152,7 +154,7 @@ class RunRecord:
         _write_table(path, self.rows, "0")
 
     def save_checks(self, path: Path) -> None:
-        """Write a CSV file with one row per registered frame and one column per figure; empty where it is not known."""
+        """Write a CSV file with one row per registered frame and one column per metric; unknown ones are empty."""
         _write_table(path, self.checks, "")
 
     def save_movers(self, path: Path) -> None:
@@ -160,10 +162,10 @@ class RunRecord:
         write_text(path, "".join(f"{line}\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:
-        """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
+        """Write an NPZ file with the histogram of all residuals and its fitted mixture, if there are any.
 
-        ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
-        (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
+        Arrays: ``edges`` (BINS + 1,) in standard deviations of a measurement, ``counts`` (BINS,), ``prior`` (2,) and
+        ``sigma`` (2,) of the static and dynamic half-normal density (thesis eq. 4.56).
         """
         from dudmap.core.backends.cpu.evidence import EDGES
         from dudmap.core.dynamics.masks import fit_mixture

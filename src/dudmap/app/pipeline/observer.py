@@ -1,4 +1,4 @@
-"""What watches a run without taking part in it: the base of viewers, the log of events, and the report of a crash."""
+"""Observers of a run: the base class of viewers, the log of events, and the crash report."""
 
 import json
 import platform
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 RECENT = 50
-"""Last events that are kept in memory: of a second or two, most of them frames."""
+"""Events kept in memory: a second or two, mostly frames."""
 
 
 class RunObserver:
@@ -29,31 +29,31 @@ class RunObserver:
     All methods are called in the thread of the run, between two frames, when nothing changes the map.
 
     Attributes:
-        beside: Whether ``frame`` may be called in another thread, in the order of the frames, while later ones are
-            processed: for observers that do not look at the map.
+        in_background: Whether ``frame`` may be called in another thread, in order, while later frames are processed.
+            Such observers must not read the map.
     """
 
-    beside = False
+    in_background = False
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""
 
     def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
-        """A pass that was interrupted goes on at frame number ``first``; by default as if it began."""
+        """An interrupted pass continues at frame number ``first``; by default as if it began."""
         self.start(slam, out, count)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Frame number ``index`` was read and processed in ``ms`` milliseconds."""
 
     def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
-        """Something else happened, such as an unreadable frame, with its figures."""
+        """Another event occurred, such as an unreadable frame."""
 
     def finish(self, out: Path) -> None:
-        """The run is over, also by an error or an interrupt, and its run folder is written."""
+        """The run is over, possibly by an error or an interrupt, and its run folder is written."""
 
 
 class EventLog(RunObserver):
-    """Writes one JSON object per line and event; each is on its way to the file before the next frame begins.
+    """Writes one JSON object per line and event, before the next frame begins.
 
     Every object has ``time`` (seconds since 1970) and ``event``; docs/reliability.md lists the events and their keys.
 
@@ -79,12 +79,12 @@ class EventLog(RunObserver):
         self._state = "tracked"
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """A pass begins."""
+        """Write the start event of a pass."""
         self._slam, self.out, self._state = slam, out, "tracked"
         self.event("start", folder=str(out), frames=count)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """One event for the frame, and one for what else happened with it."""
+        """Write one event for the frame's state, and one for each special event of the frame."""
         assert self._slam is not None
         place: dict[str, Any] = {"frame": index, "timestamp": result.timestamp}
         figures = {"ms": round(ms, 2), "dynamic_share": round(float(result.dynamic_share), 4), "submap": result.submap}
@@ -113,17 +113,17 @@ class EventLog(RunObserver):
             self._file.write(json.dumps(row) + "\n")
 
     def finish(self, out: Path) -> None:
-        """The run folder is written."""
+        """Write the finish event."""
         self.event("finish", folder=str(out))
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
 
 
 def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, Any]] = ()) -> InternalError:
-    """Write ``crash-<date>.txt`` into a folder, with the last events of the run, and return the error that says so."""
+    """Write ``crash-<date>.txt`` with the last events into a folder; return the error that names it."""
     path = folder / f"crash-{time.strftime('%Y%m%d-%H%M%S')}.txt"
     what = f"{type(error).__name__}: {error}"
     try:
@@ -149,7 +149,7 @@ def report_text(error: BaseException, events: Iterable[dict[str, Any]]) -> str:
 
 
 def _versions() -> dict[str, Any]:
-    """Versions and machine; less where the installation itself is broken."""
+    """Versions and machine; fewer if the installation is broken."""
     from dudmap.app.pipeline.environment import machine, versions
 
     try:

@@ -30,27 +30,26 @@ FIGURES = (
     ("RPE RMSE, rotation", "rpe_rot_rmse_deg_per_s", "{:.2f} deg/s", 1),
     ("mask IoU", "mask_iou_mean", "{:.3f}", 1),
 )
-"""Label, key of metrics.json, format and factor of the figures of a run, printed where the run has them."""
+"""Label, key of metrics.json, format and factor of the printed metrics; missing ones are skipped."""
 
 NOT_FUSED = {
     "skipped_similar": "redundant view",
     "uncertain": "uncertain pose or labels",
     "blind": "without usable colour",
 }
-"""Why a tracked frame is not fused, by the key of metrics.json that counts such frames."""
+"""Why a tracked frame is not fused, by its key in metrics.json."""
 
 
 class RunProgress:
-    """Progress bar on stderr, if that is a terminal, with frame number, frames per second, dynamic share and state.
+    """Progress bar on stderr, if it is a terminal, with frame number, frames per second, dynamic share and state.
 
-    Losses of tracking and unreadable frames are reported, once per gap, even without the bar. The ``total`` is None if
-    it is not known.
+    Lost and unreadable frames are reported once per gap, even without the bar. ``total`` is None if unknown.
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
         self.console = plain_console(stderr=True)
         self._bar = Progress(
-            SpinnerColumn(),  # turns while kernels are compiled, when no frame is finished for a minute
+            SpinnerColumn(),  # turns while kernels compile and no frame is finished
             TextColumn("frame"),
             MofNCompleteColumn(),
             BarColumn(),
@@ -99,7 +98,7 @@ class RunProgress:
         )
 
     def skip(self, error: "FrameError") -> None:
-        """Report the first of the frames in a row that cannot be read or used."""
+        """Report the first of consecutive frames that cannot be read or used."""
         if self._skipped == 0:
             self.note(f"skipped: {error}")
         self._skipped += 1
@@ -109,7 +108,7 @@ class RunProgress:
         self.console.print(sentence, style="yellow", soft_wrap=True)
 
     def announce_compilation(self) -> None:
-        """Say that the kernels are compiled first, where that is so."""
+        """Report that kernels are compiled first, if none is cached."""
         if not kernel_cache.count():
             self.note(COMPILING)
 

@@ -1,4 +1,4 @@
-"""Continuation of an interrupted run from the state in its folder."""
+"""Continue an interrupted run from the state in its folder."""
 
 import sqlite3
 from contextlib import closing
@@ -28,23 +28,23 @@ def resume(
     progress: bool = True,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
-    """Go on with a run that was killed or interrupted, from its last checkpoint to the end.
+    """Continue a killed or interrupted run from its last checkpoint to the end.
 
-    One that ended while it calibrated the colour camera begins anew. Recording, configuration and options are those the
-    run began with, and a report is written if one was wanted. Results are those of a run that was not interrupted: the
-    same poses, masks, map and mesh, bit for bit.
+    Recording, configuration and options are taken from the interrupted run, and a report is written if it was wanted.
+    Poses, masks, map and mesh are bit-identical to those without interruption. A run that ended during the calibration
+    of the colour camera starts again.
 
     Args:
         out: The run folder.
-        sequence: The recording; None opens the one that the run began with.
-        device: Device to go on on, if it is to be another one: results then differ by roundings.
+        sequence: The recording; None opens the recording of the run.
+        device: Another device to continue on; the results then differ by rounding.
         progress: Show a progress bar on a terminal.
         observers: As for ``run``.
 
     Raises:
         StateError: There is no state in the folder, the run is finished, its recording has changed, another version of
             dudmap wrote it, or it is damaged.
-        DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
+        DudmapError: As for ``run``; or another process writes into the folder.
     """
     from dudmap.app.viewing.report import ReportObserver
     from dudmap.core.places.saved_map import SavedMap

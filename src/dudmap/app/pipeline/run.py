@@ -1,4 +1,4 @@
-"""Processing of a recording or of a camera: reads frames, runs the system, records metrics, writes the run folder."""
+"""Process a recording or a camera: read frames, run the system, record metrics, write the run folder."""
 
 import sys
 from collections.abc import Generator, Iterable, Iterator
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from dudmap.io.sequences.masks import MaskFolder
 
 PREVIEW = 3
-"""Frames with which the kernels are compiled or loaded before the stream of a camera begins."""
+"""Frames that compile or load the kernels before the stream of a camera begins."""
 
 
 def run(
@@ -71,39 +71,38 @@ def run(
     """Run the system over a recording, or on a camera until its stream ends or Ctrl-C, and write a run folder.
 
     ``docs/files.md`` describes the files of the folder: trajectory.txt, mesh.ply, map.npz, metrics.json and others.
-    Results of an earlier run in the same folder are removed first. If the run is interrupted or fails, the results so
-    far are written. With ``storing`` the folder also holds state.db until the run is finished, from which
-    ``dudmap.app.pipeline.resume.resume`` continues it.
+    Results of an earlier run in the folder are removed first. If the run is interrupted or fails, the results so
+    far are written. With ``storing`` the folder also holds state.db until the run is finished;
+    ``dudmap.app.pipeline.resume.resume`` continues from it.
 
     Args:
         sequence: The recording, whose ground truth and masks are used for evaluation only; or a camera, which is closed
-            at the end. Frames that arrive during processing wait for at most 0.1 s; older ones are counted as
-            ``dropped``.
+            at the end. Frames of a camera wait for at most 0.1 s; older ones are counted as ``dropped``.
         config: All parameters.
         out: The run folder; created if needed.
         max_frames: Process only this many frames.
         save_masks: Write the dynamic mask of every frame.
         save_map: Write map.npz and keyframes.npz.
-        masks: Folder of external dynamic masks, named like the images or <timestamp>.png, with 255 = dynamic, which are
-            added to the estimated ones. Frames with and without a mask are counted.
-        ignore: Image, white at the pixels of the depth or colour image that never count; ignored.png is its copy.
+        masks: Folder of external dynamic masks, which are added to the estimated ones. They are named like the images
+            or <timestamp>.png, with 255 = dynamic. Frames with a mask are counted.
+        ignore: Image, white at pixels of the depth or colour image that are never used; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
-        ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
-            would distort the times. The result does not depend on it.
+        ahead: Number of frames read ahead of the processed one, without effect on the result. Use 0 for rendered
+            frames, because rendering uses all cores and would distort the times.
         live: Replay the recording as if it were a camera.
         record: MCAP file for all frames of a camera that arrive, processed or not.
         passes: 2 processes the recording twice. The second pass compares every frame with the final map of the first
-            one. So objects that are in view from the start also leave the map. The last complete pass is written.
+            one, so that objects in view from the start also leave the map. The last complete pass is written.
         poses: Poses of the frames: the result, or the start of registration; given_poses.txt is their copy. If they are
             the result, frames without a pose are left out.
         calibration: Of the colour camera; None takes the calibration of the recording or the camera.
         calibrate: Estimate the calibration from the start of the recording first.
-        saved_map: Map of an earlier run to continue, which is taken over; all poses are in its world frame.
+        saved_map: Map of an earlier run to continue; it is modified. All poses are in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         max_memory: Largest resident memory of the process, bytes. Distant parts of the map wait on disk. None keeps the
             whole map in memory. It changes no result.
-        observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
-        storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
+        observers: Observers of every pass, every processed frame, and the written run folder.
+        storing: Store the state of the run at checkpoints; None does not. A live replay cannot be stored.
         warnings: Sentences on suspected faults of the recording (``pipeline.inspection``), for metrics.json.
 
     Raises:
@@ -141,7 +140,7 @@ def run(
     if saved_map is not None and passes == 2:
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     if storing is not None and live:
-        raise ConfigError("a live run cannot be stored: it does not stop for what is missed; drop live or storing")
+        raise ConfigError("a live run cannot be stored, because its frames cannot be read again; drop live or storing")
     if record is not None and not live:
         raise ConfigError("only the frames of a camera are recorded; these are on the disk already")
     if config.system == "thesis":
@@ -204,7 +203,7 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run as it was ordered; for the attributes see ``run``."""
+    """A run with its options; for the attributes see ``run``."""
 
     sequence: "Sequence | LiveCamera"
     out: Path
@@ -216,11 +215,11 @@ class Job:
 
     @cached_property
     def poses(self) -> "GivenPoses | None":
-        """The given poses, as they are in the run folder."""
+        """Given poses, as stored in the run folder."""
         return None if self.options.poses is None else stored_poses(self.out, self.options.poses)
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
-        """A new system for this recording."""
+        """Create a system for this recording."""
         if self.options.config.system == "thesis":
             from dudmap.thesis import ThesisSlam
 
@@ -244,12 +243,12 @@ class Job:
         )
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
-        """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
+        """Restore the run's state at the checkpoint in its database; ``store`` continues it."""
         with TreeReader(reader, store.database) as tree:
             return RunState.read(tree, StoredRun.model_validate(reader.meta()), self.options.config.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
-        """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
+        """Process the remaining frames and write the run folder, which is locked; see ``run``."""
         out, display, stopped, defect = self.out, self.display, "", False
         with ExitStack() as files, display:
             try:
@@ -270,7 +269,7 @@ class Job:
                     stopped = f"interrupted after {count} frames{of_pass}"
                     resume = "" if store is None else f"; dudmap run --resume {out} goes on"
                     raise KeyboardInterrupt(f"{stopped}; {_saved(state)} in {out}{resume}") from None
-                display.note(f"stopped by {interruption.name()} after {count} frames")  # as a stream without an end is
+                display.note(f"stopped by {interruption.name()} after {count} frames")  # like a stream that ends
             except DudmapError as error:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state)} in {out}") from error
@@ -290,7 +289,7 @@ class Job:
         return report
 
     def _process(self, state: RunState, store: RunStore | None) -> None:
-        """Process the frames of all passes that are left."""
+        """Process the remaining frames of all remaining passes."""
         options = self.options
         for number in range(state.number, options.passes):
             if number > state.number:
@@ -326,7 +325,7 @@ class Job:
             store.end(state)
 
     def _frames(self, state: RunState, background: Background) -> Generator[SourceFrame]:
-        """The frames of a pass that are left."""
+        """Remaining frames of the pass."""
         count, source, slam = self.options.max_frames, self.sequence, state.slam
         if isinstance(source, LiveCamera):
             self.display.working("loading kernels")
@@ -338,21 +337,21 @@ class Job:
         return read_ahead(source, count, self.options.ahead, self.masks, slam, state.next)
 
     def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
-        """A new system with what is known of the camera; for a second pass with the first."""
+        """Create a system with the known calibration; for a second pass, with the first pass."""
         return self.system(first_pass=first_pass, calibration=state.calibration)
 
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
-        """Where the run stood at its last checkpoint, from which it goes on on the CPU."""
+        """Restore the last checkpoint, to continue on the CPU."""
         store.close(finished=False)
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
             old, state = state, self.restored(reader, store)
-            self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")
+            self.display.note(f"frames {state.next} to {old.next - 1}, after the last checkpoint, are processed again")
             yield state, store
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
-        """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
+        """Write the run folder; delete the stored state of a run that was not stopped."""
         self.display.working("writing")
         slam, record = state.slam, state.record
         if stopped and state.number:  # the first pass is complete, the second is not
@@ -360,7 +359,7 @@ class Job:
         complete = False
         try:
             if not defect and not isinstance(sys.exception(), DeviceError | MapError | OSError | MemoryError):
-                self._fuse_held(state)  # of a run that was stopped; a map that cannot be written is left as it is
+                self._fuse_held(state)  # of a stopped run; a map that cannot be written stays as it is
             config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
                 self.out, slam, record, self.sequence, config, stopped,
@@ -377,14 +376,14 @@ class Job:
         return report
 
     def _fuse_held(self, state: RunState) -> None:
-        """Fuse the frames that are held back, since no other comes, and say so."""
+        """Fuse the frames that a young map holds back, because no other frame comes, and report them."""
         held, stamps = state.slam.finish(), [float(row["timestamp"]) for row in state.record.rows]
         state.record.fused_at_end += held
         if held:
             from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 
             self.display.note(
-                f"{held} frames were fused at the end, in which something may move that shows only after "
+                f"{held} frames were fused at the end, although motion in them may become visible only after "
                 f"{LONGEST_BASELINE:g} s; the recording has {len(stamps)} frames in {stamps[-1] - stamps[0]:.2f} s: "
                 f"expected {LONGEST_BASELINE:g} s or more"
             )
@@ -395,7 +394,7 @@ def _saved(state: RunState) -> str:
 
 
 def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
-    """Complete the recording and say what is in it."""
+    """Complete the recording and report its content."""
     with interruption.postponed():
         recorder.close()
     display.note(f"recorded {recorder.written} frames to {recorder.path}")

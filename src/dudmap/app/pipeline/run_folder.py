@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 LOCKED_BYTE = 1 << 20
-"""Place of the locked byte on Windows, behind the text, which others must be able to read."""
+"""Position of the locked byte on Windows, behind the text that other processes must be able to read."""
 
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
@@ -47,9 +47,9 @@ FILES = (
     "merge.json", "report.html", "changes.jsonl", "ignored.png", "given_poses.txt",
 )  # fmt: skip
 IGNORED = "ignored.png"
-"""Copy of the mask of the pixels that never count."""
+"""Copy of the mask of unused pixels."""
 FACES = 20_000
-"""Largest number of triangles for the direction against gravity, as in ``diff``: they take a tenth of a second."""
+"""Most triangles for the direction against gravity, as in ``diff``: a tenth of a second."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
@@ -61,15 +61,15 @@ WRITTEN = {
     )),
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
 }  # fmt: skip
-"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
+"""Regular expressions of all file names of a run, by sub-folder; a run removes only these files first."""
 
 
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
-    """Hold the lock of a run folder, which exists; the operating system gives it up when the process ends, however.
+    """Hold the lock of an existing run folder; the operating system releases it when the process ends.
 
     Raises:
-        DudmapError: Another process, or another run of this one, holds the lock; the sentence says which.
+        DudmapError: Another process, or another run of this one, holds the lock; the message names it.
         OSError: The file cannot be written, or is a link or anything but a plain file.
     """
     with OwnFolder(folder, linked=True) as own, _locked_file(own) as file:
@@ -98,7 +98,7 @@ def _locked_file(folder: OwnFolder) -> IO[bytes]:
         there = folder.status(LOCK)
         if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
             return file
-        file.close()  # whoever held it has removed this file in between
+        file.close()  # the previous holder has removed this file meanwhile
 
 
 def _lock(file: IO[bytes]) -> None:
@@ -116,7 +116,7 @@ def _lock(file: IO[bytes]) -> None:
 
 
 def _described(holder: str) -> str:
-    """Who holds a lock, from its file."""
+    """Text on the holder of a lock, from its file."""
     try:
         about = json.loads(holder)
         return f"process {int(about['pid'])} on {about['host']} since {about['since']}"
@@ -140,15 +140,15 @@ class RunReport:
 
 
 def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
+    """Write a mask (H, W) as an image, 255 = dynamic; it reaches the disk before the next checkpoint."""
     write_image(path, mask, sync=False, own=True)
 
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Keep other processes from writing into the run folder, which is created if needed.
+    """Lock the run folder against other processes; create it if needed.
 
-    What a process that was killed has left half written is removed.
+    Half-written files of a killed process are removed.
 
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
@@ -193,8 +193,8 @@ def write_run_folder(
 ) -> RunReport:
     """Write all files of the run folder; a file that fails does not prevent the others.
 
-    After a defect of dudmap itself, what cannot be made of the state that it left is listed under ``not_written`` in
-    metrics.json, so that the error is not replaced by another one.
+    After a defect of dudmap, files that cannot be written are listed under ``not_written`` in metrics.json, so that the
+    first error is reported.
 
     Raises:
         DudmapError: A file could not be written, other than after a defect.
@@ -217,7 +217,7 @@ def write_run_folder(
     thinned: list[Mesh] = []
 
     def save_mesh() -> None:
-        if volume.pager is not None:  # the mesh may not fit into the memory either
+        if volume.pager is not None:  # the mesh may not fit into the memory
             vertices, triangles = save_pieces(volume.extract_pieces(), out / "mesh.ply")
         else:
             mesh = volume.extract_mesh()
@@ -283,7 +283,7 @@ def write_run_folder(
 
 
 def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None) -> dict[str, Any] | None:
-    """The entry ``up`` of metrics.json; None without poses."""
+    """Entry ``up`` of metrics.json; None without poses."""
     measured, problem = None, ""
     try:
         gravity = getattr(sequence, "gravity", None)
@@ -299,7 +299,7 @@ def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None)
 
 
 def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:
-    """Write mesh and trajectory of every rigid object; returns the entries of all objects in metrics.json."""
+    """Write mesh and trajectory of every rigid object; return the entries of all objects in metrics.json."""
     out = []
     for obj in objects:
         row = {"id": obj.id, "rigid": obj.rigid, "why_not": obj.reason or None, "frames": obj.frames}

@@ -1,4 +1,4 @@
-"""The state of a run in its folder: what is stored, when, and what a continued run finds there."""
+"""Store the state of a run in its folder, at checkpoints, and read it to continue the run."""
 
 import os
 import re
@@ -45,23 +45,22 @@ if TYPE_CHECKING:
 DATABASE = "state.db"
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 SHARE = 0.02
-"""Largest share of the time so far that checkpoints take in processor time, snapshots and writing together, unless an
-interval is given.
+"""Largest share of elapsed time that checkpoints take in processor time, unless an interval is given.
 
-What the writing thread takes from the memory bandwidth and the caches of the frames is not measured; the rest of the
-3 % that checkpoints may cost is left for it.
+Snapshots and writing count. The rest of the allowed 3 % is for the writing thread's use of memory bandwidth and caches,
+which is not measured.
 """
 FIRST = 5.0
-"""Seconds before the first checkpoint: a run that is shorter is repeated as fast as it is continued."""
+"""Seconds before the first checkpoint; repeating a shorter run takes no longer than continuing it."""
 
 
 @dataclass(frozen=True)
 class Storing:
-    """How a run is stored while it goes on.
+    """How a run is stored.
 
     Attributes:
         recording: Arguments of ``open_sequence``: path, and camera and options as texts.
-        every: Seconds from one checkpoint to the next; None chooses by what they cost.
+        every: Seconds between checkpoints; None chooses by their cost.
         report: Whether a report is made.
     """
 
@@ -71,7 +70,7 @@ class Storing:
 
 
 class RunOptions(BaseModel):
-    """What a run was ordered with, under the names of the arguments of ``run``, as it is stored."""
+    """Arguments of ``run`` as they are stored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -91,13 +90,13 @@ class RunOptions(BaseModel):
 
 
 class StoredRun(BaseModel):
-    """What the database of a run says of it.
+    """Description of a run in its database.
 
     Attributes:
-        options: What it was ordered with.
+        options: Arguments of the run.
         recording: Fingerprint of the recording.
-        number: Number of the pass that goes on, None before the first frame.
-        next, frame: Number of the frame that comes next, and fingerprint of the one before.
+        number: Number of the current pass, None before the first frame.
+        next, frame: Number of the next frame, and fingerprint of the previous one.
     """
 
     options: RunOptions
@@ -109,14 +108,14 @@ class StoredRun(BaseModel):
 
 @dataclass(eq=False)
 class RunState:
-    """Where a run stands.
+    """State of a run.
 
     Attributes:
-        slam, record: The system and the metrics of the pass that goes on.
+        slam, record: System and metrics of the current pass.
         calibration: Of the camera, as given.
         number: Number of the pass, from 0.
-        next: Number of the frame that comes next.
-        first_record: Metrics of the pass before, whose system is ``slam.first_pass``.
+        next: Number of the next frame.
+        first_record: Metrics of the previous pass, whose system is ``slam.first_pass``.
     """
 
     slam: "Slam"
@@ -127,13 +126,13 @@ class RunState:
     first_record: RunRecord | None = None
 
     def parts(self) -> dict[str, object]:
-        """Parts of the state that is stored; the numbers are in its ``StoredRun``."""
+        """Parts of the stored state; the numbers are in its ``StoredRun``."""
         figures = {"record": self.record, "calibration": self.calibration, "first record": self.first_record}
         return parts_of(self.slam) | figures
 
     @classmethod
     def read(cls, tree: TreeReader, stored: "StoredRun", device: str | None) -> "RunState":
-        """The state with these parts."""
+        """Read the state with these parts."""
         from dudmap.core.geometry.calibration import Calibration
 
         slam, record = read_system(tree, device), tree.part("record", RunRecord)
@@ -147,13 +146,13 @@ class RunState:
 class RunStore:
     """Stores the state of a run in its folder: checkpoints between two frames, written by a background thread.
 
-    A checkpoint that cannot be written, since the disk is full or fails or by a defect of this program, is announced
-    once and tried again when the next one is due; what is in the database stays as it is.
+    If a checkpoint cannot be written, this is reported once and tried again at the next one. The database then keeps
+    its content.
 
     Args:
         out: The run folder, locked by this process.
-        every: Seconds from one checkpoint to the next; None chooses by what they cost.
-        notice: Receives sentences on what cannot be stored.
+        every: Seconds between checkpoints; None chooses by their cost.
+        notice: Receives messages on failed checkpoints.
 
     Raises:
         DudmapError: The database cannot be created.
@@ -161,7 +160,7 @@ class RunStore:
 
     def __init__(self, out: Path, every: float | None, notice: "Callable[[str], None]") -> None:
         try:
-            self.database = StateDatabase(out / DATABASE)  # only the writing thread uses it from now on
+            self.database = StateDatabase(out / DATABASE)  # used by the writing thread only
         except (OSError, sqlite3.Error) as error:
             raise DudmapError(f"the state of the run cannot be stored in {out / DATABASE}: {error}") from error
         self.written = 0
@@ -169,12 +168,12 @@ class RunStore:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="dudmap-state")
         self._running: Future[float] | None = None
         self._start = self._last = time.perf_counter()
-        self._cost, self._last_cost = 0.0, 0.0  # seconds, of all checkpoints and of the last
-        self._files: list[Path] = []  # which the next checkpoint counts on: they are brought to the disk before
+        self._cost, self._last_cost = 0.0, 0.0  # processor seconds of all checkpoints and of the last
+        self._files: list[Path] = []  # masks that must reach the disk before the next checkpoint
         self._failing = False
 
     def order(self, sequence: "Sequence", options: RunOptions) -> None:
-        """Store what the run is, before anything that takes time."""
+        """Store the arguments of the run, before anything that takes time."""
         about = {"options": options.model_dump(mode="json"), "recording": recording_fingerprint(sequence)}
         about |= {"code": code_fingerprint(), "versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
         try:
@@ -183,7 +182,7 @@ class RunStore:
             raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
 
     def frame(self, state: RunState, frame: "Frame | Exception", background: Background) -> None:
-        """A frame was processed; take a checkpoint if one is due, with all that the background does for the frames."""
+        """Take a checkpoint after a processed frame if one is due, once all background jobs are done."""
         if not isinstance(frame, Exception):
             self._files.append(self._out / "masks" / f"{frame.timestamp:.6f}.png")
         if self.is_due:
@@ -191,13 +190,13 @@ class RunStore:
             self.take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:
-        """All frames are processed, and the results will be written: store the last state unless the run was short."""
+        """Store the last state before the results are written, unless the run was short."""
         if self._every is not None or self.written or time.perf_counter() - self._start >= FIRST:
             self.take(state, wait=True)
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time for a checkpoint and the last one is written."""
+        """Whether a checkpoint is due and the last one is written."""
         if self._running is not None and not self._running.done():
             return False
         self._finish()
@@ -207,14 +206,13 @@ class RunStore:
         return now - self._last >= FIRST and self._cost + self._last_cost <= SHARE * (now - self._start)
 
     def take(self, state: RunState, frame: str = "", *, wait: bool = False) -> None:
-        """Take a snapshot of the state after a frame of this fingerprint, and have it written.
+        """Take a snapshot of the state and have it written; ``frame`` is the fingerprint of the last frame.
 
-        It has no effect while something is computed in the background; ``wait`` waits for that, and until it is
-        written.
+        During background computations it does nothing; with ``wait`` it waits for them and for the file.
         """
         if wait:
             self._finish()
-        start, busy = time.perf_counter(), time.thread_time()  # a process that was stopped meanwhile has not been busy
+        start, busy = time.perf_counter(), time.thread_time()
         for record in filter(None, (state.record, state.first_record)):
             record.settle()
         updated = datetime.now().isoformat(" ", "seconds")
@@ -223,7 +221,7 @@ class RunStore:
             snapshot = take_snapshot(state.parts(), self.database, wait=wait)
         except NotSettledError:
             return
-        except StateError as error:  # a defect of this program, which is no reason to end the run
+        except StateError as error:  # a defect of this program does not end the run
             self._last = start
             self._warn(error)
             return
@@ -235,11 +233,11 @@ class RunStore:
             self._finish()
 
     def reopened(self) -> "RunStore":
-        """The same after ``close``, to go on from what is stored."""
+        """Reopen the store after ``close``."""
         return RunStore(self._out, self._every, self._notice)
 
     def close(self, *, finished: bool) -> None:
-        """Close the database, and remove it where the run is finished, so that only its results remain."""
+        """Close the database; remove it if the run is finished."""
         self._thread.shutdown()
         self._finish()
         self.database.close()
@@ -247,7 +245,7 @@ class RunStore:
             remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
 
     def _write(self, snapshot: Snapshot, meta: dict[str, Any], files: list[Path]) -> float:
-        """Seconds of processor time that writing took."""
+        """Write a checkpoint; return the processor seconds."""
         start = time.thread_time()
         for path in [*files, *{path.parent for path in files}] if os.name == "posix" else files:
             if path.exists():
@@ -256,7 +254,7 @@ class RunStore:
         return time.thread_time() - start
 
     def _finish(self) -> None:
-        """Wait for the last checkpoint, and take note of how it went."""
+        """Wait for the last checkpoint; note its cost or error."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -272,7 +270,7 @@ class RunStore:
             self._warn(error)
 
     def _warn(self, error: BaseException) -> None:
-        """Say once that no checkpoints are written."""
+        """Report once that no checkpoints are written."""
         if not self._failing:
             self._failing = True
             of_disk = isinstance(error, OSError | sqlite3.Error)
@@ -282,7 +280,7 @@ class RunStore:
 
 
 def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
-    """The database of an unfinished run, and what it says of the run.
+    """Open the database of an unfinished run; return it with the description of the run.
 
     Raises:
         StateError: There is none, the run is finished, or another version wrote it.
@@ -298,22 +296,22 @@ def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
         return reader, StoredRun.model_validate(meta)
     except ValidationError as error:
         raise StateError(
-            f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run"
+            f"{out / DATABASE} is damaged or not the state of a run; begin again with dudmap run"
         ) from error
 
 
 def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
-    """Refuse a recording that is not the one that a stored run is of."""
+    """Check that a recording is the one of a stored run."""
     same = recording_fingerprint(sequence) == stored.recording
     if not same or (stored.frame and frame_fingerprint(sequence, stored.next - 1) != stored.frame):
         raise StateError(
-            f"the recording {sequence.name} is not as it was when the run in {out} began; bring the old one back, or "
-            "begin anew with dudmap run"
+            f"the recording {sequence.name} has changed since the run in {out} began; restore the old one, or "
+            "begin again with dudmap run"
         )
 
 
 def _why_nothing(out: Path) -> str:
-    """Sentence on why a folder holds no run that can be continued."""
+    """Why a folder holds no run that can be continued."""
     try:
         metrics = read_json(out / "metrics.json")
         if metrics["complete"]:

@@ -1,1 +1,1 @@
-"""The state of a run in one SQLite database: checkpoints while it goes on, and what continues it from them."""
+"""Store the state of a run in one SQLite database, at checkpoints, and continue the run from it."""

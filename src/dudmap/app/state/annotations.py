@@ -1,4 +1,4 @@
-"""What the annotation of an attribute says about its values: how they are stored, and what may be made of them."""
+"""Interpret annotations of attributes: how values are stored, and which values may be created from them."""
 
 import types
 from collections.abc import Callable, Iterable
@@ -14,18 +14,19 @@ NUMBERS = {
     int: (int, np.integer, np.bool_),
     float: (int, float, np.integer, np.floating),
 }
-"""What counts as a number of a type."""
+"""Accepted types per type of number."""
 RECORD = dict[str, Any]
-"""Annotation of plain values, as JSON has them, by name."""
+"""Annotation of plain JSON values by name."""
 
 
 @cache
 def content_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
-    """Class and arguments of an annotation: those of the one member of a union that is neither None nor plain;
-    ``object`` where it allows for plain values alone.
+    """Class and arguments of an annotation; ``object`` for plain values.
+
+    Of a union, the one member counts that is neither None nor plain.
 
     Raises:
-        TypeError: There are several such members, or it allows for anything.
+        TypeError: There are several such members, or the annotation is ``Any``.
     """
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind is Annotated:
@@ -38,13 +39,13 @@ def content_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
     if kind is Any:
         raise TypeError("an annotation allows for anything")
     if kind is Callable:
-        return kind, parts[-1:]  # of what it returns
+        return kind, parts[-1:]  # the annotation of the result
     return (object, ()) if kind in (*PLAIN, types.NoneType, Literal) else (kind, parts)
 
 
 @cache
 def fields_of(cls: type) -> dict[str, Any]:
-    """Annotation by name of the fields of a dataclass or named tuple, without caches; empty for other classes."""
+    """Annotations of the fields of a dataclass or named tuple by name, without caches; empty for other classes."""
     if issubclass(cls, tuple):
         names: Iterable[str] = getattr(cls, "_fields", ())
     else:
@@ -54,7 +55,7 @@ def fields_of(cls: type) -> dict[str, Any]:
 
 
 def is_frozen(cls: type) -> bool:
-    """Whether the fields of a dataclass or named tuple stay as they are."""
+    """Whether the fields of a dataclass or named tuple are immutable."""
     return issubclass(cls, tuple) or getattr(cls, "__dataclass_params__").frozen  # noqa: B009 - not in the stubs
 
 
@@ -62,7 +63,7 @@ def item_hints(kind: Any, parts: tuple[Any, ...], count: int) -> list[Any]:  # n
     """Annotation of each item of a tuple or another sequence.
 
     Raises:
-        ValueError: There are not as many as the annotation says.
+        ValueError: The annotation has another number of items.
     """
     if kind is not tuple or parts[-1:] == (...,):
         return [parts[0]] * count
@@ -72,7 +73,7 @@ def item_hints(kind: Any, parts: tuple[Any, ...], count: int) -> list[Any]:  # n
 
 
 def fits(value: Any, hint: Any) -> bool:  # noqa: ANN401
-    """Whether a value is what an annotation says; what a container holds is looked at where it is made."""
+    """Whether a value fits an annotation; items of containers are checked when they are created."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)

@@ -1,4 +1,4 @@
-"""Blocks of the maps and stored frames on their way into the database and back: only what changed is written."""
+"""Changed map blocks and stored frames between memory and database."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords
 from dudmap.core.places.frame_store import EncodedFrame, FrameStore
 
 VOXELS = 2 * BLOCK**3
-"""Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""
+"""32-bit words of a block: the geometry of its voxels, then their colours, as in memory."""
 
 
 class MapSettings(NamedTuple):
-    """Arguments of ``TsdfVolume`` with which a map is made again."""
+    """Arguments of ``TsdfVolume`` that recreate a map."""
 
     camera: Camera
     config: VolumeConfig
@@ -29,23 +29,23 @@ class MapSettings(NamedTuple):
 
     @classmethod
     def of(cls, volume: TsdfVolume) -> "MapSettings":
-        """Those of a map."""
+        """Settings of a map."""
         limit = None if volume.pager is None else volume.pager.max_blocks
         return cls(volume.camera, volume.config, volume.sensor, volume.depth_max, limit)
 
 
 @dataclass(frozen=True, eq=False)
 class MapSnapshot:
-    """What changed in a map since the last checkpoint.
+    """Changes of a map since the last checkpoint.
 
     Attributes:
         number: Number of the map in the database.
         map_id, frame: The map in this process, and its number of fused frames.
-        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) int32 of the blocks that were written.
-        released: Slots that hold no block any more.
-        num_slots: Number of slots in use; there are none behind them.
-        away: Number of the content of each region that has left the memory.
-        regions: Those of them that the database lacks.
+        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) int32 of the changed blocks.
+        released: Slots that no longer hold a block.
+        num_slots: Number of slots in use.
+        away: Content number of each region that has left the memory.
+        regions: Regions that the database lacks.
     """
 
     number: int
@@ -61,7 +61,7 @@ class MapSnapshot:
 
 
 class StoredMap(NamedTuple):
-    """A map in the database: its number, the frame that it was stored after, the numbers of its regions' contents."""
+    """A map in the database: its number, the frame count at its last storing, its regions' content numbers."""
 
     number: int
     frame: int
@@ -69,7 +69,7 @@ class StoredMap(NamedTuple):
 
 
 class StoredMaps:
-    """Knows which blocks are in the database as they are in memory.
+    """Tracks which blocks the database holds in their present state.
 
     Attributes:
         by_id: The maps in the database by ``TsdfVolume.map_id``.
@@ -77,10 +77,10 @@ class StoredMaps:
 
     def __init__(self) -> None:
         self.by_id: dict[int, StoredMap] = {}
-        self._next = 0  # number of the next map that the database lacks
+        self._next = 0  # number of the next new map
 
     def snapshot(self, volume: TsdfVolume) -> MapSnapshot:
-        """A copy of the blocks of a map that the database lacks or has in an earlier state."""
+        """Copy the blocks of a map that the database lacks or holds in an earlier state."""
         stored, blocks = self.by_id.get(volume.map_id), volume.blocks
         number = self._next if stored is None else stored.number
         self._next = max(self._next, number + 1)
@@ -100,11 +100,11 @@ class StoredMaps:
         )  # fmt: skip
 
     def commit(self, maps: list[MapSnapshot]) -> None:
-        """The blocks of these maps are in the database, and no other maps."""
+        """Record that the database now holds the blocks of these maps, and no other maps."""
         self.by_id = {changed.map_id: StoredMap(changed.number, changed.frame, changed.away) for changed in maps}
 
     def add(self, volume: TsdfVolume, number: int) -> None:
-        """A map has been read from the database."""
+        """Record a map that was read from the database."""
         regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
         self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, regions)
         self._next = max(self._next, number + 1)
@@ -112,13 +112,13 @@ class StoredMaps:
 
 @dataclass(frozen=True, eq=False)
 class FrameSnapshot:
-    """What changed in a frame store since the last checkpoint.
+    """Changes of a frame store since the last checkpoint.
 
     Attributes:
         number: Number of the store in the database.
-        frames: The frames that the database lacks, by number: depth, colour and mask as files.
-        gone: Numbers of those that it holds, and the store does not any more.
-        kept: Numbers of the frames whose images are in the store.
+        frames: Frames that the database lacks, by number: depth, colour and mask as files.
+        gone: Numbers of frames in the database that the store no longer holds.
+        kept: Numbers of the frames in the store.
         store: The store.
     """
 
@@ -130,13 +130,13 @@ class FrameSnapshot:
 
 
 class StoredFrames:
-    """Knows which frames are in the database."""
+    """Tracks which frames the database holds."""
 
     def __init__(self) -> None:
-        self._stores: list[tuple[FrameStore, set[int]]] = []  # the number is the place in the list
+        self._stores: list[tuple[FrameStore, set[int]]] = []  # indexed by store number
 
     def snapshot(self, store: FrameStore) -> FrameSnapshot:
-        """The frames that the database lacks, and those that it no longer needs; waits until the former are encoded."""
+        """Frames that the database lacks, and frames that it no longer needs; waits until the former are encoded."""
         number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
         if number == len(self._stores):
             self._stores.append((store, set()))
@@ -145,12 +145,12 @@ class StoredFrames:
         return FrameSnapshot(number, frames, sorted(stored - kept), kept, store)
 
     def commit(self, frames: list[FrameSnapshot]) -> None:
-        """What these snapshots hold is in the database."""
+        """Record that the database now holds these frames."""
         for changed in frames:
             self._stores[changed.number] = changed.store, changed.kept
 
     def add(self, store: FrameStore, number: int) -> None:
-        """The frames of a store come from the database."""
+        """Record a store whose frames were read from the database."""
         while len(self._stores) <= number:
             self._stores.append((store, set()))
         self._stores[number] = store, set(store.kept)

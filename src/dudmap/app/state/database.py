@@ -1,8 +1,15 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables: ``blocks`` (voxels by map and slot), ``regions`` (blocks that have left the memory), ``frames`` (stored
-frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
-write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
+Tables:
+
+- ``blocks``: voxels by map and slot.
+- ``regions``: blocks that have left the memory.
+- ``frames``: stored frames.
+- ``chunks``: parts of arrays by their content.
+- ``state``: the tree.
+- ``meta``: the description of the run.
+
+The write-ahead log makes a checkpoint complete or absent after a crash, and readable during writing.
 """
 
 import hashlib
@@ -39,15 +46,15 @@ from dudmap.input_files import (
 from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
-"""Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
+"""Application number in the file header that marks these databases: the letters DUDS."""
 SCHEMA = 6
 CHUNK = 1 << 16
-"""Bytes of an array that are stored together; a part that did not change is not written again."""
+"""Bytes of an array per chunk; unchanged chunks are not written again."""
 STEPS, LIMIT = 10_000, 100_000
-"""Instructions of SQLite between two looks at ctrl-C, and looks after which a statement is ended; a row takes 10 to
-50 instructions."""
+"""SQLite instructions between two checks for ctrl-C, and checks until a statement is ended. A row takes 10 to 50
+instructions."""
 ROWS = 4096
-"""Blocks that are read at once."""
+"""Blocks read at once."""
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
@@ -69,7 +76,7 @@ class StateDatabase:
         path: The file; created with its tables if it does not exist.
 
     Attributes:
-        maps, frames: Know what is in the database.
+        maps, frames: Track the content of the database.
 
     Raises:
         OSError: The file is a link or anything but a plain file.
@@ -95,7 +102,7 @@ class StateDatabase:
         self._chunks = {row[0].hex() for row in self._execute("SELECT key FROM chunks")}
 
     def write_meta(self, values: dict[str, Any]) -> None:
-        """Set values that describe the run, all of them or none.
+        """Set values that describe the run, all or none.
 
         Raises:
             sqlite3.Error: They cannot be written.
@@ -104,10 +111,10 @@ class StateDatabase:
         self._connection.execute("INSERT OR REPLACE INTO meta SELECT key, value FROM json_each(?)", [rows])
 
     def write(self, snapshot: Snapshot, meta: dict[str, Any]) -> None:
-        """Store a snapshot that was taken with ``maps`` and ``frames``, as one transaction.
+        """Store a snapshot taken with ``maps`` and ``frames``, as one transaction.
 
         Raises:
-            sqlite3.Error: It cannot be written; the database holds the checkpoint before.
+            sqlite3.Error: It cannot be written; the database keeps the previous checkpoint.
         """
         arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
         described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays]}
@@ -134,7 +141,7 @@ class StateDatabase:
         self._chunks = used
         alive = {id(snapshot.arrays[n]) for n in snapshot.constant}
         self._constants = {key: value for key, value in self._constants.items() if key in alive}
-        self._execute("PRAGMA busy_timeout = 0")  # what a reader still needs stays in the log: it is not waited for
+        self._execute("PRAGMA busy_timeout = 0")  # do not wait for readers; their pages stay in the log
         self._execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._execute("PRAGMA busy_timeout = 5000")
 
@@ -173,8 +180,10 @@ class StateDatabase:
             self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
 
     def _described(self, array: NDArray | list[Any], constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Type, shape and chunks of an array, and the content of the chunks that may be new; a list of plain values is
-        the text of lines of JSON."""
+        """Type, shape and chunk keys of an array, and the content of chunks that may be new.
+
+        A list of plain values is stored as lines of JSON.
+        """
         if isinstance(array, list):
             array = np.frombuffer("".join(json.dumps(record) + "\n" for record in array).encode(), np.uint8)
         transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
@@ -192,22 +201,21 @@ class StateDatabase:
 
 
 class StateReader:
-    """Reads the database of a run, also of one that goes on: what is read is the state of one checkpoint.
+    """Reads one checkpoint from the database of a run, also during the run.
 
     Args:
         path: The file.
 
     Raises:
-        StateError: There is none, or it is no database of this version; by all methods: it is damaged, or what they
-            read is missing.
+        StateError: The file is missing or of another version; all methods: it is damaged, or a row is missing.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         if not path.is_file():
             raise StateError(f"there is no state of a run at {path}")
-        if path.with_name(f"{path.name}-journal").exists():  # SQLite would do what is in it, also to other files
-            raise StateError(f"there is a {path.name}-journal beside {path}, which no run leaves; remove it")
+        if path.with_name(f"{path.name}-journal").exists():  # SQLite would replay it, even into other files
+            raise StateError(f"found a {path.name}-journal next to {path}; no run writes one: remove it")
         _check_size(path)
         self._left = 0
         try:
@@ -218,7 +226,7 @@ class StateReader:
             self._connection.set_progress_handler(self._is_too_long, STEPS)
             for safety in ("trusted_schema = OFF", "cell_size_check = ON"):
                 self._connection.execute(f"PRAGMA {safety}")
-            self._connection.execute("BEGIN")  # one state for all that is read
+            self._connection.execute("BEGIN")  # all reads see one checkpoint
             found = [self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in _HEADER]
         except sqlite3.Error as error:
             raise StateError(f"{path} is not a readable state of a run: {error}") from error
@@ -227,10 +235,10 @@ class StateReader:
         if found[1] != SCHEMA:
             raise StateError(f"{path} was written in version {found[1]} of the format; this version reads {SCHEMA}")
         if list(self._rows(_TABLES_OF)) != _own_tables() or list(self._rows("PRAGMA quick_check(1)")) != [("ok",)]:
-            raise StateError(f"{path} is damaged or not of this program: its tables are not those of a state")
+            raise StateError(f"{path} is damaged or not of this program: it has other tables than a state")
 
     def meta(self) -> dict[str, Any]:
-        """What describes the run, by name."""
+        """Description of the run, by name."""
         try:
             return {key: parse_json(value, exact=True) for key, value in self._rows("SELECT key, value FROM meta")}
         except (ValueError, TypeError, AttributeError) as error:
@@ -249,7 +257,7 @@ class StateReader:
             chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
             parts = [key for one in described["arrays"] for key in one["chunks"]]
             total, held = sum(len(chunks[key]) for key in parts), sum(map(len, chunks.values()))
-            if total > max(RATIO_FREE_BYTES, LARGEST_RATIO * held):  # a part may stand in many arrays
+            if total > max(RATIO_FREE_BYTES, LARGEST_RATIO * held):  # a chunk may belong to many arrays
                 raise ValueError(f"its arrays have {total} bytes, and {held} are stored")
             return described["tree"], [_array(about, chunks) for about in described["arrays"]]
         except (*DAMAGE, MemoryError) as error:
@@ -271,7 +279,7 @@ class StateReader:
         return places[:, 0], places[:, 1:], voxels
 
     def region(self, map_number: int, region: Region) -> BlockRecords:
-        """Blocks of a region of a map that had left the memory."""
+        """Blocks of a region of a map that left the memory."""
         columns, where = ", ".join(COLUMNS), "map = ? AND x = ? AND y = ? AND z = ?"
         select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
         rows = list(self._rows(select, map_number, *region))
@@ -296,7 +304,7 @@ class StateReader:
         return [row[0] for row in self._rows("SELECT number FROM frames WHERE store = ? ORDER BY number", store)]
 
     def release(self) -> None:
-        """Let go of the state that was current when the file was opened; later reads see the newest."""
+        """Release the checkpoint seen since opening; later reads see the newest."""
         self._connection.execute("COMMIT")
 
     def close(self) -> None:
@@ -308,7 +316,7 @@ class StateReader:
         try:
             yield from self._connection.execute(statement, values)
         except (sqlite3.Error, UnicodeDecodeError) as error:
-            if "interrupted" in str(error) and self._left > 0:  # what ctrl-C raises in the handler ends here
+            if "interrupted" in str(error) and self._left > 0:  # ctrl-C in the handler arrives as this error
                 raise KeyboardInterrupt from None
             raise self._damaged(error) from error
 
@@ -316,7 +324,7 @@ class StateReader:
         return StateError(f"the state of the run in {self.path} is damaged: {what}")
 
     def _is_too_long(self) -> bool:
-        """Whether a statement must end; called by SQLite, so that ctrl-C is heard."""
+        """Whether a statement must end; SQLite calls it, so that Python handles ctrl-C."""
         self._left -= 1
         return self._left <= 0
 
@@ -326,14 +334,14 @@ _TABLES_OF = "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name"
 
 
 def _own_tables() -> list[tuple[str, ...]]:
-    """What ``_TABLES_OF`` finds in a new database."""
+    """Result of ``_TABLES_OF`` for a new database."""
     with closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(TABLES)
         return list(connection.execute(_TABLES_OF))
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a file that is much larger than what of it is on the disk."""
+    """Refuse a file that is much larger than its content on the disk."""
     status = path.stat()
     stored = 512 * getattr(status, "st_blocks", status.st_size)
     if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):
@@ -348,7 +356,7 @@ def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
 
 
 def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
-    """An array from its chunks; it may be written."""
+    """Writable array from its chunks."""
     dtype, shape = np.dtype(about["dtype"]), tuple(about["shape"])
     if dtype.kind not in SAFE_KINDS or any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
         raise ValueError(f"found an array of {dtype} with the shape {shape}; expected numbers or text")

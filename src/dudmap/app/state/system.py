@@ -1,4 +1,4 @@
-"""A system and what belongs to it, from and into a database, and what a stored state fits."""
+"""Store a system in a database, restore it, and check that a stored state fits code and recording."""
 
 import hashlib
 from collections.abc import Mapping
@@ -27,9 +27,9 @@ CODE = ("config.py", "core", "app/state", "app/pipeline/metrics.py", "app/pipeli
 
 @cache
 def code_fingerprint() -> str:
-    """Checksum of the code that computes a state and of the versions of the libraries it uses.
+    """Checksum of the code that computes a state and of the versions of its libraries.
 
-    A state is continued by the code that wrote it and by no other: with any other the result would be that of neither.
+    Only the code that wrote a state continues it, because other code would mix two results.
     """
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     root = Path(str(files("dudmap")))
@@ -57,7 +57,7 @@ def frame_fingerprint(sequence: "Sequence", index: int) -> str:
 
 
 def images_fingerprint(frame: "Frame | Exception") -> str:
-    """Checksum of the images of a frame, or of the sentence on why it cannot be read."""
+    """Checksum of the images of a frame, or of its error text."""
     if isinstance(frame, Exception):
         return hashlib.sha256(str(frame).encode()).hexdigest()
     digest = hashlib.sha256(repr((frame.timestamp, frame.color_timestamp)).encode())
@@ -67,25 +67,25 @@ def images_fingerprint(frame: "Frame | Exception") -> str:
 
 
 def take_snapshot(parts: Mapping[str, object], database: StateDatabase, *, wait: bool = True) -> Snapshot:
-    """The state of some things by name, without what the database, in which it will be written, holds already.
+    """Take the state of named parts, without content that the database already holds.
 
-    Without ``wait`` it raises ``NotSettledError`` while something is computed in the background.
+    Without ``wait`` it raises ``NotSettledError`` during background computations.
 
     Raises:
-        StateError: There is something that cannot be stored.
+        StateError: A part cannot be stored.
     """
     return TreeWriter(database.maps, database.frames, wait=wait).take(parts)
 
 
 def parts_of(slam: "Slam") -> dict[str, object]:
-    """A system, and the first pass that it goes on from, as parts of a state."""
+    """Parts of a system's state, including its first pass, if any."""
     first = slam.first_pass
     before = {} if first is None else {"first arguments": first.arguments, "first slam": first}
     return before | {"arguments": slam.arguments, "slam": slam}
 
 
 def read_system(tree: TreeReader, device: str | None, which: str = "") -> "Slam":
-    """The system with these parts, on another device if one is given; it is made first, and then gets its state."""
+    """Restore the system of these parts, on another device if one is given."""
     from dudmap.core.slam import Slam, SlamArguments
 
     first = read_system(tree, device, "first ") if not which and "first slam" in tree else None
@@ -97,7 +97,7 @@ def read_system(tree: TreeReader, device: str | None, which: str = "") -> "Slam"
 
 
 def save_system(slam: "Slam", path: str | Path) -> None:
-    """Write the whole state of a system, from which ``resume_system`` goes on, replacing an older file at the end.
+    """Write the whole state of a system for ``resume_system``; an older file is replaced at the end.
 
     Raises:
         StateError: The file cannot be written.
@@ -121,10 +121,10 @@ def save_system(slam: "Slam", path: str | Path) -> None:
 
 
 def resume_system(path: str | Path, device: str | None = None) -> "Slam":
-    """A system in the state that ``save_system`` wrote: the frames that follow give the same results, bit for bit.
+    """Restore a system that ``save_system`` wrote; later frames give bit-identical results.
 
-    With another ``device`` than that of the run the results differ by roundings. The file stays open and must stay as
-    it is while the system lives: stored frames are read from it.
+    On another ``device`` the results differ by rounding. The file must not change while the system lives, because
+    stored frames are read from it.
 
     Raises:
         StateError: The file is missing, damaged, or was written by another version.
@@ -137,7 +137,7 @@ def resume_system(path: str | Path, device: str | None = None) -> "Slam":
 
 
 def on_device(config: Config, device: str | None) -> Config:
-    """The configuration with another device; None keeps that of the run."""
+    """Configuration with another device; None keeps the device."""
     return config if device is None else config.override([f"device={device}"])
 
 

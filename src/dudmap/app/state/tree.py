@@ -1,11 +1,13 @@
-"""State as a tree of plain values and arrays, and back, as the annotations of its classes say.
+"""Convert state to a tree of plain values and arrays, and back, by the annotations of its classes.
 
-What is stored names no class: the annotation of the attribute or field that holds a value says what is made of it, and
-a value that does not fit is refused. A ``Stateful`` object is filled in place, where its owner has made it; dataclasses
-and named tuples are made of their fields, and one that is stored twice is one again. Of functions without arguments
-and futures the result is stored.
+The tree names no classes: the annotation of an attribute determines the class of its value, and a value that does not
+fit is refused.
 
-A node is a number, a text, None, or an object with its ``id``, under which others refer to it.
+- A ``Stateful`` object is restored in place, after its owner created it.
+- Dataclasses and named tuples are created from their fields; an object that occurs twice is created once.
+- Functions without arguments and futures are stored by their result.
+
+A node is a number, a text, None, or an object with an ``id`` for references.
 """
 
 from collections import deque
@@ -33,22 +35,22 @@ if TYPE_CHECKING:
     from dudmap.app.state.database import StateDatabase, StateReader
 
 Node = Any
-"""A tree of plain values, as JSON has them."""
+"""A tree of plain JSON values."""
 LONG = 32
-"""Length from which on a list of equal things is stored as one array."""
+"""Shortest list of equal things that is stored as one array."""
 LARGEST_COUNT = 2**23
 """Largest number of equal things that are stored as one array."""
 
 
 @dataclass(eq=False)
 class Snapshot:
-    """The state of a system at one moment, which no later change reaches.
+    """Immutable state of a system at one moment.
 
     Attributes:
-        tree: The parts by name; ``arrays`` are referred to by number.
-        arrays: Copies, except of what never changes; or lists of plain values.
-        constant: Numbers of the arrays that never change: those of frozen dataclasses and named tuples.
-        maps, frames: What changed in the maps and stored frames since the last checkpoint.
+        tree: The parts by name; arrays are referenced by number.
+        arrays: Copies of arrays, constant arrays themselves, or lists of plain values.
+        constant: Numbers of the arrays that never change, from frozen dataclasses and named tuples.
+        maps, frames: Changes of maps and stored frames since the last checkpoint.
     """
 
     tree: dict[str, Node] = field(default_factory=dict)
@@ -59,20 +61,22 @@ class Snapshot:
 
 
 class NotSettledError(Exception):
-    """Something is being computed in the background; the state can be stored at a later frame."""
+    """A background computation runs; the state can be stored at a later frame."""
 
 
 class TreeWriter:
-    """Takes a snapshot, without what ``maps`` and ``frames`` know to be in the database; for ``wait`` see
-    ``take_snapshot``."""
+    """Takes a snapshot, without content that ``maps`` and ``frames`` find in the database.
+
+    For ``wait`` see ``take_snapshot``.
+    """
 
     def __init__(self, maps: StoredMaps, frames: "StoredFrames", *, wait: bool) -> None:
         self.snapshot = Snapshot()
         self._maps, self._frames, self._wait = maps, frames, wait
-        self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
+        self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity; the value stays alive
 
     def take(self, parts: Mapping[str, object]) -> Snapshot:
-        """The snapshot of the parts of a state."""
+        """Take the snapshot of the parts of a state."""
         for name, value in parts.items():
             try:
                 self.snapshot.tree[name] = self._node(value, type(value), name)
@@ -128,7 +132,7 @@ class TreeWriter:
         }
 
     def _items(self, items: list[Any], hints: Sequence[Any], place: str, constant: bool) -> Node:
-        """Items of a list: one by one, or together where they are many of one kind."""
+        """Nodes of a list, or one node for many items of one kind."""
         kinds = {type(item) for item in items} if len(items) >= LONG else set()
         kind = kinds.pop() if len(kinds) == 1 else None
         if kind is str or hints[:1] == [RECORD]:
@@ -169,14 +173,17 @@ class TreeWriter:
 
 
 class TreeReader:
-    """Reads the parts of the state that a database holds, in the order in which they were written.
+    """Reads the parts of a stored state, in the order in which they were written.
 
-    The ``reader`` stays open as long as a system that was filled lives: stored frames are read from it when they are
-    needed. Where the run goes on in the same ``database``, that takes note of what it holds. ``device`` is that of
-    the maps to come.
+    Args:
+        reader: Open database; it must stay open while the system lives, because stored frames are read on demand.
+        database: Database that continues the run, None otherwise; it records the restored content.
+
+    Attributes:
+        device: Device of the maps to create.
 
     Raises:
-        StateError: There is no state yet; by all methods: it is damaged or of another version.
+        StateError: There is no state yet; all methods: it is damaged or of another version.
     """
 
     def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None) -> None:
@@ -186,7 +193,7 @@ class TreeReader:
             raise StateError(f"{reader.path} holds no checkpoint yet")
         self._tree, self._arrays = stored
         self._made: dict[int, Any] = {}
-        self._at: list[str] = []  # where the tree is being read, which an error names
+        self._at: list[str] = []  # place in the tree, for errors
 
     def __contains__(self, name: str) -> bool:
         return name in self._tree
@@ -198,7 +205,7 @@ class TreeReader:
         self._reader.release()
 
     def part(self, name: str, hint: Any, current: Any = None) -> Any:  # noqa: ANN401
-        """The part of a name, as an annotation says; a ``Stateful`` object is read into ``current``, a new one."""
+        """Read the named part with an annotation; a ``Stateful`` object is restored into the new object ``current``."""
         self._at = [name]
         try:
             return self._value(self._tree[name], hint, current)
@@ -255,7 +262,7 @@ class TreeReader:
         return deque(items, node["limit"]) if kind is deque else kind(items) if kind in (tuple, set) else items
 
     def _named(self, content: Node, hints: dict[str, Any], kind: type, current: object = None) -> dict[str, Any]:
-        """Attributes by name, those and no others that the annotations name."""
+        """Attributes by name, exactly those in ``hints``."""
         _check_names(content, hints, kind)
         out = {}
         for name, hint in hints.items():
@@ -286,7 +293,7 @@ class TreeReader:
         return out
 
     def _columns(self, node: dict[str, Node], kind: type) -> list[Any]:
-        """Many objects of one class, of which one attribute after the other is stored."""
+        """Objects of one class that were stored attribute by attribute."""
         hints = fields_of(kind)
         _check_names(node["columns"], hints, kind)
         columns = [self._items(node["columns"][name], list, (hint,)) for name, hint in hints.items()]
@@ -315,7 +322,7 @@ class TreeReader:
         return make_volume(*settings[:4], backend, settings.max_blocks)
 
     def _fill_map(self, volume: TsdfVolume, number: int) -> None:
-        """Give a map whose index is complete the voxels of its blocks."""
+        """Read the voxels of a map whose index is complete."""
         reader, blocks = self._reader, volume.blocks
         slots, coords, voxels = reader.blocks(number)
         owned = blocks.active_slots
@@ -337,7 +344,7 @@ class TreeReader:
 
 
 def _check_names(content: object, hints: Iterable[str], kind: type) -> None:
-    """Check that an object of a class has the attributes that it needs, and no others."""
+    """Check that the attributes of an object are exactly the expected ones."""
     if not isinstance(content, dict) or content.keys() != set(hints):
         found = sorted(content) if isinstance(content, dict) else content
         raise ValueError(f"found the attributes {found} of {kind.__name__}; expected {sorted(hints)}")

@@ -1,1 +1,1 @@
-"""What a run looks like: the report of a run folder, the page in the browser while it runs, the log for Rerun."""
+"""Views of a run: the report of a run folder, the live page in the browser, the log for Rerun."""

@@ -1,4 +1,4 @@
-"""What fills the page in the browser: a run while it goes on, or the folder of one."""
+"""Fill the page in the browser from a running run, or from a run folder."""
 
 import threading
 import time
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 PERIOD = 0.1
 """Shortest time between two updates of the page, seconds."""
 TRIANGLES = 1_000_000
-"""Triangles of a stored mesh that are sent to the browser: 40 MB, which it loads within seconds."""
+"""Most triangles of a stored mesh sent to the browser: 40 MB, which it loads within seconds."""
 
 
 @dataclass
 class _News:
-    """What the page does not show yet: the figures of all frames, and the images of the latest one."""
+    """Data that the page does not show yet: metrics of all frames, images of the latest one."""
 
     figures: list[FrameFigures] = field(default_factory=list)
     images: FrameImages | None = None
@@ -45,14 +45,14 @@ class _News:
 class LiveView(RunObserver):
     """Shows a run in a window while it goes on.
 
-    The thread of the run copies what is to be shown into a slot; another thread takes it from there. Images that were
-    not taken in time are replaced by those of a later frame, so that the run never waits for the page.
+    The thread of the run copies data into a slot, and another thread shows it. Later images replace images that were
+    not taken in time, so that the run never waits for the page.
 
     Args:
         window: The page.
 
     Attributes:
-        costs: Milliseconds that each frame took in the thread of the run.
+        costs: Milliseconds per frame in the thread of the run.
     """
 
     def __init__(self, window: Window) -> None:
@@ -92,7 +92,7 @@ class LiveView(RunObserver):
         self.costs.append(1000 * (time.perf_counter() - start))
 
     def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
-        """Show what changed since an earlier visit."""
+        """Show a change since an earlier visit."""
         if name == "change":
             with self._changed:
                 self._news.changes.append(values)
@@ -107,10 +107,10 @@ class LiveView(RunObserver):
                 self._changed.notify()
 
     def close(self) -> None:
-        """End the thread once all is shown.
+        """End the thread once all data are shown.
 
         Raises:
-            Exception: What made the thread of the page fail.
+            Exception: Error of the page's thread.
         """
         with self._changed:
             self._closed = True
@@ -126,7 +126,7 @@ class LiveView(RunObserver):
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
 
     def _take(self) -> _News | None:
-        """All news; waits for some. None once the run is over and all is shown."""
+        """Wait for news and take all; None once the run is over and everything is shown."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._has_news())
             if not self._has_news():
@@ -151,12 +151,12 @@ class LiveView(RunObserver):
                 if news.images is not None and news.figures:
                     self._window.add_images(news.figures[-1].timestamp, news.images.files())
                 time.sleep(PERIOD)
-        except Exception as error:  # handed to the thread of the run, which raises it in close
+        except Exception as error:  # close raises it in the thread of the run
             self._error = error
 
 
 def open_run(folder: str | Path, host: str, port: int, token: str | None = None) -> Window:
-    """Window that shows a run folder; the slider stands at the first frame.
+    """Open a window with a run folder; the slider is at the first frame.
 
     Raises:
         DudmapError: The folder is no complete run folder, viser is missing, or the port is in use.

@@ -1,4 +1,4 @@
-"""The changed parts of a growing map, at a bounded cost per frame."""
+"""Changed parts of a growing map, at a bounded cost per frame."""
 
 import threading
 import time
@@ -12,20 +12,20 @@ if TYPE_CHECKING:
     from dudmap.core.map.volume import TsdfVolume
 
 BUDGET_MS = 1.0
-"""Mean time per frame for copying the map, milliseconds: a third of what watching a run may cost."""
+"""Mean time per frame for copying the map, milliseconds: a third of the allowed cost of a viewer."""
 BLOCKS = 512
-"""Blocks that one hand-over copies at most: 2 MB, about a millisecond, so that no frame is held up for long."""
+"""Most blocks per copy: 2 MB, about a millisecond, so that no frame is delayed for long."""
 LONGEST_WAIT = 15
-"""Frames after which the budget allows another hand-over in any case: half a second of a camera."""
+"""Frames after which another copy is allowed in any case: half a second of a camera."""
 
 
 @dataclass
 class MeshChanges:
-    """Parts of the mesh that replace those shown so far.
+    """Changed parts of the mesh.
 
     Attributes:
-        chunks: Mesh of each changed part; None where there is no surface any more.
-        reset: Whether all parts shown before are void, since the map is another one.
+        chunks: Mesh of each changed part; None if its surface is gone.
+        reset: Whether all earlier parts are void, because the map is another one.
     """
 
     chunks: dict[Chunk, Mesh | None] = field(default_factory=dict)
@@ -33,11 +33,10 @@ class MeshChanges:
 
 
 class MeshFeed:
-    """Hands a growing map from the thread that changes it to one that extracts its mesh.
+    """Copies a growing map from the thread that changes it to a thread that extracts its mesh.
 
-    Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
-    the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh
-    from the copy.
+    Each frame adds ``budget_ms`` to a budget. If it covers the cost of the last copy, and the other thread has
+    extracted that copy, up to ``BLOCKS`` changed blocks are copied.
     """
 
     def __init__(self, budget_ms: float = BUDGET_MS) -> None:
@@ -52,11 +51,11 @@ class MeshFeed:
 
     @property
     def has_copy(self) -> bool:
-        """Whether ``take`` would find something new."""
+        """Whether ``take`` would return something new."""
         return not self._free.is_set()
 
     def offer(self, volume: "TsdfVolume", *, now: bool = False) -> None:
-        """Copy what changed in a volume if budget and receiver allow it; with ``now``, as soon as the receiver does."""
+        """Copy changed blocks if budget and receiver allow; with ``now``, once the receiver is ready."""
         self._saved += self._budget
         if now:
             self._free.wait()
@@ -70,7 +69,7 @@ class MeshFeed:
         self._free.clear()
 
     def take(self) -> MeshChanges:
-        """What changed since the last call; empty if nothing new was copied."""
+        """Changes since the last call; empty if nothing new was copied."""
         if not self.has_copy or self._mirror is None:
             return MeshChanges()
         reset = self._extracted is not self._mirror
@@ -83,7 +82,7 @@ class MeshFeed:
             self._free.set()
 
     def changes(self, volume: "TsdfVolume", *, now: bool = False) -> MeshChanges:
-        """``offer`` and ``take`` in one thread, both at the expense of the budget."""
+        """``offer`` and ``take`` in one thread; both use the budget."""
         start = time.perf_counter()
         self.offer(volume, now=now)
         if not self.has_copy:

@@ -1,4 +1,4 @@
-"""Who may see a page that is served: this machine, or whoever has its secret address."""
+"""Access control of a served page: this machine only, or clients with a secret address."""
 
 import ipaddress
 import re
@@ -12,28 +12,30 @@ from urllib.parse import urlsplit
 from dudmap.errors import ConfigError
 
 TOKEN_BYTES = 16
-"""Random bytes of a token that is made here: 128 bit, more than can be guessed."""
+"""Random bytes of a generated token: 128 bit."""
 POLICY_VIOLATION = 1008
 """Code with which a connection is closed (RFC 6455, section 7.4.1)."""
 
 
 class PageAccess:
-    """Decides which connections get what the page shows.
+    """Decides which connections may see the page.
 
-    Without a token the page is for this machine: a connection must be made to a name of the loopback, which keeps off
-    web pages that point their own name at it (DNS rebinding). With a token its path must be the token. In both cases
-    connections that a page from elsewhere opens in the user's browser are refused by their ``Origin``.
+    - Without a token the page is for this machine. A connection must name the loopback, which excludes web pages that
+      resolve their own name to it (DNS rebinding).
+    - With a token the path must be the token.
+    - In both cases the ``Origin`` must be this page, which excludes connections that other pages open in the user's
+      browser.
 
     Args:
         host: Address to serve at.
         port: Port to serve at.
-        token: Secret part of the address; None makes one where ``host`` lets other machines in.
+        token: Secret part of the address; None generates one if ``host`` admits other machines.
 
     Attributes:
-        token: The secret, empty where none is needed.
+        token: The secret, empty if none is needed.
 
     Raises:
-        ConfigError: The token has too few or other characters than an address may hold.
+        ConfigError: The token has too few or invalid characters.
     """
 
     def __init__(self, host: str, port: int, token: str | None = None) -> None:
@@ -48,7 +50,7 @@ class PageAccess:
 
     @property
     def url(self) -> str:
-        """Address to open in a browser; with a token, viser's page is told by its query where to connect."""
+        """Address to open in a browser; with a token, its query tells viser's page where to connect."""
         name = "localhost" if self.local else self.host
         if name in ("0.0.0.0", "::", ""):
             name = socket.gethostname()
@@ -73,15 +75,15 @@ class PageAccess:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
 
     def guard(self, server: Any) -> None:  # noqa: ANN401 - viser.ViserServer, of an optional package
-        """Close every connection to a server of viser that is not allowed before anything is sent to it.
+        """Close every forbidden connection to a viser server before anything is sent to it.
 
-        Nothing is shown before this is called; connections from before are closed, too. A page cannot publish the
-        server through viser's relay on the internet.
+        Earlier connections are closed too, and nothing is shown before this call. A page cannot publish the server
+        through viser's relay on the internet.
         """
         connections = server._websock_server
 
         async def check(client: Any) -> None:  # noqa: ANN401 - viser.infra.WebsockClientConnection
-            # viser runs this before it sends; whatever fails here ends the connection without a message
+            # viser runs this before it sends; any error here ends the connection without a message
             connection = connections._live_connections[client.client_id]
             if not self.allows(connection.request.path, connection.request.headers):
                 await connection.close(POLICY_VIOLATION, "the address of this page has a secret part, which is wrong")
@@ -93,7 +95,7 @@ class PageAccess:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address is one of this machine alone."""
+    """Whether a name or address belongs to this machine alone."""
     if host.lower() == "localhost":
         return True
     try:
@@ -103,9 +105,9 @@ def is_loopback(host: str) -> bool:
 
 
 def port_problem(host: str, port: int) -> str:
-    """Why no page can be served at a port; empty if one can."""
+    """Why a port cannot serve a page; empty if it can."""
     with socket.socket() as probe:
-        if sys.platform != "win32":  # where it would let two programs take one port
+        if sys.platform != "win32":  # Windows would let two programs take one port
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 400
-"""Points of a curve over time: a plot is about this many pixels wide."""
+"""Most points of a curve over time: a plot is about this many pixels wide."""
 MAX_STAGES = 9
-"""Stages with a colour of their own; the shortest ones are added up."""
+"""Stages with their own colour; the shortest ones are summed."""
 
 
 def plots(run: RunFiles) -> dict[str, str]:
-    """SVG text by title: time per stage, share that moves, residuals; those with data."""
+    """SVG text by title: time per stage, dynamic share, residuals, as far as there are data."""
     out: dict[str, str] = {}
     if run.frames and run.stages:
         out["Time per stage"] = _times(run)
@@ -47,7 +47,7 @@ def _times(run: RunFiles) -> str:
         ranked = [*ranked[: MAX_STAGES - 1], "others"]
         times["others"] = np.sum([times[stage] for stage in rest], axis=0)
     curves = [_binned(t, times[stage]) for stage in ranked]
-    # a few frames may take very long, such as the first one, in which the kernels are loaded
+    # single frames may take very long, such as the first one, which loads the kernels
     highest = 1.3 * max(float(np.percentile(np.sum([curve[1] for curve in curves], axis=0), 95)), 1e-3)
     with _drawing("times") as (figure, picture):
         figure.subplots_adjust(right=0.72)  # room for the legend
@@ -86,7 +86,7 @@ def _limits(t: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means of about ``POINTS`` equal groups of consecutive frames, so that a long run has no larger plot."""
+    """Means of about ``POINTS`` equal groups of consecutive frames, which bound the size of the plot."""
     starts = np.arange(0, len(t), max(1, len(t) // POINTS))
     counts = np.diff(np.append(starts, len(t)))
     return np.add.reduceat(t, starts) / counts, np.add.reduceat(y, starts) / counts
@@ -94,7 +94,7 @@ def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
 
 @contextmanager
 def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
-    """Figure to draw into, and a list that holds its SVG text afterwards; the same data give the same text."""
+    """Figure to draw into, and a list that holds its SVG text afterwards; equal data give equal text."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

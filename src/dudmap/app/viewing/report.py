@@ -1,4 +1,4 @@
-"""The report of a run, one HTML page that needs neither network nor server, and the small images that it shows."""
+"""Report of a run: one HTML page without network or server, and its thumbnails."""
 
 import base64
 import gzip
@@ -34,19 +34,19 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 NUMBER = 36
-"""Number of frames that are kept: about 1.5 MB of JPEG files, and a strip that can still be looked through."""
+"""Frames that are kept: about 1.5 MB of JPEG files."""
 
 STEPS = 65535
 """Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
 REPORT = "report.html"
 TRIANGLES = 200_000
-"""Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
+"""Most triangles of the mesh in the page: about 1.5 MB, fluent without a graphics card."""
 POSES = 5000
-"""Poses in the page; those of a longer run are thinned evenly."""
+"""Most poses in the page; longer trajectories are thinned evenly."""
 POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
-"""Content security policy: the page's own scripts by their hashes, its styles and pictures, and nothing else."""
+"""Content security policy: only the page's own scripts (by hash), styles and pictures."""
 LISTED = 200
-"""Lost or unreadable frames that are listed one by one."""
+"""Most lost or unreadable frames that are listed one by one."""
 CARDS = {
     "frames": ("frames", 1, "{:.0f}"),
     "lost": ("lost", 1, "{:.0f}"),
@@ -56,27 +56,26 @@ CARDS = {
     "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
     "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
 }
-"""Key of metrics.json to label, factor and format of the figures at the top of the page."""
+"""Key of metrics.json to label, factor and format of the metrics at the top of the page."""
 
 
 class Thumbnails(RunObserver):
     """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames.
 
-    Of a camera, whose number of frames is not known, up to ``2 NUMBER`` are kept: whenever there are more, every second
-    one is removed.
+    If the number of frames is unknown (camera), up to ``2 NUMBER`` are kept. Beyond it, every second one is removed.
     """
 
-    beside = True
+    in_background = True
 
     def __init__(self) -> None:
         self._out, self._count, self._next, self._step = Path(), None, 0, 1
         self._kept: list[list[Path]] = []
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """Remember where the images go and how many frames come."""
+        """Prepare the folder for a pass of ``count`` frames."""
         self._out, self._count, self._next, self._step, self._kept = out / FOLDER, count, 0, 1, []
         make_folder(self._out)
-        remove_files(out, {FOLDER: WRITTEN[FOLDER]})  # of the first pass, whose timestamps may differ in a live run
+        remove_files(out, {FOLDER: WRITTEN[FOLDER]})  # of the first pass; timestamps of a live run may differ
 
     def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
         """Keep the images of the frames before number ``first``."""
@@ -85,7 +84,7 @@ class Thumbnails(RunObserver):
         self._next = self._next_after(first - 1)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Write the images of the frame if it is the first one of the next of equal parts."""
+        """Write the images of the first frame in each of the equal parts."""
         if index < self._next or isinstance(read.frame, FrameError):
             return
         paths = []
@@ -105,7 +104,7 @@ class Thumbnails(RunObserver):
         return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
 
     def _thin(self) -> None:
-        """Remove every second frame if there are too many, and keep half as many from now on."""
+        """If there are too many, remove every second frame, and keep half as many in future."""
         if len(self._kept) <= 2 * NUMBER:
             return
         with OwnFolder(self._out) as folder:
@@ -115,7 +114,7 @@ class Thumbnails(RunObserver):
 
 
 class Html(str):
-    """Text that is HTML already: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
+    """Trusted HTML: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
 
     __slots__ = ()
 
@@ -131,7 +130,7 @@ def html(template: str, /, **values: object) -> Html:
 
 
 def joined(parts: Iterable[object], between: str = "") -> Html:
-    """Parts one after the other; those that are no HTML are escaped."""
+    """Concatenate parts; parts that are not ``Html`` are escaped."""
     return Html(between.join(html("{part}", part=part) for part in parts))
 
 
@@ -141,11 +140,11 @@ def script_source(script: str) -> str:
 
 
 def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
-    """Description for the page, and the data as base64 text of a gzip stream.
+    """Description of a mesh for the page, and its data as base64 text of a gzip stream.
 
-    The stream holds the positions, uint16 (V, 3), from the corner ``low`` (0) to ``high`` (65535) of the bounding box;
-    the colours, uint8 (V, 3); zeros up to a multiple of 4 bytes; and the faces, int32 (F, 3), each index as the
-    difference to the one before it, which compresses well. All little-endian.
+    The stream holds, little-endian: positions, uint16 (V, 3), from the corner ``low`` (0) to ``high`` (65535) of the
+    bounding box; colours, uint8 (V, 3); zeros up to a multiple of 4 bytes; faces, int32 (F, 3). Each face index is
+    stored as the difference to the previous one, which compresses well.
     """
     low, high = mesh.vertices.min(axis=0).astype(float), mesh.vertices.max(axis=0).astype(float)
     positions = np.rint((mesh.vertices - low) / np.maximum(high - low, 1e-9) * STEPS).astype("<u2")
@@ -164,8 +163,8 @@ def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     """Write the report of a run folder, by default report.html in it, and return its path.
 
-    The page holds the mesh (at most ``TRIANGLES``, the full one stays in mesh.ply) with trajectory, camera and moving
-    objects in 3D, the thumbnails, plots, all figures, the configuration, and what was lost and why.
+    The page shows the mesh (at most ``TRIANGLES`` triangles) with trajectory, camera and moving objects in 3D. It also
+    shows thumbnails, plots, metrics, the configuration, and lost frames with reasons.
 
     Raises:
         DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
@@ -201,7 +200,7 @@ def report_page(run: RunFiles) -> str:
 
 
 def filled(name: str, data: dict[str, Any], parts: dict[str, Any]) -> str:
-    """HTML text of a page of the page folder with its parts, style, program, three.js, and the data of the program."""
+    """HTML of a page of the page folder, filled with its parts, style, scripts and data."""
     library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
     script = Html(asset("scene.js") + asset(f"{name}.js"))
     parts = parts | {
@@ -243,7 +242,7 @@ class ReportObserver(Thumbnails):
 
 
 def asset(name: str) -> Html:
-    """A file of the page folder, as it is."""
+    """Content of a file of the page folder."""
     return Html((files("dudmap.app.viewing") / "page" / name).read_text(encoding="utf-8"))
 
 
@@ -264,7 +263,7 @@ def _cards(metrics: dict[str, Any]) -> Html:
 
 
 def _strip(run: RunFiles) -> Html:
-    """Columns of colour image and mask; depth and residuals are kept for the frame at the slider."""
+    """Columns of colour image and mask; depth and residuals are embedded for the frame at the slider."""
     if not run.thumbnails:
         return Html("<p>This run kept no images (it was made with --no-report).</p>")
     start = float(next(iter(run.thumbnails)))
@@ -286,7 +285,7 @@ def _strip(run: RunFiles) -> Html:
 
 
 def _losses(metrics: dict[str, Any]) -> Html:
-    """Lost frames by reason, unreadable frames, and frames that were left out of the map."""
+    """Lost frames by reason, unreadable frames, and frames that are not in the map."""
     lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
     notes = [
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),

@@ -24,11 +24,12 @@ BUDGET_MS = 10.0
 
 
 class RerunLog(RunObserver):
-    """Writes camera, images, map, moving objects and figures of every frame into an .rrd file.
+    """Writes camera, images, map, moving objects and metrics of every frame into an .rrd file.
 
-    Timelines: ``frame`` (number) and ``time`` (seconds since the first frame). Entities: ``world/camera`` with colour
-    and depth, ``world/map``, ``world/movers``, ``world/trajectory``; ``images/mask`` and ``images/residuals``; the
-    plots ``plots/ms``, ``plots/residual_mm``, ``plots/moving_percent``; ``lost`` with the reasons.
+    Timelines: ``frame`` (number) and ``time`` (seconds since the first frame). Entities: ``world/camera`` with
+        colour and depth, ``world/map``, ``world/movers``, ``world/trajectory``; ``images/mask`` and
+        ``images/residuals``; the plots ``plots/ms``, ``plots/residual_mm``, ``plots/moving_percent``; ``lost`` with
+        the reasons.
 
     Args:
         path: The file.
@@ -54,7 +55,7 @@ class RerunLog(RunObserver):
         self._start: float | None = None
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """Follow this system; what an earlier pass left is overwritten frame by frame."""
+        """Follow this system; frames of an earlier pass are overwritten one by one."""
         self._slam, self._feed = slam, MeshFeed(BUDGET_MS)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
@@ -99,7 +100,7 @@ class RerunLog(RunObserver):
             stream.log(f"images/{kind}", rr.EncodedImage(contents=jpeg(pictures[kind]), media_type="image/jpeg"))
 
     def _log_map(self, changes: MeshChanges) -> None:
-        """Log the changed parts of the map and, as often, the trajectory."""
+        """Log the changed parts of the map and the trajectory."""
         assert self._slam is not None
         if changes.reset:
             for part in self._parts:

@@ -17,25 +17,25 @@ from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 FOLDER = "thumbnails"
-"""Folder of the small images."""
+"""Folder of the thumbnails."""
 NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency")
 """Columns of timings.csv that are not the time of a stage."""
 MAX_TRIANGLES = 5_000_000
-"""Triangles of a mesh that a page or a window can hold; a larger one is simplified."""
+"""Most triangles of a mesh in a page or window; a larger mesh is simplified."""
 LARGEST_THUMBNAIL = 2**22
-"""Largest thumbnail, bytes; they have 10 to 30 kB."""
+"""Largest thumbnail, bytes; usual ones have 10 to 30 kB."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunFiles(RunContent):
-    """A run with what the viewers show of it; trajectory and mesh may be missing."""
+    """A run with its data for viewers; trajectory and mesh may be missing."""
 
     @classmethod
     def load(cls, folder: str | Path) -> "RunFiles":
         """Open a run folder.
 
         Raises:
-            DatasetError: The folder is none of a run, or was written by a newer version.
+            DatasetError: The folder is no run folder, or was written by a newer version.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -48,15 +48,17 @@ class RunFiles(RunContent):
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of all tracked frames; without any if no frame was tracked."""
+        """Poses of all tracked frames, possibly none."""
         path = self.folder / "trajectory.txt"
         tracked = self.metrics.get("tracked") and path.is_file()
         return Trajectory.load(path) if tracked else Trajectory.from_poses([])
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The mesh without its smallest loose pieces; a very large one is simplified as it is read, so that it need not
-        fit into the memory. None if no frame was fused."""
+        """Mesh without its smallest loose pieces; None if no frame was fused.
+
+        A very large mesh is simplified while it is read, because it may not fit into the memory.
+        """
         path = self.folder / "mesh.ply"
         if not path.is_file() or not self.metrics.get("mesh_triangles"):
             return None
@@ -90,7 +92,7 @@ class RunFiles(RunContent):
 
     @property
     def stages(self) -> list[str]:
-        """Names of the stages of processing, in the order of the columns of timings.csv."""
+        """Names of the processing stages, in the order of the columns of timings.csv."""
         return [key for key in self.frames[0] if key not in NOT_STAGES] if self.frames else []
 
     def column(self, name: str) -> np.ndarray:
@@ -121,9 +123,9 @@ class RunFiles(RunContent):
             return dict(sorted(out.items(), key=lambda item: float(item[0])))
 
     def figures(self) -> list[FrameFigures]:
-        """Pose, moving objects and figures of every processed frame; the residual of single frames is not stored."""
+        """Pose, moving objects and metrics of every processed frame; residuals per frame are not stored."""
         path = self.trajectory
-        if not self.frames:  # maps of several runs that were merged have trajectories and no frames
+        if not self.frames:  # merged maps have trajectories and no frames
             pairs = zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True)
             return [FrameFigures(stamp, T, "", (), 0.0, np.nan, 0.0) for stamp, T in pairs]
         poses = {f"{t:.6f}": T for t, T in zip(path.timestamps, path.Ts_world_camera, strict=True)}

@@ -1,4 +1,4 @@
-"""What is shown of one frame, reduced images, pose, moving objects and figures; and overview images of several."""
+"""Display data of one frame (reduced images, pose, moving objects, metrics), and overview images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ DEPTH_RANGE = 5.0
 RESIDUAL_RANGE = 0.05
 """Residual at the ends of the colour scale, metres."""
 KINDS = ("color", "depth", "mask", "residuals")
-"""The images of a frame."""
+"""Images of a frame."""
 _NO_READING = np.array([40, 40, 40], dtype=np.uint8)
 
 LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
@@ -51,7 +51,7 @@ class MoverBox:
 
 @dataclass(frozen=True, eq=False)
 class FrameFigures:
-    """Pose, moving objects and figures of one frame.
+    """Pose, moving objects and metrics of one frame.
 
     Attributes:
         timestamp: Seconds.
@@ -59,8 +59,8 @@ class FrameFigures:
         lost_reason: Empty for a tracked frame.
         movers: The moving objects.
         ms: Processing time, milliseconds.
-        residual: Root mean square of the distance residuals at 1 m depth, metres; NaN where nothing was registered.
-        dynamic_share: Share of the readings that move.
+        residual: Root mean square of the distance residuals at 1 m depth, metres; NaN without registration.
+        dynamic_share: Share of dynamic depth pixels.
     """
 
     timestamp: float
@@ -73,7 +73,7 @@ class FrameFigures:
 
     @classmethod
     def of(cls, result: "FrameResult", ms: float) -> "FrameFigures":
-        """Figures of a processed frame."""
+        """Metrics of a processed frame."""
         movers = tuple(MoverBox(mover.id, mover.box, mover.speed) for mover in result.movers)
         residual = np.nan if result.tracking is None else result.tracking.residual
         return cls(
@@ -88,7 +88,7 @@ class FrameImages:
 
     Attributes:
         color: (h, w, 3) uint8.
-        depth: (h, w) metres, 0 = no reading.
+        depth: (h, w) metres, 0 = missing.
         mask: (h, w) bool, dynamic pixels.
         residuals: (h', w') metres, NaN off the map.
     """
@@ -100,13 +100,15 @@ class FrameImages:
 
     @classmethod
     def of(cls, frame: "Frame", result: "FrameResult", width: int = WIDTH) -> "FrameImages":
-        """Every n-th pixel of the images of a frame, at most ``width`` columns of them."""
+        """Every n-th pixel of the images of a frame, at most ``width`` columns."""
         parts = (frame.rgb, frame.depth, result.dynamic_mask, result.residuals)
         return cls(*(_reduced(part, width) for part in parts))
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """Images (h, w, 3) uint8 by the names of ``KINDS``: colour, depth in colours, mask over colour, and residuals
-        where there are any, which the first frame of a map has not."""
+        """Images (h, w, 3) uint8 by the names of ``KINDS``: colour, coloured depth, mask over colour, residuals.
+
+        The first frame of a map has no residuals.
+        """
         pictures = {
             "color": self.color,
             "depth": depth_colors(self.depth),
@@ -120,12 +122,12 @@ class FrameImages:
 
 
 def shading(normals: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Brightness (H, W), 0..1, of a view with these normals (H, W, 3), world frame, with a light near the camera."""
+    """Brightness (H, W), 0..1, of a view with normals (H, W, 3), world frame, and a light near the camera."""
     return (0.25 + 0.7 * np.clip(normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)).astype(np.float32)
 
 
 def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArray[np.uint8]:
-    """Depth (h, w) in the colours of the turbo scale (h, w, 3) up to ``far``, dark where there is no reading."""
+    """Depth (h, w) in the turbo colour scale (h, w, 3) up to ``far``; missing depth is dark."""
     import cv2
 
     scaled = np.clip(255 * depth / far, 0, 255).astype(np.uint8)
@@ -135,9 +137,9 @@ def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArr
 
 
 def mask_overlay(color: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Colour image (h, w, 3), dimmed, with the masked pixels tinted red."""
+    """Dimmed colour image (h, w, 3) with masked pixels tinted red."""
     dim = np.right_shift(color, 1)
-    if mask.shape != color.shape[:2]:  # a colour camera of another size, whose image has no mask
+    if mask.shape != color.shape[:2]:  # a colour camera of another size has no mask
         return dim
     tint = np.array([127, 0, 0], dtype=np.uint8)
     return np.where(mask[..., None], dim + tint, dim).astype(np.uint8)
@@ -153,7 +155,7 @@ def residual_colors(residuals: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:
-    """An RGB image (h, w, 3) as a JPEG file."""
+    """Encode an RGB image (h, w, 3) as JPEG."""
     import cv2
 
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
@@ -173,11 +175,9 @@ def save_sheet(
     T_world_camera: NDArray[np.float64],
     true_mask: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the pose of the frame (4,
-    4).
+    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the frame's pose (4, 4).
 
-    The residuals (h, w) are signed distances in metres, NaN where there is none; a true mask (H, W) is drawn as an
-    outline.
+    ``residuals`` (h, w) are signed distances in metres, NaN if unknown; ``true_mask`` (H, W) is drawn as an outline.
 
     Raises:
         DudmapError: The file cannot be written.
@@ -225,7 +225,7 @@ def _far(frames: list[Frame]) -> float:
 
 
 def _row(pictures: Iterable[tuple[str, NDArray]], width: int, columns: int) -> NDArray[np.uint8]:
-    """Pictures (h, w, 3) of one width side by side, each below its title, on a white row of a number of columns."""
+    """Pictures (h, w, 3) of one width with titles above, in a white row of ``columns`` columns."""
     scaled = [(title, cv2.resize(np.asarray(image, np.uint8), (width, width * image.shape[0] // image.shape[1])))
               for title, image in pictures]  # fmt: skip
     row = np.full((TITLE + max(len(image) for _, image in scaled), columns * width, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""A page in the browser with the map, the camera, what moves, images and plots, served by viser."""
+"""A page in the browser with map, camera, moving objects, images and plots, served by viser."""
 
 import io
 import threading
@@ -37,10 +37,10 @@ class Window:
         host: Address to serve at; 127.0.0.1 for this machine only.
         port: Port to serve at.
         title: Title of the page.
-        token: Secret part of the address; None makes one unless ``host`` is this machine only.
+        token: Secret part of the address; None generates one unless ``host`` is this machine only.
 
     Attributes:
-        access: Who may see it.
+        access: Access control.
 
     Raises:
         MissingExtraError: viser is not installed.
@@ -52,10 +52,10 @@ class Window:
             import viser  # pyright: ignore[reportMissingImports]
         self.access = PageAccess(host, port, token)
         problem = port_problem(host, port)
-        if problem:  # viser would take another port without a word
+        if problem:  # viser would silently take another port
             raise DudmapError(f"cannot show a page at {host}:{port} ({problem}); name another --port or --host")
         self._lock = threading.RLock()
-        with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
+        with redirect_stdout(io.StringIO()):  # viser prints a banner, also when JSON is expected
             self._server = viser.ViserServer(host=host, port=port, verbose=False)
         self.access.guard(self._server)
         self.url = self.access.url
@@ -72,7 +72,7 @@ class Window:
         self._server.initial_camera.look_at = (0.0, 0.0, 1.5)
 
     def set_camera(self, camera: "Camera") -> None:
-        """The camera whose frustum is shown."""
+        """Set the camera whose frustum is shown."""
         with self._lock:
             self._camera = camera
 
@@ -103,11 +103,11 @@ class Window:
                     self._remove(_mesh_name(key))
                 else:
                     self._chunks.add(key)
-                    file = encoded(mesh, double_sided=False)  # rooms are looked into from outside
+                    file = encoded(mesh, double_sided=False)  # rooms are viewed from outside
                     self._add(_mesh_name(key), "add_glb", file)
 
     def add_frames(self, frames: list[FrameFigures], poses: dict[float, NDArray] | None = None) -> None:
-        """Append frames; ``poses`` (4, 4) by time replace those of earlier frames after a correction."""
+        """Append frames; ``poses`` (4, 4) by time replace poses of earlier frames after a correction."""
         with self._lock:
             self._frames += frames
             if poses is not None:
@@ -137,7 +137,7 @@ class Window:
             self._add(f"{name}/label", "add_label", text=f"{change['id']}: {change['kind']}", position=middle)
 
     def add_images(self, timestamp: float, files: dict[str, bytes]) -> None:
-        """JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
+        """Add JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
         with self._lock:
             self._images[timestamp] = files
             if len(self._images) > MAX_IMAGES:

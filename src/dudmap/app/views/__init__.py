@@ -1,1 +1,1 @@
-"""Images of the map: artificial views, videos, and recordings without what moves."""
+"""Images of the map: artificial views, videos, and recordings without dynamic objects."""

@@ -1,4 +1,4 @@
-"""What stands behind the things that move: depth from the map, colour from other frames of the recording."""
+"""Render the background behind dynamic objects: depth from the map, colour from other frames."""
 
 from dataclasses import dataclass
 
@@ -12,25 +12,25 @@ from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.map.volume import TsdfVolume
 
 SAMPLES = 5
-"""Number of other frames over whose colours the median of a pixel is taken; two of them may show what moves."""
+"""Other frames whose median colour is used; two of them may show a dynamic object."""
 TRIES = 24
-"""Other frames, nearest first, in which a pixel is looked for."""
+"""Most other frames, nearest first, that are searched for a pixel."""
 TOLERANCE = 0.03
-"""A surface in another frame is the same if the depths agree within this share (two standard deviations of a depth
-camera at 4 m, 0.8 %, and as much again for the map)."""
+"""Largest relative difference of depths of one surface: two standard deviations of a depth camera at 4 m (0.8 %), and
+as much for the map."""
 ANGLE_LENGTH = 2.0
-"""Metres that count as much as a turn by one radian: the depth of a room."""
+"""Length equivalent to a rotation by one radian, metres: the depth of a room."""
 LEAST_PIXELS = 500
-"""Pixels from which the exposure of a frame is determined."""
+"""Fewest pixels that determine the exposure of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A frame that lends its colours.
+    """A frame that provides colours.
 
     Attributes:
         color: (h, w, 3) uint8, of the colour camera.
-        depth: (h, w) float32, metres, of the map from the same pose; 0 where something moves or the frame differs.
+        depth: (h, w) float32, metres, of the map from the same pose; 0 at dynamic pixels and where the frame differs.
         T_world_color: (4, 4) pose of the colour camera.
         gain: (3,) of its colours against the map's.
     """
@@ -42,7 +42,7 @@ class Source:
 
 
 class BackgroundRenderer:
-    """Renders the static scene behind what moves in the frames of one recording.
+    """Renders the static scene behind dynamic objects in the frames of a recording.
 
     Args:
         volume: The map.
@@ -66,7 +66,7 @@ class BackgroundRenderer:
         T_world_camera: NDArray[np.float64],
         T_world_color: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the colour image that show what moves (H, W) in the depth image."""
+        """Map moving pixels (H, W) of the depth image to the colour image (h, w)."""
         if self.other is None:
             return moving
         return self.other.mask(moving, frame.depth, se3.inverse(T_world_color) @ T_world_camera)
@@ -78,7 +78,7 @@ class BackgroundRenderer:
         T_world_camera: NDArray[np.float64],
         T_world_color: NDArray[np.float64],
     ) -> None:
-        """Let a frame lend its colours, but for the pixels (h, w) of its colour image that show what moves."""
+        """Add a frame as a source of colours, without its moving pixels (h, w)."""
         color, depth = self._map_in_color(T_world_color)
         seen = frame.depth
         if self.other is not None:
@@ -90,8 +90,9 @@ class BackgroundRenderer:
     def colors(
         self, frame: Frame, wanted: NDArray[np.bool_], T_world_color: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours (h, w, 3) of the background at the wanted pixels (h, w) of the colour image of a frame, in its
-        exposure, and where they are known (h, w).
+        """Background colours (h, w, 3) at the wanted pixels (h, w) of a frame's colour image, in its exposure.
+
+        Also returns which colours are known (h, w).
         """
         of_map, distances = self._map_in_color(T_world_color)
         gain = exposure_gain(frame.rgb, of_map, (distances > 0) & ~wanted)
@@ -105,12 +106,12 @@ class BackgroundRenderer:
         return color, known
 
     def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (H, W) of the map as the depth camera sees it, metres, 0 where nothing is known."""
+        """Depth (H, W) of the map in the depth camera, metres, 0 = unknown."""
         rendered = self.volume.raycast(T_world_camera, self.depth_lens.straight).depth
         return self.depth_lens.distorted(rendered, nearest=True)
 
     def _map_in_color(self, T_world_color: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour (h, w, 3) and depth (h, w) of the map as the colour camera sees it."""
+        """Colour (h, w, 3) and depth (h, w) of the map in the colour camera."""
         result = self.volume.raycast(T_world_color, self.color_lens.straight)
         return self.color_lens.distorted(result.color), self.color_lens.distorted(result.depth, nearest=True)
 
@@ -121,7 +122,7 @@ class BackgroundRenderer:
         distances: NDArray[np.float32],
         T_world_color: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Colours (n, 3) of pixels in other frames, with the map's exposure, and which were found (n,)."""
+        """Colours (n, 3) of pixels in other frames, in the map's exposure, and which were found (n,)."""
         from scipy.ndimage import map_coordinates
 
         points = self.color_lens.points(rows, columns, distances.astype(np.float64))
@@ -147,7 +148,7 @@ class BackgroundRenderer:
         return out, counts > 0
 
     def _nearest(self, T_world_color: NDArray[np.float64]) -> list[Source]:
-        """Sources by the distance of their poses."""
+        """Sources by increasing distance of their poses."""
 
         def distance(source: Source) -> float:
             T = se3.inverse(T_world_color) @ source.T_world_color
@@ -157,7 +158,7 @@ class BackgroundRenderer:
 
 
 def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) all of whose neighbours are seen: at the borders of the map its colours fade into black."""
+    """Pixels (h, w) whose neighbours are all seen, because map colours fade into black at borders."""
     import cv2
 
     return cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -173,8 +174,10 @@ def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDAr
 def exposure_gain(
     image: NDArray[np.uint8], rendered: NDArray[np.uint8], used: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Factor (3,) of an image's colours against those of the map, the median over pixels that are neither dark nor
-    saturated; 1 where there are hardly any."""
+    """Gains (3,) of an image's colours over map colours; 1 if too few pixels are valid.
+
+    Each is the median over pixels that are neither dark nor saturated.
+    """
     gains = np.ones(3)
     for channel in range(3):
         a, b = image[..., channel], rendered[..., channel]
@@ -185,8 +188,10 @@ def exposure_gain(
 
 
 def continued(color: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) continued smoothly to where they are not known, by a pyramid of weighted means (pull-push,
-    Gortler et al. 1996): no edge appears that a tracker could take for one."""
+    """Fill unknown colours (H, W, 3) smoothly by a pyramid of weighted means (pull-push, Gortler et al. 1996).
+
+    The filled area has no edges that a tracker could use.
+    """
     if known.all() or not known.any():
         return color
     import cv2

@@ -1,4 +1,4 @@
-"""A recording as it would have been without the things that move."""
+"""Remove dynamic objects from a recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,34 +20,35 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 MARGIN = 6 / 640
-"""Width by which masks grow, as a share of the image's: blur, mixed pixels and the disparity window of the sensor."""
+"""Width by which masks grow, as a share of the image width: blur, mixed pixels and the sensor's disparity window."""
 REACH = 24 / 640
-"""Largest distance from a mask, as a share of the width, of pixels in front of the map that are added to it: only what
-moved lies in front of a finished map."""
+"""Largest distance from a mask, as a share of the width, of added pixels in front of the map. Only dynamic objects lie
+in front of a finished map."""
 IN_FRONT = 0.04
-"""A reading is in front of the map if it is nearer by this share: 2.5 standard deviations of a Kinect at 5 m
-(0.0012 m + 0.0019 (z - 0.4)^2)."""
+"""A measurement is in front of the map if nearer by this share: 2.5 standard deviations of a Kinect at 5 m (0.0012 m +
+0.0019 (z - 0.4)^2)."""
 SHADOW = 48 / 640
-"""Largest width of the shadow without readings beside what stands in front of the projector, as a share of the image's:
-baseline times focal length over distance, 0.075 m * 525 / 0.8 m for a Kinect."""
+"""Largest width of the projector's shadow next to a near object, as a share of the image width. It is baseline times
+focal length over distance: 0.075 m * 525 / 0.8 m for a Kinect."""
 LEFT_OVER = 5.0
-"""A pixel beside a mask whose colour is so many standard deviations (1.48 median absolute deviations of all such pixels
-of the frame) from the background's belongs to what moves: feet on the floor, which the depth cannot tell apart."""
+"""A pixel near a mask is dynamic if its colour differs from the background by this many standard deviations. They are
+1.48 median absolute deviations of all such pixels of the frame. This finds feet on the floor, which depth does not
+separate."""
 LEAST_DIFFERENCE = 40.0
-"""Smallest such difference, of 255; less is hardly seen, and made by shadows and by changes of the exposure as well."""
+"""Smallest such difference, of 255. Smaller ones are hardly visible; shadows and exposure also cause them."""
 SOURCES = 150
-"""Largest number of frames that lend their colours, spread evenly; 640x480 pixels of one take 2 MB."""
+"""Most frames that provide colours, evenly spread; one of 640x480 pixels takes 2 MB."""
 
 
 class Cleaned(NamedTuple):
-    """A frame without what moves.
+    """A frame without dynamic objects.
 
     Attributes:
         frame: As recorded.
         moving: (h, w) bool, replaced pixels of the colour image.
-        replaced: (H, W) bool, replaced pixels of the depth image: the same, and shadows without readings.
-        color: (h, w, 3) uint8; where it is not known, a smooth continuation of what is.
-        depth: (H, W) float32, metres, 0 where it is not known.
+        replaced: (H, W) bool, replaced pixels of the depth image: moving pixels and their shadows.
+        color: (h, w, 3) uint8; unknown pixels continue the known ones smoothly.
+        depth: (H, W) float32, metres, 0 = unknown.
         known: (h, w) bool, whether the colour is known.
     """
 
@@ -61,13 +62,13 @@ class Cleaned(NamedTuple):
 
 @dataclass(frozen=True)
 class CleanReport:
-    """What ``clean`` did.
+    """Result of ``clean``.
 
     Attributes:
         frames: Number of frames written.
         left_out: Numbers of the frames without a pose or a readable image.
-        replaced: Mean share of the pixels that was replaced.
-        unknown: Mean share of the pixels whose background no frame saw.
+        replaced: Mean share of replaced pixels.
+        unknown: Mean share of pixels whose background no frame saw.
     """
 
     frames: int
@@ -77,7 +78,7 @@ class CleanReport:
 
 
 class Cleaner:
-    """Replaces what moves in the frames of a recording, given a run over it.
+    """Replaces dynamic objects in the frames of a recording, given a run over it.
 
     Args:
         run: The run, with map and masks.
@@ -88,8 +89,8 @@ class Cleaner:
         registered: Whether the pixels of depth and colour images correspond.
 
     Raises:
-        DatasetError: The run has no masks, none of its poses belongs to the recording, or it does not say where the
-            colour camera of the recording is.
+        DatasetError: The run has no masks, its poses do not belong to the recording, or it lacks the pose of the colour
+            camera.
         MapError: There is no map.
     """
 
@@ -101,7 +102,7 @@ class Cleaner:
             self._poses[index], self._masks[index] = T_world_camera, mask
         self.indices = tuple(self._poses)
         self.registered, color_camera = sequence.calibration is None, run.color_camera(sequence)
-        if run.calibration is not None:  # also of registered images, where it was estimated
+        if run.calibration is not None:  # also for registered images whose camera was estimated
             color_camera = run.calibration.camera
         if run.mesh is not None:
             remove_hanging_pieces(run.volume, run.mesh)
@@ -117,8 +118,7 @@ class Cleaner:
             self._renderer.add(frame, moving, T_world_camera, T_world_color)
 
     def _moving(self, index: int, frame: Frame, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a
-        margin."""
+        """Replaced pixels (H, W) of a frame: its mask, nearby pixels in front of the map, and a margin."""
         mask, width = read_mask(self._masks[index]), self.sequence.camera.width
         if mask.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")
@@ -126,18 +126,18 @@ class Cleaner:
         return grown(mask | (in_front & grown(mask, REACH * width)), MARGIN * width)
 
     def clean(self, index: int) -> Cleaned:
-        """Frame number ``index`` without what moves."""
+        """Remove dynamic objects from frame number ``index``."""
         frame, T_world_camera = self.sequence[index], self._poses[index]
         T_world_color = self._color_pose(frame)
         behind = self._renderer.map_depth(T_world_camera)
         replaced = self._moving(index, frame, behind)
         moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
-        asked, surely = grown(moving, REACH * moving.shape[1]), None
-        if self.registered:  # what is too near for the sensor has no readings, and its colours tell it
-            asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
+        checked, surely = grown(moving, REACH * moving.shape[1]), None
+        if self.registered:  # objects too near for the sensor have no depth and are found by their colours
+            checked |= connected(replaced, (frame.depth == 0) & (behind > 0))
             surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
-        found, seen = self._renderer.colors(frame, asked, T_world_color)
-        left = unlike(frame.rgb, found, asked & ~moving & seen, surely)
+        found, seen = self._renderer.colors(frame, checked, T_world_color)
+        left = unlike(frame.rgb, found, checked & ~moving & seen, surely)
         if self.registered:
             replaced = replaced | left
         replaced = with_shadow(replaced, frame.depth, behind)
@@ -160,7 +160,7 @@ def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
 
 
 def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (H, W) with the other pixels that are connected with it through such pixels."""
+    """Mask (H, W) plus pixels of ``others`` that are connected with it."""
     import cv2
 
     _, pieces = cv2.connectedComponents((mask | others).astype(np.uint8), connectivity=8)
@@ -171,8 +171,10 @@ def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.
 def with_shadow(
     moving: NDArray[np.bool_], depth: NDArray[np.float32], behind: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Mask (H, W) with the pixels that touch it, have no reading, and whose background (H, W) is known: the sensor's
-    projector does not reach them past what moves."""
+    """Mask (H, W) plus connected pixels without depth whose background depth (H, W) is known.
+
+    These are shadows: the object blocks the light of the sensor's projector.
+    """
     return connected(moving, grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0))
 
 
@@ -182,10 +184,10 @@ def unlike(
     where: NDArray[np.bool_],
     surely: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of an image (h, w, 3) whose colours differ from the expected ones more than is usual.
+    """Pixels (h, w) of an image (h, w, 3) whose colours differ unusually from the expected ones.
 
-    Single ones and lines are edges that are a pixel off, and left out. Only pixels ``where`` are asked; what is usual
-    is judged by those of them that ``surely`` show what is expected, or by all.
+    Only pixels ``where`` are tested. The usual difference comes from tested pixels that ``surely`` show the expected
+    surface, else from all. Single pixels and lines are discarded, because edges may be off by a pixel.
     """
     import cv2
 
@@ -207,17 +209,21 @@ def clean_recording(
     progress: "Callable[[int, int], None] | None" = None,
     max_frames: int | None = None,
 ) -> CleanReport:
-    """Write the recording without what moves, in TUM layout, into a new or empty folder.
+    """Write the recording without dynamic objects, in TUM layout, into a new or empty folder.
 
-    The folder receives rgb/, depth/, their lists rgb.txt, depth.txt and associations.txt, intrinsics.txt,
-    groundtruth.txt if it is known, trajectory.txt (poses of the run), replaced/ and unknown/ (255 = pixels that were
-    replaced, and those of them whose background no frame saw: their depth is 0, their colour continues what surrounds
-    them), with replaced.txt and unknown.txt. Colour of a camera of its own stays in its own geometry, intrinsics.txt
-    says where that camera is, and replaced_color/ and unknown_color/ are the same for it. ``progress`` receives the
-    numbers of finished frames and of all.
+    The folder receives:
+
+    - rgb/ and depth/ with rgb.txt, depth.txt, associations.txt and intrinsics.txt.
+    - trajectory.txt, the poses of the run, and groundtruth.txt if known.
+    - replaced/ with replaced.txt: masks, 255 = replaced pixels.
+    - unknown/ with unknown.txt: 255 = pixels whose background no frame saw. Their depth is 0; their colour continues
+      the surroundings.
+
+    A separate colour camera keeps its geometry. Then intrinsics.txt holds that camera, and replaced_color/ and
+    unknown_color/ are its masks. ``progress`` receives the numbers of finished and of all frames.
 
     Raises:
-        DatasetError: The folder is not empty, or run and recording do not fit together.
+        DatasetError: The folder is not empty, or run and recording do not match.
         MapError: There is no map.
         OSError: A file cannot be written.
     """
@@ -225,7 +231,7 @@ def clean_recording(
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     cleaner, camera = Cleaner(run, sequence), sequence.camera
     masks = ("replaced", "unknown") + (() if cleaner.registered else ("replaced_color", "unknown_color"))
-    folder = TumFolder(out, f"{sequence.name} without what moves, by dudmap clean", ("rgb", "depth", *masks))
+    folder = TumFolder(out, f"{sequence.name} without dynamic objects, by dudmap clean", ("rgb", "depth", *masks))
     wanted = range(len(sequence))[:max_frames]
     indices = [index for index in cleaner.indices if index in wanted]
     pairs, shares, left_out = [], [], sorted(set(wanted) - set(indices))

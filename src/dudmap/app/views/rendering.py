@@ -1,4 +1,4 @@
-"""Artificial views (thesis section 4.5.3): the map seen along a trajectory, as picture, video or recording."""
+"""Artificial views (thesis section 4.5.3): render the map along a trajectory, as picture, video or recording."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,18 +19,18 @@ from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
-"""Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
+"""Codec by file suffix: VP9 plays in browsers (0.1 s per frame), MPEG-4 in desktop players (3 ms)."""
 PICTURE = ".png"
-"""Ending of a single picture."""
+"""Suffix of a single picture."""
 NEAREST, EDGE = 0.3, 0.04
-"""Least distance of the camera of an orbit from the map (metres), and the margin of its pictures as a share of half
-their size."""
+"""Least distance of an orbit's camera from the map (metres), and margin of its pictures as a share of half their size.
+"""
 EMPTY = 32
-"""Grey value of pixels that show no surface."""
+"""Grey value of pixels without surface."""
 
 
 class TumFolder:
-    """Writes a folder of PNG files for every kind of image, and a list of each whose first line is a title."""
+    """Writes a folder of PNG files per kind of image, and a list per kind whose first line is a title."""
 
     def __init__(self, out: Path, title: str, kinds: Iterable[str]) -> None:
         self._out, self._title = out, title
@@ -39,15 +39,14 @@ class TumFolder:
             (out / kind).mkdir(parents=True, exist_ok=True)
 
     def add(self, kind: str, timestamp: float, image: NDArray) -> str:
-        """Write an image: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool as 255 and 0; returns its line of the
-        list."""
+        """Write an image and return its line of the list: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool."""
         line = f"{timestamp:.6f} {kind}/{timestamp:.6f}.png"
         write_image(self._out / line.split()[1], image, sync=False)
         self._lines[kind].append(line)
         return line
 
     def finish(self, camera: Camera, associations: Iterable[str] = (), more: Iterable[str] = ()) -> None:
-        """Write the lists, and intrinsics.txt with ``more`` lines than those of the camera of the depth images."""
+        """Write the lists and intrinsics.txt: the lines of the depth camera, then ``more`` lines."""
         lists = self._lines | ({"associations": list(associations)} if associations else {})
         for name, lines in lists.items():
             write_text(self._out / f"{name}.txt", "\n".join([f"# {self._title}", *lines]) + "\n")
@@ -63,17 +62,17 @@ def camera_lines(camera: Camera) -> list[str]:
 
 
 def depth_units(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint16]:
-    """Depth in the units of a camera's images; 0 where it is too large for them."""
+    """Depth in the units of a camera's images; 0 if it exceeds 16 bits."""
     units = np.rint(depth * camera.depth_scale)
     return np.where(units > 65535, 0, units).astype(np.uint16)
 
 
 @contextmanager
 def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """Write a video of a size (width, height); gives a function that adds an image (H, W, 3) in RGB order.
+    """Write a video of a size (width, height); yield a function that adds an RGB image (H, W, 3).
 
     Raises:
-        ConfigError: The ending of the path is unknown, or this OpenCV cannot write the format.
+        ConfigError: The suffix is unknown, or this OpenCV cannot write the format.
     """
     codec = CODECS.get(path.suffix.lower())
     if codec is None:
@@ -98,9 +97,9 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callab
 def orbit(
     run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float, camera: Camera
 ) -> Trajectory:
-    """Trajectory on an arc from which a camera sees the whole mesh, as near as that permits, from 27 degrees above.
+    """Trajectory on an arc around the mesh, 27 degrees above, as near as it stays fully visible.
 
-    The middle of the arc is where the cameras were, and it is ``sweep_deg`` wide, there and back; from 360 on it is a
+    The arc is centred on the side of the recording cameras. It spans ``sweep_deg``, there and back; 360 or more gives a
     circle. ``up`` (3,) is a unit vector against gravity.
     """
     large = without_small_pieces(run.surface)
@@ -111,7 +110,7 @@ def orbit(
     arm = Ts[:, :3, 3].mean(axis=0) - np.median(points, axis=0)
     choices = [arm, -Ts[:, :3, 2].mean(axis=0), Ts[:, :3, 1].mean(axis=0)]
     level = [choice - (choice @ up) * up for choice in choices]
-    # a camera among what it sees is behind its mean view; one that looks straight up or down, below its image
+    # a recording camera is behind its mean view direction; one that looks straight up or down, below its image
     first = next((one for one, least in zip(level, (0.5, 0.1, 0.0), strict=True) if np.linalg.norm(one) > least), up)
     first /= np.linalg.norm(first)
     share = np.arange(frames) / frames
@@ -131,10 +130,11 @@ def orbit(
 def _framing(
     points: NDArray[np.float64], back: NDArray[np.float64], up: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.float64], float]:
-    """Pose (4, 4) of a camera that looks against ``back`` and just holds all points (n, 3), and its place along it.
+    """Pose (4, 4) of a camera that looks against ``back`` and just sees all points (n, 3), and its distance along
+    ``back``.
 
-    A point with the coordinates (x, y, z) along the axes of the camera is in the picture of a camera at (cx, cy, cz) if
-    |x - cx| <= r (z - cz) with r the tangent of half the field of view, and likewise for y.
+    A camera at (cx, cy, cz) sees a point (x, y, z), in camera axes, if |x - cx| <= r (z - cz), and likewise for y. r is
+    the tangent of half the field of view.
     """
     forward = -back / np.linalg.norm(back)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
@@ -161,16 +161,23 @@ def render_run(
     progress: Callable[[int, int], None] | None = None,
     whole: bool = False,
 ) -> int:
-    """Write the map as a camera on a trajectory sees it; returns the number of frames.
+    """Render the map along a trajectory; return the number of frames.
 
-    A file name ending with .png gives one picture, of the first pose, and one with another known ending a video. A name
-    without an ending is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists,
-    intrinsics.txt and groundtruth.txt. ``size`` is width and height in pixels, None for those of the recording; ``fps``
-    that of a video. ``progress`` receives the numbers of finished frames and of all. Views end where the readings of
-    the run did, those of the ``whole`` map at its far end.
+    The suffix of ``out`` selects the output: .png a picture from the first pose, another known suffix a video. No
+    suffix is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists, intrinsics.txt and
+    groundtruth.txt.
+
+    Args:
+        run: The run.
+        trajectory: Poses of the views.
+        out: File or folder.
+        size: Width and height in pixels; None takes the size of the recording.
+        fps: Frames per second of a video.
+        progress: Receives the numbers of finished and of all frames.
+        whole: Render to the far end of the map, not only to the depth range of the run.
 
     Raises:
-        ConfigError: The ending is unknown.
+        ConfigError: The suffix is unknown.
         DatasetError: The folder is not empty.
         MapError: There is no map.
         OSError: A file cannot be written.
@@ -213,7 +220,7 @@ def render_run(
 
 
 def view_camera(run: RunContent, size: tuple[int, int] | None) -> Camera:
-    """The camera of the run, for images of a size (width, height)."""
+    """Camera of the run, resized to (width, height)."""
     return run.volume.camera if size is None else run.volume.camera.resized(*size)
 
 
