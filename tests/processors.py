@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.lab.benchmark.measure import grid
+from dudmap.evaluation.tables import grid
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -140,7 +140,7 @@ def test_pictures(folders):
     assert (run / "masks.pdf").read_bytes().startswith(b"%PDF")
     assert evaluate(run, "--reference", recording, "--plot-format", "svg").exit_code == 0
     assert "<svg" in (run / "trajectory.svg").read_text(encoding="utf-8")
-    for name in ("trajectory", "error", "rpe", "residuals", "mesh_error", "masks"):
+    for name in ("trajectory", "error", "path", "rpe", "residuals", "mesh_error", "masks"):
         image = cv2.imread(str(run / f"{name}.png"))
         assert image is not None, name
         assert image.std() > 10, name
@@ -159,6 +159,9 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
         ((run, "--plots"), "name one with --reference"),
         ((run, "--plot-format", "gif"), "found --plot-format gif; expected png, pdf or svg"),
+        ((run, "--table-format", "tex"), "found --table-format tex; expected one of md, csv, latex"),
+        ((run, run), "several estimates need one reference; name it with --reference"),
+        ((run, run, "--reference", recording), "found two estimates with the name run; name them by NAME=PATH"),
         (("mesh", tmp_path / "empty", recording), "there is no mesh"),
         (("mesh", tmp_path / "broken.ply", recording), "cannot read the mesh"),
         (("mesh", run, recording, "--distances", "1cm"), "expected numbers separated by commas"),
@@ -177,6 +180,11 @@ def test_help_names_all_three():
     for name in ("trajectory", "mesh", "masks"):
         assert name in evaluate("--help").stdout
         assert "--json" in evaluate(name, "--help").stdout
+
+
+def test_help_shows_the_options_of_the_form_without_a_word():
+    for option in ("--reference", "--plots", "--align", "--table-format", "--time-offset"):
+        assert option in evaluate("--help").stdout
 
 
 def test_the_truth_of_a_recording_is_read_as_its_format_stores_it(tmp_path):
@@ -230,3 +238,65 @@ def test_scale_and_time_offset_of_a_run(folders, tmp_path):
     outcome = evaluate(run, "--reference", recording, "--time-offset", "0.2")
     assert "50 of 50 estimated and 60 true poses" in outcome.stdout
     assert re.search(r"hint: the clocks seem to differ: with -0\.[12]\d+ s .*--time-offset auto", outcome.stdout)
+
+
+@pytest.fixture
+def several(folders, tmp_path):
+    """Options for the run, its copy without the frames of 0.5 to 1 s under another name, and the reference."""
+    run, recording = folders
+    found = Trajectory.load(run / "trajectory.txt")
+    kept = (found.timestamps < 0.5) | (found.timestamps > 1)
+    Trajectory(found.timestamps[kept], found.Ts_world_camera[kept]).save(tmp_path / "a=b_1.txt")
+    return run, f"with % gaps={tmp_path / 'a=b_1.txt'}", "--reference", recording, "--out", tmp_path / "out"
+
+
+def test_several_estimates_are_one_table(folders, several, tmp_path):
+    out = figures(*several)
+    alone = figures(folders[0], "--reference", folders[1])
+    first, second = out["estimates"]
+    assert first == {"name": "run"} | alone
+    assert second["name"] == "with % gaps"
+    assert second["pairs"] == 34
+    assert first["covered_share"] == pytest.approx(49 / 59)
+    assert second["covered_share"] == pytest.approx((49 - 17) / 59)
+    assert json.loads((tmp_path / "out/evaluation.json").read_text()) == out
+    table = evaluate(*several)
+    assert table.stdout == (tmp_path / "out/evaluation.md").read_text()
+    head, _, row, _ = table.stdout.splitlines()
+    assert head.startswith("| method | ATE RMSE, mm |")
+    assert row.startswith(f"| run | {1000 * alone['ate_rmse_m']:.1f} |")
+    assert not (folders[0] / "evaluation.md").exists()
+    named = evaluate(tmp_path / "a=b_1.txt", *several[:1], *several[2:])
+    assert named.stdout.splitlines()[2].startswith("| a=b_1 |")
+
+
+def test_table_for_a_paper(several, tmp_path):
+    table = evaluate(*several, "--table-format", "latex").stdout
+    assert table == (tmp_path / "out/evaluation.tex").read_text()
+    lines = table.splitlines()
+    assert lines[:2] == [r"\begin{tabular}{lrrrrrrr}", r"\toprule"]
+    assert lines[2].endswith(r"& covered, \% \\")
+    assert lines[5].startswith(r"with \% gaps & ")
+    assert {line.count("&") for line in lines[2:6]} == {0, 7}
+    assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]
+
+
+def test_several_estimates_are_in_one_plot(several, tmp_path):
+    assert evaluate(*several, "--plot-format", "svg").exit_code == 0
+    for name in ("trajectory", "error", "path", "rpe"):
+        text = (tmp_path / f"out/{name}.svg").read_text(encoding="utf-8")
+        assert all(f"<!-- {label}: " in text for label in ("run", "with % gaps")), name
+
+
+def test_estimates_without_common_times_are_named(several, tmp_path):
+    run, named, *rest = several
+    late = adjusted(Trajectory.load(run / "trajectory.txt"), 7.25)
+    for name in ("late", "later"):
+        late.save(tmp_path / f"{name}.txt")
+    refused = evaluate(run, tmp_path / "late.txt", named, tmp_path / "later.txt", *rest)
+    assert refused.exit_code == 1
+    reason = "0 of 50 estimated poses .* give --time-offset auto if both are of one recording"
+    assert re.fullmatch(f"dudmap: late: {reason}; later: {reason}\n", refused.stderr)
+    rows = figures(run, tmp_path / "late.txt", *rest, "--time-offset", "auto")["estimates"]
+    assert rows[1]["time_offset_s"] == pytest.approx(-7.25, abs=0.005)
+    assert rows[1]["ate_rmse_m"] == pytest.approx(rows[0]["ate_rmse_m"], rel=0.02)

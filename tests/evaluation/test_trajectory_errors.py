@@ -1,5 +1,6 @@
 """Trajectory errors against exact motions, a plain transcription of the definition, and evo as a separate program."""
 
+import csv
 import json
 import re
 import subprocess
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from dudmap.cli import app
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
@@ -317,3 +320,23 @@ def test_too_few_matches_are_refused_with_the_option_that_mends_them():
         ate(adjusted(half, 0.05), half)
     with pytest.raises(DatasetError, match=r"^9 of 300 .*at least 30 are needed: give a larger --max-difference"):
         ate(adjusted(reference, reference.timestamps[-1] - 8 / 30), reference)
+
+
+def test_table_of_several_estimates_equals_evo(files, tmp_path):
+    """Each row of the command's CSV against evo on the same file, at the file's own noise."""
+    for name, seed in (("one", 3), ("two", 4)):
+        disturbed(files[1], seed=seed).save(tmp_path / f"{name}.txt")
+    arguments = [f"first={tmp_path / 'one.txt'}", tmp_path / "two.txt", "--reference", tmp_path / "ref.txt"]
+    arguments += ["--table-format", "csv", "--out", tmp_path / "out"]
+    done = CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+    assert done.exit_code == 0, done.output
+    rows = list(csv.DictReader(done.stdout.splitlines()))
+    assert [row["name"] for row in rows] == ["first", "two"]
+    for row, name in zip(rows, ("one", "two"), strict=True):
+        (tmp_path / "est.txt").write_text((tmp_path / f"{name}.txt").read_text())
+        theirs = evo("evo_ape", tmp_path, "-a")
+        for key in ("rmse", "mean", "median", "max"):
+            assert float(row[f"ate_{key}_m"]) == pytest.approx(theirs[key], rel=1e-6)
+        for key, relation in (("trans_rmse_m", "trans_part"), ("rot_rmse_deg", "angle_deg")):
+            theirs = evo("evo_rpe", tmp_path, "-d", "30", "-u", "f", "--all_pairs", "-r", relation)
+            assert float(row[f"rpe_{key}_per_s"]) == pytest.approx(theirs["rmse"], rel=1e-5)

@@ -1,7 +1,6 @@
 """``dudmap evaluate``: score a trajectory, a mesh or dynamic masks against the ground truth."""
 
 import json
-import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -16,7 +15,7 @@ from dudmap.cli.output import DefaultGroup
 from dudmap.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
-    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.evaluation.comparison import Score
     from dudmap.evaluation.trajectory import Align
 
 Figures = dict[str, Any]
@@ -45,8 +44,12 @@ GapOption = Annotated[
 
 @app.command()
 def trajectory(
-    estimate: Annotated[
-        Path, Argument(help="Run folder, or trajectory (TUM, EuRoC or KITTI).", metavar="RUN|TRAJECTORY")
+    estimates: Annotated[
+        list[str],
+        Argument(
+            help="Run folders, or trajectories (TUM, EuRoC or KITTI); NAME=PATH names the method.",
+            metavar="[NAME=]PATH",
+        ),
     ],
     reference: Annotated[
         Path | None, Option(help="True trajectory (TUM, EuRoC or KITTI), or the recording.", metavar="FILE|FOLDER")
@@ -74,57 +77,65 @@ def trajectory(
     scale: Annotated[
         bool, Option("--scale", help="Also fit the scale of the estimate (Sim(3) alignment), as for one camera.")
     ] = False,
+    table_format: Annotated[
+        str | None, Option(help="Print one table only: md, csv or latex (booktabs).", metavar="FORMAT")
+    ] = None,
     as_json: o.JsonOption = False,
     plots: PlotsOption = False,
     plot_format: FormatOption = None,
     out: OutOption = None,
 ) -> None:
-    """Score a trajectory: ATE, RPE per second and per metre, share of frames tracked.
+    """Score trajectories: ATE, RPE per second and per metre, share of frames tracked.
 
-    The default reference is groundtruth.txt in the run folder. Without one, only path length and duration are given.
+    Several estimates give one table, and --plots draws them in one plot. The default reference of one run is
+    groundtruth.txt in its folder. Without one, only path length and duration are given.
     """
-    from dudmap.evaluation.files import Clock, find_reference, find_trajectory, load_trajectories, tracked_share
-    from dudmap.evaluation.hints import hints
-    from dudmap.evaluation.time_offset import MotionComparison
-    from dudmap.evaluation.trajectory import adjusted, fit_scale, path_figures, trajectory_figures
+    from dudmap.evaluation.comparison import COLUMNS, Manner, Named, compare, score
+    from dudmap.evaluation.files import Clock
+    from dudmap.evaluation.tables import FORMATS, table
 
     ending = _plot_ending(plots, plot_format)
+    if table_format is not None and (table_format not in FORMATS or as_json):
+        found = f"--table-format {table_format}{' and --json' if as_json else ''}"
+        raise ConfigError(f"found {found}; expected one of {', '.join(FORMATS)}, or --json")
     seconds = None if time_offset == "auto" else o.numbers(time_offset, 1, "--time-offset")[0]
-    file, folder = find_trajectory(estimate)
-    truth = find_reference(reference, folder)
-    estimated, known = load_trajectories(file, truth, (estimate_format, reference_format), Clock(times, fps))
-    found = estimated.trajectory
-    for remark in (*found.remarks, *(known.trajectory.remarks if known else ())):
-        say(f"dudmap: {remark}", err=True)
-    figures: Figures = {"estimate": str(file), "reference": str(truth) if truth else None}
-    figures |= {"estimate_format": estimated.format, "reference_format": known.format if known else None}
-    figures |= path_figures(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
     alignment = cast("Align", align)  # checked by ate
-    pictures: list[Path] = []
-    shown: dict[str, str] = {}
-    target = _output_folder(out, folder if folder is not None else file.parent)
-    if known is not None:
-        true = known.trajectory
-        seconds = MotionComparison(found, true).best().seconds if seconds is None else seconds
-        found = adjusted(found, seconds)
-        factor = fit_scale(found, true, max_difference) if scale else 1.0
-        found = adjusted(found, scale=factor)
-        figures |= ({"time_offset_s": round(seconds, 6)} if seconds else {}) | ({"scale": factor} if scale else {})
-        errors = trajectory_figures(found, true, alignment, max_difference)
-        figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
-        figures["hints"] = hints(found, true, max_difference)
-        shown["pairs"] = f"{figures['pairs']} of {len(found)} estimated and {len(true)} true poses"
-        if ending:
-            pictures = _plot_trajectory(target, ending, found, true, alignment, max_difference)
-    if ending and folder is not None and (folder / "residuals.npz").is_file():
-        from dudmap.evaluation.plots import plot_residuals
-
-        pictures.append(target / f"residuals.{ending}")
-        plot_residuals(pictures[-1], folder / "residuals.npz")
+    clock = Clock(times, fps)
+    manner = Manner((estimate_format, reference_format), clock, alignment, max_difference, seconds, scale)
+    named = [Named.of(text) for text in estimates]
+    if len(named) == 1:
+        scores = [score(named[0].path, named[0].name, reference, manner)]
+    elif reference is None:
+        raise ConfigError("several estimates need one reference; name it with --reference")
+    else:
+        scores = compare(named, reference, manner)
+    for remark in dict.fromkeys(remark for one in scores for remark in one.remarks):
+        say(f"dudmap: {remark}", err=True)
+    first, several = scores[0], len(scores) > 1
+    default = Path("evaluation") if several else first.run or first.file.parent
+    target = _output_folder(out, default)
+    pictures = _plot_trajectories(target, ending, scores) if ending else []
     if ending and not pictures:
         raise DatasetError("there is nothing to plot without a reference; name one with --reference")
-    name = "evaluation.json" if folder is not None else f"{file.stem}.evaluation.json"
-    _report(figures, target / name, pictures, as_json=as_json, title="trajectory", shown=shown)
+    figures = {"estimates": [{"name": one.name} | one.figures for one in scores]} if several else first.figures
+    stem = "evaluation" if several or first.run else f"{first.file.stem}.evaluation"
+    written = [target / f"{stem}.json", *pictures]
+    _write_json(written[0], figures)
+    text = table([one.row for one in scores], COLUMNS, table_format or "md")
+    if several or table_format:
+        written.insert(1, target / f"{stem}.{FORMATS[table_format or 'md']}")
+        write_text(written[1], text)
+    if as_json or not (several or table_format):
+        shown = {} if first.true is None else {
+            "pairs": f"{first.figures['pairs']} of {len(first.found)} estimated and {len(first.true)} true poses"
+        }  # fmt: skip
+        _print(figures, written, as_json=as_json, title="trajectory", shown=shown)
+        return
+    say(text.rstrip("\n"))
+    for one in scores:
+        for hint in one.figures.get("hints", []):
+            say(f"{one.name}: hint: {hint}", err=True)
+    say("written: " + ", ".join(map(str, written)), err=True)
 
 
 @app.command()
@@ -217,18 +228,19 @@ def masks(
     out: OutOption = None,
 ) -> None:
     """Score dynamic masks: precision, recall and IoU, per frame and overall."""
+    from dudmap.evaluation.comparison import rounded
     from dudmap.evaluation.segmentation import SCORED_COVERAGE, compare_masks, mask_pairs
 
     ending = _plot_ending(plots, plot_format)
     result = compare_masks(*mask_pairs(estimate, reference))
     figures: Figures = {"estimate": str(estimate), "reference": str(reference), "frames": len(result.timestamps)}
     for key in ("overall_precision", "overall_recall", "overall_iou", "mean_iou", "false_alarm_share"):
-        figures[key] = _rounded(getattr(result, key))
+        figures[key] = rounded(getattr(result, key))
     figures |= {"scored_frames": result.num_scored, "scored_coverage": SCORED_COVERAGE}
     figures["missing_frames"] = result.num_missing
     if per_frame:
         columns = ("timestamps", "coverage", "found_share", "precision", "recall", "iou")
-        figures["per_frame"] = {key: [_rounded(x, 6) for x in getattr(result, key)] for key in columns}
+        figures["per_frame"] = {key: [rounded(x, 6) for x in getattr(result, key)] for key in columns}
     target, pictures = _output_folder(out, estimate), []
     if ending:
         from dudmap.evaluation.plots import plot_masks
@@ -270,22 +282,23 @@ def _plot_ending(plots: bool, plot_format: str | None) -> str:
     return ending if plots or plot_format else ""
 
 
-def _plot_trajectory(
-    target: Path, ending: str, found: "Trajectory", true: "Trajectory", align: "Align", max_difference: float
-) -> list[Path]:
+def _plot_trajectories(target: Path, ending: str, scores: "list[Score]") -> list[Path]:
+    """Write the plots of estimates that have a reference, and of the residuals of a single run."""
     from dudmap.evaluation import plots
-    from dudmap.evaluation.trajectory import ate, rpe
 
-    absolute = ate(found, true, align, max_difference)
-    pictures = [target / f"trajectory.{ending}", target / f"error.{ending}"]
-    plots.plot_trajectories(pictures[0], found, true, absolute)
-    plots.plot_errors(pictures[1], absolute)
-    try:
-        relative = rpe(found, true, 1.0, "s", max_difference)
-    except DatasetError:  # the reason is among the figures
-        return pictures
-    plots.plot_errors(target / f"rpe.{ending}", relative)
-    return [*pictures, target / f"rpe.{ending}"]
+    written: list[Path] = []
+    if scores[0].true is not None:
+        written = [target / f"{name}.{ending}" for name in ("trajectory", "error", "path")]
+        plots.plot_trajectories(written[0], scores)
+        plots.plot_errors(written[1], scores)
+        plots.plot_error_paths(written[2], scores)
+        if plots.plot_relative_errors(target / f"rpe.{ending}", scores):
+            written.append(target / f"rpe.{ending}")
+    run = scores[0].run
+    if len(scores) == 1 and run is not None and (run / "residuals.npz").is_file():
+        written.append(target / f"residuals.{ending}")
+        plots.plot_residuals(written[-1], run / "residuals.npz")
+    return written
 
 
 def _output_folder(out: Path | None, default: Path) -> Path:
@@ -295,35 +308,35 @@ def _output_folder(out: Path | None, default: Path) -> Path:
     return target
 
 
-def _report(
-    figures: Figures,
-    file: Path,
-    pictures: list[Path],
-    *,
-    as_json: bool,
-    title: str,
-    shown: dict[str, str] | None = None,
-) -> None:
-    """Write the figures as JSON and print them, those in ``shown`` as they stand there, and hints below the table."""
-    text = json.dumps(figures, allow_nan=False)
+def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool, title: str) -> None:
+    """Write the figures as JSON and print them."""
+    _write_json(file, figures)
+    _print(figures, [file, *pictures], as_json=as_json, title=title, shown={})
+
+
+def _write_json(file: Path, figures: Figures) -> None:
     with writing(file):
-        write_text(file, text + "\n")
+        write_text(file, json.dumps(figures, allow_nan=False) + "\n")
+
+
+def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, shown: dict[str, str]) -> None:
+    """Print the figures, those in ``shown`` as they stand there, and hints below the table."""
     if as_json:
-        say(text)
+        say(json.dumps(figures, allow_nan=False))
         return
     from rich.table import Table
 
     from dudmap.app.terminal import plain_console
 
     table = Table(title=title, show_header=False)
-    for key, value in (figures | (shown or {})).items():
+    for key, value in (figures | shown).items():
         if value is not None and not isinstance(value, list | dict):
             table.add_row(*_shown(key, value))
     console = plain_console()
     console.print(table)
     for hint in figures.get("hints", []):
         console.print(f"hint: {hint}", soft_wrap=True)
-    console.print("written: " + ", ".join(str(path) for path in [file, *pictures]), soft_wrap=True)
+    console.print("written: " + ", ".join(map(str, written)), soft_wrap=True)
 
 
 def _shown(key: str, value: object) -> tuple[str, str]:
@@ -336,7 +349,3 @@ def _shown(key: str, value: object) -> tuple[str, str]:
     text = f"{1000 * value:.1f} mm" if unit == "m" else f"{value:.2f} deg"
     note = " (see rotation_rmse)" if name.startswith("ate_rot") else ""
     return (f"{name} per {per}" if per else name) + note, text
-
-
-def _rounded(value: float, digits: int = 9) -> float | None:
-    return round(float(value), digits) if math.isfinite(value) else None

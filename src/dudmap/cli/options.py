@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 GROUPS = {
     "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --ignore --run "
     "--trajectory --reference --max-frames --every",
-    "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format --quiet --json",
+    "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format "
+    "--table-format --quiet --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
     "--z-up --resolution --heights --world",
     "Calibration": "--calibration",

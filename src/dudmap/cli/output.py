@@ -19,6 +19,12 @@ class DefaultGroup(TyperGroup):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the help of the group, then the help of its first command, whose name may be left out."""
+        super().format_help(ctx, formatter)
+        name, command = next(iter(self.commands.items()))
+        command.format_help(command.context_class(command, info_name=name, parent=ctx), formatter)
+
 
 def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False, out: Path | None = None) -> None:
     """Print the result of a command, and where it is written, to stdout: as one JSON object, as text, or not at all."""

@@ -3,6 +3,8 @@
 A plot that cannot be written is a ``DudmapError``.
 """
 
+from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +14,10 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import atomic_path
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
+from dudmap.evaluation.comparison import Score
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, MaskResult
-from dudmap.evaluation.trajectory import AteResult, RpeResult
+from dudmap.evaluation.trajectory import PoseErrors, Statistics, gaps
 from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
@@ -22,56 +25,123 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
+COLORS = ESTIMATE, SECOND, "#2e8b57", "#d98a00", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5"
+"""Colours of several estimates."""
 LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2, "frameon": False}
 """Place of a legend: above the axes on the right, where it covers no curve; titles stand on the left."""
 
 
-def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, result: AteResult) -> None:
-    """Aligned estimate and reference, projected along the direction of least motion, and per axis over time."""
-    aligned = (result.T_reference_estimate @ estimate.Ts_world_camera)[:, :3, 3]
-    start, end = result.timestamps[0] - 0.1, result.timestamps[-1] + 0.1
-    during = (reference.timestamps >= start) & (reference.timestamps <= end)
-    true, t0 = reference.Ts_world_camera[during, :3, 3], result.timestamps[0]
-    across, up = np.sort(np.argsort(-np.ptp(true, axis=0), kind="stable")[:2])
-    figure, (view, by_time) = _figure(2, width=13)
-    view.plot(true[:, across], true[:, up], color=REFERENCE, linewidth=1.5, label="reference")
-    _line_with_gaps(view, estimate.timestamps, aligned[:, across], aligned[:, up], "estimate, aligned")
-    view.plot(*true[0, [across, up]], "o", color=REFERENCE, markersize=6, label="start")
+def plot_trajectories(path: Path, scores: list[Score]) -> None:
+    """Aligned estimates and the reference: seen along the direction of least motion, and each axis over time."""
+    true, t0 = _compared_reference(scores)
+    figure, places = _figure_of([["view", axis] for axis in "xyz"], (13, 5.5), width_ratios=[1.1, 1])
+    positions = true.Ts_world_camera[:, :3, 3]
+    across, up = _widest_axes(positions)
+    view = places["view"]
+    view.plot(positions[:, across], positions[:, up], color=REFERENCE, linewidth=1.5, label="reference")
+    view.plot(*positions[0, [across, up]], "o", color=REFERENCE, markersize=6, label="start")
+    for number, name in enumerate("xyz"):
+        places[name].plot(true.timestamps - t0, positions[:, number], color=REFERENCE, linewidth=1.5)
+        places[name].set(ylabel=f"{name}, m")
+        places[name].tick_params(labelbottom=name == "z")
+    for color, score in zip(cycle(COLORS), scores, strict=False):
+        aligned = _aligned(score)
+        label = f"{score.name}: ATE {1000 * score.absolute.rmse:.1f} mm"
+        lines = [(view, aligned[:, across], aligned[:, up])]
+        lines += [(places[name], score.found.timestamps - t0, aligned[:, number]) for number, name in enumerate("xyz")]
+        for axes, x, y in lines:
+            _line_with_gaps(axes, score.found.timestamps, x, y, color, label)
     view.set(xlabel=f"{'xyz'[across]}, m", ylabel=f"{'xyz'[up]}, m")
-    view.set_title(f"ATE RMSE {1000 * result.rmse:.1f} mm", loc="left")
     view.set_aspect("equal", adjustable="datalim")
     view.legend(**LEGEND)
-    for axis, color in enumerate(("#b03a2e", "#2e8b57", "#2f6fb5")):
-        offset = true[0, axis]
-        by_time.plot(reference.timestamps[during] - t0, true[:, axis] - offset, color=color, alpha=0.45, linewidth=2.5)
-        by_time.plot(
-            estimate.timestamps - t0, aligned[:, axis] - offset, ".", color=color, markersize=2.5, label="xyz"[axis]
+    places["z"].set(xlabel="time, s")
+    _save(figure, path)
+
+
+def plot_errors(path: Path, scores: list[Score]) -> None:
+    """Absolute errors of position and orientation over time."""
+    title = f"absolute error, alignment: {scores[0].absolute.alignment}"
+    labels = "position error, mm", "orientation error, deg", "time, s"
+    _plot_errors(path, title, labels, [(score.name, score.absolute) for score in scores])
+
+
+def plot_relative_errors(path: Path, scores: list[Score]) -> bool:
+    """Relative errors over time of the estimates that have them; whether there is one."""
+    found = [(score.name, score.relative) for score in scores if score.relative is not None]
+    labels = "translation, mm over 1 s", "rotation, deg over 1 s", "time of the first pose, s"
+    if found:
+        _plot_errors(path, "relative pose error over 1 s", labels, found)
+    return bool(found)
+
+
+def plot_error_paths(path: Path, scores: list[Score]) -> None:
+    """Position error as colour along the aligned path of each estimate; one scale for all."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    true, _ = _compared_reference(scores)
+    positions = true.Ts_world_camera[:, :3, 3]
+    across, up = _widest_axes(positions)
+    width, height = np.ptp(positions[:, [across, up]], axis=0)
+    columns = min(len(scores), 3)
+    rows = -(-len(scores) // columns)
+    panel = float(np.clip(4.5 * height / width, 1.5, 6)) if width else 4.5
+    mosaic = [[str(row * columns + column) for column in range(columns)] for row in range(rows)]
+    figure, _ = _figure_of(mosaic, (5 * columns + 1.5, (panel + 1) * rows))
+    scale = ScalarMappable(Normalize(0, 1000 * max(score.absolute.trans.max for score in scores)), "turbo")
+    for axes in figure.axes[len(scores) :]:
+        axes.set_axis_off()
+    for axes, score in zip(figure.axes, scores, strict=False):
+        absolute = score.absolute
+        compared = _aligned(score)[np.isin(score.found.timestamps, absolute.timestamps)]
+        axes.plot(positions[:, across], positions[:, up], color=REFERENCE, linewidth=0.8, alpha=0.5)
+        axes.scatter(
+            compared[:, across], compared[:, up], c=scale.to_rgba(1000 * absolute.trans_errors), s=12, zorder=2
         )
-    by_time.set(xlabel="time, s", ylabel="position from the start, m")
-    by_time.set_title("band: reference; dots: estimate", loc="left")
-    by_time.legend(markerscale=4, **LEGEND | {"ncols": 3})
+        axes.set(xlabel=f"{'xyz'[across]}, m", ylabel=f"{'xyz'[up]}, m")
+        axes.set_title(f"{score.name}: ATE {1000 * absolute.rmse:.1f} mm", loc="left")
+        axes.set_aspect("equal")
+    figure.colorbar(scale, ax=figure.axes, label="position error, mm")
     _save(figure, path)
 
 
-def plot_errors(path: Path, result: AteResult | RpeResult) -> None:
-    """Absolute or relative errors of position and orientation over time."""
-    if isinstance(result, AteResult):
-        title = f"absolute error, alignment: {result.alignment}"
-        labels = "position error, mm", "orientation error, deg", "time, s"
-    else:
-        per = f"over {result.delta:g} {result.unit}"
-        title = f"relative pose error {per}"
-        labels = f"translation, mm {per}", f"rotation, deg {per}", "time of the first pose, s"
+def _plot_errors(
+    path: Path, title: str, labels: tuple[str, str, str], results: Sequence[tuple[str, PoseErrors]]
+) -> None:
     figure, (translation, rotation) = _figure(2, rows=True)
-    t = result.timestamps - result.timestamps[0]
-    translation.plot(t, 1000 * result.trans_errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
-    _rules(translation, {"RMSE": 1000 * result.trans.rmse, "median": 1000 * result.trans.median}, "mm")
-    translation.set_ylabel(labels[0])
+    t0 = min(result.timestamps[0] for _, result in results)
+    for color, (name, result) in zip(cycle(COLORS), results, strict=False):
+        parts = (translation, 1000 * result.trans_errors, "mm"), (rotation, result.rot_errors_deg, "deg")
+        for axes, errors, unit in parts:
+            levels = Statistics.of(errors)
+            label = f"{name}: RMSE {levels.rmse:.3g}, median {levels.median:.3g} {unit}"
+            _line_with_gaps(axes, result.timestamps, result.timestamps - t0, errors, color, label)
     translation.set_title(title, loc="left")
-    rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
-    _rules(rotation, {"RMSE": result.rot_deg.rmse, "median": result.rot_deg.median}, "deg")
-    rotation.set(xlabel=labels[2], ylabel=labels[1])
+    translation.set(ylabel=labels[0], ylim=(0, None))
+    rotation.set(xlabel=labels[2], ylabel=labels[1], ylim=(0, None))
+    for axes in (translation, rotation):
+        axes.legend(**LEGEND | {"ncols": 1 if len(results) > 2 else 2, "fontsize": "small"})
     _save(figure, path)
+
+
+def _compared_reference(scores: list[Score]) -> tuple[Trajectory, float]:
+    """The reference during the compared part, and the time at which this begins."""
+    start, end = (f(g(score.absolute.timestamps) for score in scores) for f, g in ((min, np.min), (max, np.max)))
+    true = scores[0].true
+    assert true is not None
+    during = (true.timestamps >= start - 0.1) & (true.timestamps <= end + 0.1)
+    return Trajectory(true.timestamps[during], true.Ts_world_camera[during]), float(start)
+
+
+def _widest_axes(positions: NDArray) -> tuple[int, int]:
+    """The two axes along which positions (N, 3) extend most, in their order."""
+    first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
+    return first, second
+
+
+def _aligned(score: Score) -> NDArray[np.float64]:
+    """Positions (N, 3) of an estimate in the world of the reference."""
+    return (score.absolute.T_reference_estimate @ score.found.Ts_world_camera)[:, :3, 3]
 
 
 def plot_residuals(path: Path, residuals: Path) -> None:
@@ -155,32 +225,34 @@ def plot_masks(path: Path, result: MaskResult) -> None:
     _save(figure, path)
 
 
-def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Figure, NDArray[np.object_]]":
+def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Figure, list[Axes]]":
+    """Figure with axes in a row, or below each other with a common horizontal axis."""
+    names = [str(number) for number in range(count)]
+    figure, axes = _figure_of(
+        [[name] for name in names] if rows else [names], (width, 6.5 if rows else 5.5), sharex=rows
+    )
+    for one in list(axes.values())[:-1]:
+        one.tick_params(labelbottom=not rows)
+    return figure, list(axes.values())
+
+
+def _figure_of(mosaic: Any, size: tuple[float, float], **options: Any) -> "tuple[Figure, dict[str, Axes]]":  # noqa: ANN401
+    """Figure with axes by name, arranged and with the options as ``Figure.subplot_mosaic`` has them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, 6.5 if rows else 5.5), dpi=110, layout="constrained")
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(count, 1, sharex=True, squeeze=False) if rows else figure.subplots(1, count, squeeze=False)
-    for one in axes.ravel():
+    axes = figure.subplot_mosaic(mosaic, **options)
+    for one in axes.values():
         one.grid(alpha=0.25)
-    return figure, axes.ravel()
+    return figure, axes
 
 
-def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, label: str) -> None:
+def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, color: str, label: str) -> None:
     """Plot a line that is interrupted where frames are missing."""
-    x, y = x.copy(), y.copy()
-    steps = np.diff(stamps)
-    breaks = np.flatnonzero(steps > 3 * np.median(steps)) + 1 if len(steps) else np.array([], dtype=int)
-    axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=ESTIMATE, linewidth=1.2, label=label)
-
-
-def _rules(axes: "Axes", levels: dict[str, float], unit: str) -> None:
-    """Horizontal lines at named levels."""
-    for style, (name, level) in zip(("--", ":"), levels.items(), strict=True):
-        axes.axhline(level, color=REFERENCE, linestyle=style, linewidth=1, label=f"{name} {level:.3g} {unit}")
-    axes.set_ylim(bottom=0)
-    axes.legend(**LEGEND)
+    breaks = gaps(stamps)
+    axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=color, linewidth=1.2, label=label)
 
 
 def _save(figure: "Figure", path: Path) -> None:

@@ -29,6 +29,8 @@ SMALLEST_SHARE = 0.1
 SMALLEST_SPREAD = 1e-3
 """Positions that spread less than this across their principal direction (metres, and as a share of the spread along
 it) do not determine a rotation."""
+LONGEST_STEP = 3.0
+"""Poses that follow each other after more than this many median steps in time enclose a gap of lost frames."""
 PATH_TOLERANCE = 0.1
 """Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
@@ -277,13 +279,16 @@ def trajectory_figures(
 ) -> dict[str, float | int | str | None]:
     """All figures of a trajectory by name and unit, for tables and JSON.
 
-    ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
+    ``covered_share``, the share of the reference's duration between consecutive pairs without a gap; ATE;
+    ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
     first pose only, by which a fixed or merely rotating camera is judged; RPE per second and per metre. A relative
     error is None where the recording is too short for it; ``rpe_per_s_missing`` or ``rpe_per_m_missing`` is the reason.
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)
+    duration = float(reference.timestamps[-1] - reference.timestamps[0])
     out: dict[str, float | int | str | None] = {"pairs": absolute.num_pairs, "alignment": absolute.alignment}
+    out |= {"covered_share": covered_time(absolute.timestamps) / duration}
     out |= _figures(absolute, "ate_{}_m", "ate_rot_{}_deg")
     out |= {"drift_rmse_m": from_start.rmse, "rotation_rmse_deg": from_start.rot_deg.rmse}
     units: tuple[Unit, ...] = ("s", "m")
@@ -295,6 +300,18 @@ def trajectory_figures(
             out |= {name.format(key): None for name in names for key in STATISTICS}
             out[f"rpe_per_{unit}_missing"] = str(error)
     return out
+
+
+def gaps(timestamps: Numbers) -> NDArray[np.intp]:
+    """Indices of the poses that follow a gap of lost frames."""
+    steps = np.diff(timestamps)
+    return np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1 if len(steps) else np.array([], np.intp)
+
+
+def covered_time(timestamps: Numbers) -> float:
+    """Seconds between consecutive poses, without gaps."""
+    after = gaps(timestamps)
+    return float(timestamps[-1] - timestamps[0] - (timestamps[after] - timestamps[after - 1]).sum())
 
 
 def _figures(errors: PoseErrors, trans: str, rot: str) -> dict[str, float]:

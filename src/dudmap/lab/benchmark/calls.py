@@ -20,7 +20,7 @@ from dudmap.core.backends import threads
 from dudmap.core.backends.parameters import BLOCK
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.frame_view import FrameView
-from dudmap.lab.benchmark.measure import grid
+from dudmap.evaluation.tables import grid
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence

@@ -29,8 +29,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.lens import Lens
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
+from dudmap.evaluation.tables import grid
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.measure import grid
 
 GAPS = 5, 15, 30
 """Frames between the two of a pair."""

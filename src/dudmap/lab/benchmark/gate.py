@@ -12,7 +12,8 @@ import tomli_w
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError
-from dudmap.lab.benchmark.measure import Row, grid, measure_sequence
+from dudmap.evaluation.tables import grid
+from dudmap.lab.benchmark.measure import Row, measure_sequence
 from dudmap.lab.benchmark.suites import WORLDS, Entry
 
 EXCERPT = "freiburg1_xyz"

@@ -8,8 +8,9 @@ from dudmap.config import Config
 from dudmap.core.backends.device import obstacle, resolve
 from dudmap.core.slam import Slam
 from dudmap.errors import DeviceError, MapError
+from dudmap.evaluation.tables import grid
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.measure import Row, grid
+from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 
 KERNELS_EVERY = 4

@@ -7,7 +7,8 @@ first frame on (``limits`` in ``suites.toml``; ``docs/limits.md`` defines the fi
 from collections.abc import Collection
 from typing import Any
 
-from dudmap.lab.benchmark.measure import Row, grid
+from dudmap.evaluation.tables import grid
+from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.data import tables
 
 LARGEST_ATE = 0.02

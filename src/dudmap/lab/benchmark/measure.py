@@ -22,6 +22,7 @@ from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
+from dudmap.evaluation.tables import Column, grid, shown
 from dudmap.evaluation.trajectory import RUN_FIGURES, accuracy, ate
 from dudmap.lab.benchmark.suites import PASSES, Entry
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
     from dudmap.io.sequences import Sequence
 
-Cells = list[str] | tuple[str, ...]
-"""Texts of one line of a table."""
 Row = dict[str, Any]
 """One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
@@ -250,15 +249,6 @@ def code_hash(without: tuple[str, ...] = ()) -> str:
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 
-class Column(NamedTuple):
-    """Format of one figure: heading with unit, factor from the stored unit, number of decimals."""
-
-    key: str
-    heading: str
-    factor: float = 1.0
-    digits: int = 0
-
-
 COLUMNS = (
     Column("frames", "frames"),
     Column("lost", "lost"),
@@ -277,21 +267,6 @@ COLUMNS = (
     Column("peak_rss_mb", "peak MB"),
 )
 """Columns of a suite; those without any value are omitted."""
-
-
-def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and words alike
-    """Text of one cell."""
-    if value is None:
-        return ""
-    return f"{value * column.factor:.{column.digits}f}" if isinstance(value, int | float) else str(value)
-
-
-def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
-    """Markdown table; the first ``words`` columns are left-aligned, the others right-aligned."""
-    lines = ["| " + " | ".join(header) + " |"]
-    lines.append("|" + "|".join("---" if number < words else "---:" for number in range(len(header))) + "|")
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
 
 
 def markdown(rows: list[Row]) -> str:

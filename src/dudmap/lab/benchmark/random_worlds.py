@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.lab.benchmark.measure import Row, code_hash, grid, measure_each, measure_sequence
+from dudmap.evaluation.tables import grid
+from dudmap.lab.benchmark.measure import Row, code_hash, measure_each, measure_sequence
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.data import tables
 

@@ -8,9 +8,10 @@ from typing import NamedTuple
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
+from dudmap.evaluation.tables import grid, shown
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.lab.benchmark.limits import limits_table
-from dudmap.lab.benchmark.measure import COLUMNS, SCORED, Job, Row, grid, markdown, measure_all, save, score_mesh, shown
+from dudmap.lab.benchmark.measure import COLUMNS, SCORED, Job, Row, markdown, measure_all, save, score_mesh
 from dudmap.lab.benchmark.suites import UNCALIBRATED, Entry, Suite
 from dudmap.lab.data import tables
 

@@ -18,8 +18,9 @@ import numpy as np
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError
+from dudmap.evaluation.tables import grid
 from dudmap.lab.benchmark.calls import COUNTED_FROM, count_calls, memory_rate, stage_table
-from dudmap.lab.benchmark.measure import Row, grid, in_own_process
+from dudmap.lab.benchmark.measure import Row, in_own_process
 from dudmap.lab.benchmark.suites import Entry
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
+from dudmap.evaluation.tables import grid
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.measure import grid
 from dudmap.lab.benchmark.suites import Excerpt
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dudmap.lab.benchmark.measure import grid
+from dudmap.evaluation.tables import grid
 from dudmap.lab.study.designs import Factor, Table
 
 if TYPE_CHECKING:

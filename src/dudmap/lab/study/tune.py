@@ -180,7 +180,7 @@ def run_tune(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS) 
 
 def describe(table: Table, good: Sequence[Point], plan: Plan) -> str:
     """Outcome of a search in words."""
-    from dudmap.lab.benchmark.measure import grid
+    from dudmap.evaluation.tables import grid
     from dudmap.lab.study.report import shown
     from dudmap.lab.study.response_surface import values_text
 
