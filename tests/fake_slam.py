@@ -89,7 +89,7 @@ class FakeSlam:
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
-        self.device = "cpu"
+        self.device, self.calibration_waits = "cpu", 0
 
     @property
     def image_poses(self):
