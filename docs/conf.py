@@ -37,13 +37,14 @@ napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True  # attributes of data classes are described in the docstring of the class
 
-LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*|README\.md)\)")
+LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((\.\./[^)]*)\)")
 
 
 def _read(app: Any, name: str, source: list[str]) -> None:
-    """Fill in the commands, and print links to files of the repository, which is no part of the site, as names."""
+    """Fill in the commands, link the index of the site, and print links to other files of the repository as names."""
     if name == "commands":
         source[0] += command_pages()
+    source[0] = source[0].replace("](README.md)", "](index.md)")
     source[0] = LINK.sub(lambda found: f"{found[1]} (`{found[2].removeprefix('../')}`)", source[0])
 
 

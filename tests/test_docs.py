@@ -33,8 +33,8 @@ def shown_commands():
             for line in block.splitlines():
                 if line.startswith("dudmap "):
                     yield pytest.param(line.partition("#")[0].strip(), id=f"{page.name}: {line[:60]}")
-    for line in re.findall(r"`(dudmap [^`]+)`", (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")):
-        yield pytest.param(line, id=f"how-to.md: {line[:60]}")
+    for line in re.findall(r"`(dudmap [^`]+)`", (ROOT / "docs" / "README.md").read_text(encoding="utf-8")):
+        yield pytest.param(line, id=f"docs/README.md: {line[:60]}")
 
 
 def program(*arguments, cwd):
