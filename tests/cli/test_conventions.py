@@ -265,7 +265,7 @@ def test_help_fits_80_columns_uncut(words):
 # -- options -----------------------------------------------------------------------------------------------------------
 
 
-def test_an_option_of_several_commands_means_one_thing_and_stands_in_the_table():
+def test_an_option_of_several_commands_means_one_thing():
     found = {}
     for words, command in ALL.items():
         for option in command.params:
@@ -277,10 +277,6 @@ def test_an_option_of_several_commands_means_one_thing_and_stands_in_the_table()
                 )
     shared = [set(meanings.values()) for meanings in found.values() if len(meanings) > 1]
     assert [meanings for meanings in shared if len(meanings) > 1] == []
-    page = Path(__file__).parents[2] / "docs" / "conventions.md"
-    rows = re.findall(r"^\| ([A-Za-z ]+) \| (`--.*) \|$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    assert {group for group, _ in rows} == set(GROUPS)
-    assert {(name, group) for group, row in rows for name in re.findall(r"`([^`]+)`", row)} == set.union(*shared)
 
 
 @pytest.mark.parametrize("words", ALL)
