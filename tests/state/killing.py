@@ -41,7 +41,10 @@ CONFIG = Config().override(
 )
 EVERY = 0.3
 """Seconds from one checkpoint to the next."""
-TIMES = "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb"
+TIMES = (
+    "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb", "command", "date",
+)  # fmt: skip
+"""Metrics that differ between two processes."""
 
 
 def lost_and_found():

@@ -4,7 +4,9 @@ import base64
 import gzip
 import json
 import re
+from datetime import datetime
 from html.parser import HTMLParser
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -12,9 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.app.pipeline.run import run
+from dudmap.app.viewing.plots import plots
 from dudmap.app.viewing.report import NUMBER, ReportObserver, Thumbnails, write_report
+from dudmap.app.viewing.run_files import RunFiles
 from dudmap.cli import app
 from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError
 from dudmap.io.sequences import open_sequence
 from fake_slam import FakeResult
@@ -117,13 +123,82 @@ def test_figures_configuration_plots_and_losses_are_there(page, text):
     assert "unreadable: frame 7: the image is cut off" in said
     assert "2 redundant views" in said
     assert 'preset = "default"' in said
-    assert "ms_per_frame_median" in said
-    assert "41.2" in said
     assert text.count("<svg") == 3
-    for title in ("Time per stage", "Share of the readings", "Residuals"):
+    for title in ("Trajectory seen from above", "Share of the readings", "Residuals"):
         assert title in said
     assert ">0.1</text>" in text  # the densities of the residuals are numbers
     assert "mathdefault" not in text
+
+
+def rows(page):
+    """Texts of the cells of the tables, in pairs."""
+    cells = [text for text in page.texts if text.strip()]
+    return dict(pairwise(cells))
+
+
+def test_metrics_have_names_and_units(tmp_path):
+    metrics = {
+        "ate_rmse_m": 0.0123, "rpe_rot_rmse_deg_per_s": 0.456, "map_bytes": 2_500_000, "peak_rss_mb": 691.3,
+        "readings": {"too_near": 0.01, "too_far": 0.25}, "command": "dudmap run desk --max-frames 12",
+        "date": "2026-11-28 21:40:13+00:00",
+    }  # fmt: skip
+    found = rows(Page(write_report(write_run(tmp_path / "run", **metrics)).read_text(encoding="utf-8")))
+    assert found["absolute trajectory error (ATE), RMSE"] == "12.3 mm"
+    assert found["relative error (RPE) over one second, rotation, RMSE"] == "0.46 deg"
+    assert found["size of the map"] == "2.5 MB"
+    assert found["per frame, median"] == "41.2 ms"
+    assert found["readings beyond the depth range"] == "25.0 %"
+    assert found["command"] == metrics["command"]
+    assert found["finished"] == metrics["date"]
+    assert not set(found) & set(metrics) - {"command"}
+
+
+def test_times_per_stage_are_the_parts_of_one_bar(tmp_path):
+    folder = write_run(tmp_path / "run")
+    lines = (folder / "timings.csv").read_text().splitlines()
+    lines = [lines[0] + ",movers", *(f"{line},6" for line in lines[1:])]
+    (folder / "timings.csv").write_text("\n".join(lines) + "\n")
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    widths = {
+        values["title"]: float(re.search(r"flex-grow:([\d.]+)", values["style"])[1])
+        for tag, values in page.tags
+        if tag == "span" and "flex-grow" in values.get("style", "")
+    }
+    assert widths == {"track": 25, "integrate": 15, "others": 0}
+    said = " ".join(page.texts)
+    assert "Time per stage: 40.0 ms per frame on average; not part of it: movers 6.0 ms" in said
+
+
+def test_the_truth_is_drawn_in_the_world_of_the_run(tmp_path):
+    """The run's own path in another world, 2 cm off in one frame: both lines coincide and the error has one peak."""
+    folder = write_run(tmp_path / "run")
+    found = Trajectory.load(folder / "trajectory.txt")
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
+    Ts = found.Ts_world_camera.copy()
+    Ts[:, 1, 3] = 0.3 * np.sin(np.arange(len(Ts)))  # not on a line
+    Trajectory(found.timestamps, Ts).save(folder / "trajectory.txt")
+    Trajectory(found.timestamps, T @ Ts).save(folder / "groundtruth.txt")
+    run = RunFiles.load(folder)
+    assert run.errors.rmse < 1e-6
+    drawn = plots(run)
+    assert list(drawn)[:2] == ["Trajectory seen from above", "Error over time, after least-squares alignment"]
+    above = drawn["Trajectory seen from above"]
+    for label in ("true", "estimated", "lost (1 gap)", "start", "end"):
+        assert f">{label}</text>" in above
+    curves = re.findall(r'<path d="([^"]+)"[^>]*stroke-linecap: square', above)
+    true, estimated = (np.array(re.findall(r"[-\d.]+", curve), float).reshape(-1, 2) for curve in curves[:2])
+    assert len(true) == FRAMES - 1
+    for point in estimated:  # which is interrupted where the frame is lost
+        assert np.abs(true - point).sum(axis=1).min() < 0.1
+
+
+def test_a_truth_of_another_time_is_no_plot(tmp_path):
+    folder = write_run(tmp_path / "run", accuracy_missing="no pair")
+    found = Trajectory.load(folder / "trajectory.txt")
+    Trajectory(found.timestamps + 100, found.Ts_world_camera).save(folder / "groundtruth.txt")
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    assert rows(page)["no accuracy, because"] == "no pair"
+    assert "Error over time" not in " ".join(page.texts)
 
 
 def test_names_of_a_recording_are_no_markup(text):
@@ -193,8 +268,9 @@ def test_the_command(tmp_path):
     assert "cannot write the report" in done.stderr
 
 
-def test_a_run_keeps_images_and_writes_its_report(slam, tmp_path):
+def test_a_run_keeps_images_and_writes_its_report(slam, tmp_path, monkeypatch):
     slam.script = {2: "lost"}
+    monkeypatch.setattr("sys.argv", ["/usr/bin/dudmap", "run", "my desk", "--token", "secret"])
     out = tmp_path / "out"
     recording = open_sequence(write_recording(tmp_path / "desk", 6))
     for _ in range(2):  # the second run finds the files of the first
@@ -202,6 +278,9 @@ def test_a_run_keeps_images_and_writes_its_report(slam, tmp_path):
     assert len(list((out / "thumbnails").iterdir())) == 6 * 4
     said = " ".join(Page((out / "report.html").read_text(encoding="utf-8")).texts)
     assert "5 of 6 frames were tracked" in said
+    assert "dudmap run 'my desk' --token ..." in said
+    finished = datetime.fromisoformat(json.loads((out / "metrics.json").read_text())["date"])
+    assert abs((datetime.now().astimezone() - finished).total_seconds()) < 3600
     run(recording, Config(), out, progress=False)
     assert not (out / "report.html").exists()
     assert not list((out / "thumbnails").iterdir())

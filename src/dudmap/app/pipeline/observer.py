@@ -3,6 +3,7 @@
 import json
 import platform
 import re
+import shlex
 import sys
 import time
 import traceback
@@ -136,16 +137,22 @@ def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, 
 
 def report_text(error: BaseException, events: Iterable[dict[str, Any]]) -> str:
     """Content of the report."""
-    command = re.sub(r"(--token[= ])\S+", r"\1...", " ".join(sys.argv))
     parts = [
         f"dudmap stopped by a defect of its own, {time.strftime('%Y-%m-%d %H:%M:%S %z')}",
-        f"command: {command}",
+        f"command: {command_line()}",
         f"versions: {json.dumps(_versions())}",
         "".join(traceback.format_exception(error)),
         "last events of the run, newest at the end:",
         *(json.dumps(event) for event in events),
     ]
     return "\n".join(parts) + "\n"
+
+
+def command_line() -> str:
+    """The command line of this process, without the secret of ``--token``."""
+    program, *arguments = sys.argv
+    program = "dudmap" if Path(program).name == "__main__.py" else Path(program).name
+    return re.sub(r"(--token[= ])\S+", r"\1...", shlex.join([program, *arguments]))
 
 
 def _versions() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.pipeline.observer import command_line
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
 from dudmap.app.pipeline.usefulness import uselessness
 from dudmap.atomic_file import UNFINISHED, write_image, write_text, writing
@@ -51,8 +52,9 @@ IGNORED = "ignored.png"
 FACES = 20_000
 """Most triangles for the direction against gravity, as in ``diff``: a tenth of a second."""
 SCORES = (
-    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
-    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+    "evaluation.json", "evaluation.md", "evaluation.csv", "evaluation.tex", "mesh.evaluation.json",
+    "masks.evaluation.json", "timings.evaluation.json", "timings.tex", "trajectory.png", "error.png", "path.png",
+    "rpe.png", "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
 )  # fmt: skip
 """Files of `dudmap evaluate` in a run folder."""
 WRITTEN = {
@@ -235,6 +237,7 @@ def write_run_folder(
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         about = {"versions": versions(), "machine": machine(), "device": slam.device, "peak_rss_mb": peak_rss_mb()}
         metrics.update(zip(("wall_s", "cpu_s"), (round(seconds, 3) for seconds in record.elapsed()), strict=True))
+        about |= {"command": command_line(), "date": datetime.now().astimezone().isoformat(" ", "seconds")}
         metrics.update(camera=asdict(sequence.camera), **about)
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 

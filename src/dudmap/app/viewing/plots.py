@@ -4,72 +4,112 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.viewing.run_files import RunFiles
-from dudmap.errors import printable
-from dudmap.evaluation.plots import LEGEND, draw_residuals
+from dudmap.core.geometry import se3
+from dudmap.evaluation.plots import ESTIMATE, LEGEND, REFERENCE, SECOND, draw_residuals
+from dudmap.evaluation.trajectory import AteResult, Statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 400
 """Most points of a curve over time: a plot is about this many pixels wide."""
-MAX_STAGES = 9
-"""Stages with their own colour; the shortest ones are summed."""
 
 
 def plots(run: RunFiles) -> dict[str, str]:
-    """SVG text by title: time per stage, dynamic share, residuals, as far as there are data."""
+    """SVG text by title: trajectory, its error, dynamic share, residuals, as far as there are data."""
     out: dict[str, str] = {}
-    if run.frames and run.stages:
-        out["Time per stage"] = _times(run)
+    if len(run.trajectory) > 1:
+        out["Trajectory seen from above"] = _from_above(run)
+    if run.errors is not None:
+        out["Error over time, after least-squares alignment"] = _errors(run, run.errors)
     if run.frames:
         out["Share of the readings that move"] = _dynamic_share(run)
     if (run.folder / "residuals.npz").is_file():
         with _drawing("residuals") as (figure, picture):
-            axes = figure.subplots()
-            figure.subplots_adjust(left=0.13, top=0.8)  # room for numbers and legend
-            draw_residuals(axes, run.folder / "residuals.npz")
+            draw_residuals(figure.subplots(), run.folder / "residuals.npz")
         out["Residuals"] = picture[0]
     return out
 
 
-def _times(run: RunFiles) -> str:
-    t = _seconds(run)
-    times = {stage: run.column(stage) for stage in run.stages}
-    ranked = sorted(times, key=lambda stage: -float(times[stage].sum()))
-    if len(ranked) > MAX_STAGES:
-        rest = ranked[MAX_STAGES - 1 :]
-        ranked = [*ranked[: MAX_STAGES - 1], "others"]
-        times["others"] = np.sum([times[stage] for stage in rest], axis=0)
-    curves = [_binned(t, times[stage]) for stage in ranked]
-    # single frames may take very long, such as the first one, which loads the kernels
-    highest = 1.3 * max(float(np.percentile(np.sum([curve[1] for curve in curves], axis=0), 95)), 1e-3)
-    with _drawing("times") as (figure, picture):
-        figure.subplots_adjust(right=0.72)  # room for the legend
+def _from_above(run: RunFiles) -> str:
+    """Estimated and true trajectory on the ground, the first view pointing upwards; lost parts are dashed."""
+    across, frames = _ground_axes(run), run.figures()
+    places = [np.full(3, np.nan) if frame.T_world_camera is None else frame.T_world_camera[:3, 3] for frame in frames]
+    path = np.array(places) @ across.T
+    known = np.flatnonzero(np.isfinite(path[:, 0]))
+    with _drawing("above", height=4.4) as (figure, picture):
         axes = figure.subplots()
-        labels = [f"{printable(stage)[:30]}: {times[stage].mean():.1f} ms" for stage in ranked]
-        axes.stackplot(curves[0][0], *(curve[1] for curve in curves), labels=labels, linewidth=0)
-        axes.set(xlabel="time, s", ylabel="ms per frame", xlim=_limits(t), ylim=(0, highest))
-        handles, names = axes.get_legend_handles_labels()
-        axes.legend(handles[::-1], names[::-1], loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+        if run.errors is not None and run.truth is not None:
+            T = se3.inverse(run.errors.T_reference_estimate)
+            true = (T @ run.truth.Ts_world_camera)[:, :3, 3] @ across.T
+            stamps = run.truth.timestamps
+            during = (stamps >= frames[0].timestamp - 0.1) & (stamps <= frames[-1].timestamp + 0.1)
+            axes.plot(*_thinned(true[during]).T, color=REFERENCE, linewidth=1, label="true")
+        axes.plot(*_thinned(path).T, color=SECOND, linewidth=1.5, label="estimated")
+        bridges = [path[[a, b]] for a, b in pairwise(known) if b > a + 1]
+        for number, bridge in enumerate(bridges):
+            label = f"lost ({len(bridges)} gap{'s' * (len(bridges) > 1)})" if number == 0 else None
+            axes.plot(*bridge.T, "--x", color=ESTIMATE, linewidth=1.5, label=label)
+        axes.plot(*path[known[0]], "o", color=SECOND, markersize=7, label="start")
+        axes.plot(*path[known[-1]], "s", color=SECOND, markersize=6, label="end")
+        axes.set(xlabel="to the right, m", ylabel="ahead, m")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.legend(**LEGEND | {"ncols": 5})
+    return picture[0]
+
+
+def _ground_axes(run: RunFiles) -> NDArray[np.float64]:
+    """Axes (2, 3) of the ground plane: to the right and ahead of the first camera."""
+    Ts = run.trajectory.Ts_world_camera
+    given = (run.metrics.get("up") or {}).get("direction")
+    up = -Ts[:, :3, 1].mean(axis=0) if given is None else np.array(given, dtype=float)
+    right = np.cross(Ts[0, :3, 2], up)
+    if np.linalg.norm(right) < 0.1 * np.linalg.norm(up):  # the first camera looks along the vertical
+        right = Ts[0, :3, 0]
+    axes = np.array([right, np.cross(up, right)])
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _thinned(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    """About ``5 * POINTS`` of the positions; gaps stay."""
+    return path[:: max(1, len(path) // (5 * POINTS))]
+
+
+def _errors(run: RunFiles, errors: AteResult) -> str:
+    t = errors.timestamps - (run.column("timestamp")[0] if run.frames else errors.timestamps[0])
+    with _drawing("errors", height=3.6) as (figure, picture):
+        position, orientation = figure.subplots(2, 1, sharex=True)
+        parts = (position, 1000 * errors.trans_errors, "mm"), (orientation, errors.rot_errors_deg, "deg")
+        for axes, values, unit in parts:
+            rmse = Statistics.of(values).rmse
+            axes.plot(*_binned(t, values), color=SECOND, linewidth=1.2, label=f"RMSE {rmse:.3g} {unit}")
+            axes.set(ylabel=unit, xlim=_limits(t), ylim=(0, None))
+        lost = _lost(run)
+        if len(lost):
+            position.plot(lost, np.zeros(len(lost)), "|", color=ESTIMATE, markersize=12, label="lost")
+        position.set_title("position", loc="left", fontsize="medium")
+        orientation.set_title("orientation", loc="left", fontsize="medium")
+        orientation.set(xlabel="time, s")
+        for axes in (position, orientation):
+            axes.legend(**LEGEND)
     return picture[0]
 
 
 def _dynamic_share(run: RunFiles) -> str:
-    t = _seconds(run)
-    lost = t[np.array([row["state"] == "lost" for row in run.frames])]
+    t, lost = _seconds(run), _lost(run)
     with _drawing("dynamic") as (figure, picture):
         axes = figure.subplots()
         at, share = _binned(t, 100 * run.column("dynamic_share"))
         axes.fill_between(at, share, color="#d95f02", alpha=0.6, linewidth=0)
         if len(lost):
             axes.plot(lost, np.zeros(len(lost)), "|", color="black", markersize=12, label=f"{len(lost)} frames lost")
-            figure.subplots_adjust(top=0.88)  # room for the legend
             axes.legend(**LEGEND)
         axes.set(xlabel="time, s", ylabel="%", xlim=_limits(t), ylim=(0, None))
     return picture[0]
@@ -79,6 +119,11 @@ def _seconds(run: RunFiles) -> NDArray[np.float64]:
     """Times of the processed frames since the first, seconds."""
     stamps = run.column("timestamp")
     return stamps - stamps[0]
+
+
+def _lost(run: RunFiles) -> NDArray[np.float64]:
+    """Times of the lost frames since the first processed one, seconds."""
+    return _seconds(run)[[row["state"] == "lost" for row in run.frames]] if run.frames else np.empty(0)
 
 
 def _limits(t: NDArray[np.float64]) -> tuple[float, float]:
@@ -93,7 +138,7 @@ def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
 
 
 @contextmanager
-def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
+def _drawing(name: str, height: float = 2.8) -> "Iterator[tuple[Figure, list[str]]]":
     """Figure to draw into, and a list that holds its SVG text afterwards; equal data give equal text."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -103,13 +148,12 @@ def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
     style = {
         "svg.fonttype": "none",
         "svg.hashsalt": name,
-        "font.size": 9,
+        "font.size": 11,
         "font.family": "sans-serif",
         "text.parse_math": False,
     }
     with matplotlib.rc_context(rc=cast("Any", style)):
-        figure = Figure(figsize=(7.2, 2.8))
-        figure.subplots_adjust(left=0.09, right=0.98, bottom=0.17, top=0.96)
+        figure = Figure(figsize=(6.4, height), layout="constrained")
         FigureCanvasSVG(figure)
         yield figure, picture
         text = io.StringIO()

@@ -17,6 +17,7 @@ import numpy as np
 from dudmap import __version__
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run_folder import WRITTEN
+from dudmap.app.viewing.metrics_table import metrics_table
 from dudmap.app.viewing.plots import plots
 from dudmap.app.viewing.run_files import FOLDER, RunFiles
 from dudmap.app.viewing.snapshot import FrameImages
@@ -45,6 +46,10 @@ POSES = 5000
 """Most poses in the page; longer trajectories are thinned evenly."""
 POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
 """Content security policy: only the page's own scripts (by hash), styles and pictures."""
+BESIDE = "preprocess", "movers"
+"""Stages outside of the time to the result: the first runs in the reader's thread, the second after the result."""
+COLORS = "#2f6fb5", "#d98a00", "#2e8b57", "#c8322d", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5", "#9aa7b6"
+"""Colours of the stages; the last one is for all further ones together."""
 LISTED = 200
 """Most lost or unreadable frames that are listed one by one."""
 CARDS = {
@@ -192,6 +197,7 @@ def report_page(run: RunFiles) -> str:
             html("<figure>{svg}<figcaption>{title}</figcaption></figure>", svg=Html(svg), title=title)
             for title, svg in plots(run).items()
         ),
+        "stages": _stages(run),
         "table": _table(run.metrics),
         "config": run.config or "The run folder has no config.toml.",
         "mesh": mesh,
@@ -314,22 +320,49 @@ def _losses(metrics: dict[str, Any]) -> Html:
     return html("<ul>{rows}</ul>", rows=joined(html("<li>{row}</li>", row=row) for row in rows))
 
 
-def _table(metrics: dict[str, Any]) -> Html:
-    left_out = ("warnings", "lost_frames", "unreadable_frames")
-    rows = joined(
-        html("<tr><td>{key}</td><td>{value}</td></tr>", key=key, value=_text(value))
-        for key, value in metrics.items()
-        if key not in left_out
+def _stages(run: RunFiles) -> Html:
+    """Mean time per frame as one bar, whose parts are the stages; the shortest ones are added up."""
+    if not run.stages:
+        return Html("")
+    times = {stage: float(run.column(stage).mean()) for stage in run.stages}
+    beside = {stage: times.pop(stage) for stage in BESIDE if stage in times}
+    ranked = sorted(times.items(), key=lambda item: -item[1])
+    total = float(run.column("total").mean())
+    ranked = ranked[: len(COLORS) - 1]
+    parts = [*ranked, ("others", max(total - sum(ms for _, ms in ranked), 0.0))]
+    part = '<span style="flex-grow:{ms:.3f};background:{color}" title="{name}"></span>'
+    row = '<li><i style="background:{color}"></i>{name} <b>{ms:.1f} ms</b></li>'
+    bar, legend = (
+        joined(
+            html(form, name=_words(name), ms=ms, color=color) for (name, ms), color in zip(parts, COLORS, strict=False)
+        )
+        for form in (part, row)
     )
-    return html("<table>{rows}</table>", rows=rows)
+    also = ", ".join(f"{_words(name)} {ms:.1f} ms" for name, ms in beside.items())
+    return html(
+        '<p>Time per stage: {total:.1f} ms per frame on average{also}.</p><div class="bar">{bar}</div>'
+        '<ul class="legend">{legend}</ul>',
+        bar=bar, legend=legend, total=total, also=also and f"; not part of it: {also}",
+    )  # fmt: skip
 
 
-def _text(value: object) -> str:
-    """Value of metrics.json as text; trees as one line of JSON."""
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return "-" if value is None else str(value)
+def _words(name: str) -> str:
+    """Name of a stage for people."""
+    return printable(name)[:30].replace("_", " ")
+
+
+def _table(metrics: dict[str, Any]) -> Html:
+    """The metrics in groups, and all of them as they are in metrics.json."""
+    row = "<tr><td>{name}</td><td>{value}</td></tr>"
+    groups = joined(
+        html(
+            "<section><h3>{heading}</h3><table>{rows}</table></section>",
+            heading=heading, rows=joined(html(row, name=name, value=value) for name, value in rows),
+        )
+        for heading, rows in metrics_table(metrics)
+    )  # fmt: skip
+    kept = {key: value for key, value in metrics.items() if key not in ("lost_frames", "unreadable_frames")}
+    return html(
+        '<div class="groups">{groups}</div><details><summary>metrics.json</summary><pre>{tree}</pre></details>',
+        groups=groups, tree=json.dumps(kept, indent=2, ensure_ascii=False),
+    )  # fmt: skip

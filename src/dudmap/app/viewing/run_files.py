@@ -12,6 +12,7 @@ from dudmap.core.geometry.mesh import Mesh, ply_layout
 from dudmap.core.geometry.mesh_pieces import load_simplified
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
+from dudmap.evaluation.trajectory import AteResult, ate
 from dudmap.input_files import DAMAGE, damaged, read_bytes, read_text
 from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
@@ -65,6 +66,20 @@ class RunFiles(RunContent):
         layout = ply_layout(path)
         large = layout is not None and len(layout[1]) > MAX_TRIANGLES
         return without_small_pieces(load_simplified(path, MAX_TRIANGLES) if large else Mesh.load(path))
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """The true trajectory in its own world, None if it is not known."""
+        path = self.folder / "groundtruth.txt"
+        return Trajectory.load(path) if path.is_file() else None
+
+    @cached_property
+    def errors(self) -> AteResult | None:
+        """Absolute errors of the trajectory; None without a true one, or if both do not match in time."""
+        try:
+            return None if self.truth is None else ate(self.trajectory, self.truth)
+        except DatasetError:  # accuracy_missing in metrics.json gives the reason
+            return None
 
     @property
     def config(self) -> str:
