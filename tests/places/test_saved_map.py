@@ -76,7 +76,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_bad_folders_are_refused_with_a_reason(tmp_path):
-    with pytest.raises(MapError, match=r"holds no map\.npz and no keyframes\.npz, so no map to go on in"):
+    with pytest.raises(MapError, match=r"holds no map\.npz and no keyframes\.npz, so no map to continue"):
         SavedMap.load(tmp_path)
     saved(tmp_path)
     with pytest.raises(ConfigError, match=r"has voxels of 0\.01 m, the run is to have 0\.02 m; set"):

@@ -1,4 +1,4 @@
-"""Atlas: submaps, each with a world frame of its own, their keyframes, stored frames and trajectories.
+"""Atlas: submaps with their own world frames, keyframes, stored frames and trajectories.
 
 Submaps are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
 """
@@ -31,9 +31,9 @@ from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 class TimedPose:
     """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
 
-    ``repeats`` is empty for a tracked frame, ``depth`` for one whose pose is predicted, since its depth image repeats,
-    and ``frame`` for one with the pose of the frame that it repeats, or interpolated between tracked frames. The depth
-    image was taken ``late`` seconds before its time stamp, as far as that was known when the frame was tracked.
+    ``repeats``: "" for a tracked frame; "depth" for a predicted pose, because the depth image repeats; "frame" for a
+    copied or interpolated pose. ``late``: seconds from the capture of the depth image to its time stamp, by the
+    calibration at tracking time.
     """
 
     timestamp: float
@@ -44,18 +44,18 @@ class TimedPose:
 
 
 class Atlas(Stateful):
-    """The submaps and everything whose pose changes when a submap is corrected or joined with another.
+    """The submaps, and all poses that change when a submap is corrected or joined.
 
     Attributes:
         history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
-        keyframes: Of all submaps.
-        volumes: Maps by the numbers of their submaps; while one is rebuilt, its provisional map.
-        rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
+        keyframes: Keyframes of all submaps.
+        volumes: Map of each submap, by number; the provisional map during a rebuilding.
+        rebuildings: Incomplete new maps, by number of the submap.
         current: Number of the submap that is tracked.
         poses: Poses of all tracked frames, in order of time.
-        depth_late: Of the calibration in use, seconds.
-        saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
-            submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
+        depth_late: Delay of the depth time stamps in the present calibration, seconds.
+        saved: Number of the submap that began as a saved map, or None. Its world frame is kept: other submaps are
+            joined to it, and loop closures do not change it, because not all its frames are stored.
     """
 
     history: Remembered[FrameStore | None]
@@ -95,8 +95,8 @@ class Atlas(Stateful):
     ) -> "Atlas":
         """An atlas with one empty map, for frames of a camera without lens distortion.
 
-        Frames are kept for corrections with ``keep_frames``, where the configuration needs them, and where no ``prior``
-        map of a first pass over the same recording, whose keyframes are used, replaces them.
+        Frames are stored for corrections if ``keep_frames`` is set and the configuration needs them. A ``prior`` map of
+        a first pass provides the keyframes; no frames are stored then.
         """
         if prior is not None:
             return cls(make_volume, prior.keyframes, None, prior.submap)
@@ -104,15 +104,15 @@ class Atlas(Stateful):
         return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
     def continue_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
-        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera;
-        ``max_blocks`` as of ``TsdfVolume``."""
+        """Make a saved map the current submap, for frames of a camera; takes its volume and keyframes. ``max_blocks``:
+        see ``TsdfVolume``."""
         self.saved = self.current
         self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend, max_blocks)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
     def unit(self) -> float:
-        """The reference depth of the sensor, metres: unit of the lengths that are constants."""
+        """Reference depth of the sensor, metres: the unit of constant lengths."""
         return self.keyframes.sensor.reference_depth
 
     @property
@@ -128,10 +128,10 @@ class Atlas(Stateful):
         exposure: tuple[float, float] = (1.0, 0.0),
         recorded: Frame | None = None,
     ) -> None:
-        """Fuse the static pixels of a frame into the current map, and keep the frame for later corrections.
+        """Fuse the static pixels of a frame into the current map, and store the frame for corrections.
 
-        ``exposure`` are gain and offset to the colours of the map; what is kept is ``recorded``, the frame with its
-        colour as it was recorded (None for the same).
+        ``exposure``: gain and offset to the map's colours. ``recorded``: the frame with its recorded colour, which is
+        stored (None = ``frame``).
         """
         color = exposed_color(frame.rgb, exposure)
         self.volume.integrate(Frame(frame.timestamp, frame.depth, color), T_world_camera, static_mask)
@@ -139,9 +139,9 @@ class Atlas(Stateful):
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
     def recolor(self) -> None:
-        """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
+        """Repaint all maps with the colours of the stored frames under the present calibration.
 
-        The current map is painted over the next frames, so that none of them waits. A saved map keeps its colours,
+        The current map is repainted during the next frames, so that none of them waits. A saved map keeps its colours,
         because not all its frames are stored.
         """
         assert self.history is not None
@@ -155,14 +155,13 @@ class Atlas(Stateful):
         self.switch_to(self.current)
 
     def _complete_repainting(self) -> None:
-        """Complete the map that is being painted anew, if there is one."""
         repainting, self.repainting = self.repainting, None
         if repainting is not None:
             repainting.fuse()
             self.volumes[repainting.submap].take_colors(repainting.volume)
 
     def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
+        """Twist per second (6,), camera axes, at a tracked frame, from the poses before and after it; 0 if unknown."""
         number = min(bisect_left(self.poses, timestamp, key=lambda pose: pose.timestamp), len(self.poses) - 1)
         near = [
             pose
@@ -177,21 +176,21 @@ class Atlas(Stateful):
         return motion / (near[-1].timestamp - near[0].timestamp)
 
     def as_saved_map(self) -> SavedMap:
-        """The main map and its keyframes; how well frames fit it is left to the caller."""
+        """The main map and its keyframes, with an empty registration history."""
         self.complete()
         self.keyframes.settle()
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
     def clear_map(self) -> None:
-        """Empty the current map, which is the newest, and forget the frames stored of it."""
+        """Empty the current map, which is the newest, and forget its stored frames."""
         self.volume.clear()
         if self.history is not None:
             self.history.remove_submap(self.current)
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
-        """Append the pose (4, 4) of a frame in the current submap; poses that were predicted since the last tracked
-        frame are interpolated between that and this one."""
+        """Append the pose (4, 4) of a frame in the current submap. A tracked pose replaces the predicted poses since
+        the last tracked frame by interpolated ones."""
         new = TimedPose(timestamp, T_world_camera, self.current, repeats, self.depth_late)
         first = len(self.poses)
         while repeats != "depth" and first and self.poses[first - 1].repeats == "depth":
@@ -211,28 +210,27 @@ class Atlas(Stateful):
         self.volumes[number] = self.make_volume()
 
     def switch_to(self, number: int) -> None:
-        """Make a submap the current one; the maps of the others leave the memory where they may."""
+        """Make a submap the current one and page the other maps out where a pager allows it."""
         self.current = number
         for other, volume in self.volumes.items():
             if other != number:
                 volume.page_out()
 
     def make_room(self) -> None:
-        """Have the current map leave the memory, unless another one of the same view fits beside it."""
+        """Page the current map out unless a second map of the same view fits into the memory limit."""
         limit = None if self.volume.pager is None else self.volume.pager.max_blocks
         if isinstance(limit, MemoryLimit):
             if limit.limit - resident_bytes() < self.volume.view_bytes:
                 self.volume.page_out()
 
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
-        """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
+        """Map of a submap; during a rebuilding, it includes the surroundings of a pose (4, 4)."""
         if number in self.rebuildings:
             self.rebuildings[number].show(self.volumes[number], T_world_camera, MAX_ADDED)
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
-        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames, or with
-        the one that is painted anew."""
+        """Advance the repainting and one rebuilding, of the current submap first, by ``PER_FRAME`` frames each."""
         if self.repainting is not None and self.repainting.fuse(PER_FRAME):
             self._complete_repainting()
         if not self.rebuildings:
@@ -245,7 +243,7 @@ class Atlas(Stateful):
             self._take(rebuilding)
 
     def complete(self) -> None:
-        """Complete all maps that are being rebuilt or painted anew."""
+        """Complete all maps that are being rebuilt or repainted."""
         self._complete_repainting()
         for rebuilding in list(self.rebuildings.values()):
             self.volumes[rebuilding.submap].clear()  # makes room
@@ -253,7 +251,6 @@ class Atlas(Stateful):
             self._take(rebuilding)
 
     def _take(self, rebuilding: MapRebuilding) -> None:
-        """Use a complete map."""
         volume = self.volumes[rebuilding.submap]
         volume.take_over(rebuilding.volume)
         del self.rebuildings[rebuilding.submap]
@@ -261,18 +258,18 @@ class Atlas(Stateful):
             volume.page_out()
 
     def by_size(self) -> list[int]:
-        """Numbers of the submaps: the saved one, then those with more tracked frames first."""
+        """Numbers of the submaps: the saved one first, then by decreasing number of tracked frames."""
         sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
         return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
 
     def image_poses(self, submap: int) -> Trajectory:
-        """Poses at which the depth images of the frames tracked in a submap were taken."""
+        """Poses of a submap at the capture times of the depth images."""
         return Trajectory.from_poses(
             (pose.timestamp, pose.T_world_camera) for pose in self.poses if pose.submap == submap
         )
 
     def trajectory(self, submap: int) -> Trajectory:
-        """Poses in a submap at the time stamps of its frames, which may be late."""
+        """Poses of a submap at the time stamps of the frames, which may be late."""
         return self.image_poses(submap).after(np.array([pose.late for pose in self.poses if pose.submap == submap]))
 
     def nodes(self, submap: int) -> list[int]:
@@ -292,11 +289,9 @@ class Atlas(Stateful):
     ) -> NDArray[np.float64]:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
-        Trajectory and keyframes receive the correction interpolated in time between the stored frames.
-
-        ``volume`` was built from all stored frames ``nodes`` of the submap at their new poses (n, 4, 4), or from
-        ``fused`` alone; it is used then until another one, of all, is complete. Returns the motion (4, 4) of the newest
-        stored frame.
+        Trajectory and keyframes receive the correction interpolated in time between the stored frames. ``volume`` was
+        built from the stored frames ``nodes`` at their new poses (n, 4, 4), or only from ``fused``; then it is
+        provisional until the map of all frames is complete. Returns the motion (4, 4) of the newest stored frame.
         """
         assert self.history is not None
         frames = [self.history.frames[n] for n in nodes]
@@ -305,7 +300,7 @@ class Atlas(Stateful):
         self.move(stamps, corrections)
         self.volume.take_over(volume)
         for frame, T in zip(frames, Ts_new, strict=True):
-            frame.T_world_camera = T  # without the rounding of a correction
+            frame.T_world_camera = T  # exact: without the rounding of the correction
         self.rebuildings.pop(self.current, None)  # of an earlier correction
         if fused is not None and len(fused) < len(self.kept_nodes(self.current)):
             new = self.make_volume()
@@ -313,20 +308,20 @@ class Atlas(Stateful):
         return corrections[-1]
 
     def _places(self, submap: int) -> list[TimedPose | Keyframe | KeptFrame]:
-        """Everything that has a pose in the world of a submap."""
         frames = [] if self.history is None else self.history.frames
         return [place for place in (*self.poses, *self.keyframes.places, *frames) if place.submap == submap]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64]) -> None:
-        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); its map
-        is built anew from the moved ones, with the colours of now."""
+        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,). A
+        running repainting is cancelled, because the map is rebuilt afterwards with the present colours."""
         self.repainting = None
         for place in self._places(self.current):
             correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
             place.T_world_camera = correction @ place.T_world_camera
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
-        """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
+        """Join submap ``source`` into ``target`` and make that the current one; ``T_target_source`` (4, 4) maps world
+        to world."""
         assert self.history is not None
         self._complete_repainting()
         moved_nodes = self.kept_nodes(source)
@@ -335,7 +330,8 @@ class Atlas(Stateful):
             moved.submap = target
         del self.volumes[source]
         self.rebuildings.pop(source, None)
-        if len(moved_nodes) <= MAX_IMMEDIATE or target == self.saved:  # not all frames of a saved map are stored
+        # a saved map cannot be rebuilt: not all its frames are stored
+        if len(moved_nodes) <= MAX_IMMEDIATE or target == self.saved:
             self.history.reintegrate(self.volumes[target], moved_nodes)
             if target in self.rebuildings:
                 self.rebuildings[target].add_shown(moved_nodes)

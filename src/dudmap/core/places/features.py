@@ -23,7 +23,7 @@ class ImageFeatures:
     """SIFT features of one image.
 
     Attributes:
-        pixels: (n, 2) float64, u and v in the image; pixel centres lie at whole numbers.
+        pixels: (n, 2) float64, u and v; pixel centres at integers.
         responses: (n,) float64, strength.
         descriptors: (n, 128) float32.
         image_shape: (height, width) of the image.
@@ -39,8 +39,7 @@ class ImageFeatures:
 
 
 class SiftExtractor:
-    """Extracts the strongest SIFT features; OpenCV may return a few more of equal strength. Not for concurrent
-    calls."""
+    """Extracts the strongest SIFT features; OpenCV may add a few of equal strength. Not thread-safe."""
 
     def __init__(self, max_features: int) -> None:
         self.max_features = max_features
@@ -68,9 +67,8 @@ def match_descriptors(
 ) -> NDArray[np.int64]:
     """Pairs (m, 2) of rows: each row of ``a`` with its nearest neighbour in ``b``, if it passes the ratio test.
 
-    The distances of all pairs are computed: with some hundred features this is faster than building a search tree, and
-    exact. With fewer than two rows in ``b`` the ratio test cannot be made and nothing matches. ``mutual`` keeps only
-    pairs that are also the nearest neighbours from ``b`` to ``a``.
+    All distances are computed: for some hundred features this is exact and faster than a search tree. Nothing matches
+    if ``b`` has fewer than two rows. ``mutual`` keeps only pairs that are also nearest neighbours from ``b`` to ``a``.
     """
     if len(a) == 0 or len(b) < 2:
         return np.empty((0, 2), dtype=np.int64)

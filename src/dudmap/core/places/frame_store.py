@@ -1,4 +1,4 @@
-"""Store of fused frames on disk, from which the map is rebuilt with corrected poses."""
+"""Store of fused frames on disk, from which maps are rebuilt with corrected poses."""
 
 import weakref
 from collections import deque
@@ -20,15 +20,15 @@ from dudmap.core.scratch_store import ScratchStore
 from dudmap.core.state import Remembered, Stateful
 
 DEPTH_UNIT = 0.0005
-"""Step of the stored depth, reference depths. The quantisation error, 0.29 steps rms, is 0.14 mm in a room: a seventh
-of ``sigma_base``."""
+"""Step of the stored depth, reference depths. Its rounding error, 0.29 steps rms, is 0.14 mm in a room, a seventh of
+``sigma_base``."""
 JPEG_QUALITY = 95
 MAX_PENDING = 3
-"""Frames that may wait for the encoding thread before ``add`` waits for it."""
+"""Frames that may wait for the encoding thread before ``add`` blocks."""
 CELLS = 8, 6
-"""Cells of an image, across and down, of each of which is known whether a frame was fused in most of it."""
+"""Cells of an image, across and down; ``KeptFrame.cells`` tells which of them were mostly fused."""
 EncodedFrame = tuple[bytes, bytes, bytes]
-"""Depth, colour and mask of a stored frame, compressed."""
+"""Compressed depth, colour and mask of a stored frame."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class StoredFrame:
     """A frame as it was fused.
 
     Attributes:
-        frame: Depth, and colour with the exposure of the map, registered with the calibration now in use.
-        static: (H, W) bool, pixels that were fused.
+        frame: Depth, and colour with the exposure of the map, registered with the present calibration.
+        static: (H, W) bool, fused pixels.
         T_world_camera: (4, 4).
         count: Number of fused frames that it represents.
     """
@@ -55,9 +55,9 @@ class KeptFrame:
     Attributes:
         timestamp: Seconds.
         T_world_camera: (4, 4), updated when the map is corrected.
-        submap: Number of its submap; -1 for a frame that is as if it had never been.
-        cells: Bit by bit, in which of the ``CELLS`` most pixels were fused.
-        color_timestamp: Seconds, of the colour image; None if that is not known.
+        submap: Number of its submap; -1 if the submap was discarded.
+        cells: Bit mask of the ``CELLS`` in which most pixels were fused.
+        color_timestamp: Seconds, of the colour image; None if unknown.
         count: Number of fused frames that it represents; 0 if its images were removed.
     """
 
@@ -70,18 +70,22 @@ class KeptFrame:
 
 
 class FrameStore(Stateful):
-    """A selection of the fused frames in a temporary file, which the operating system removes.
+    """Selected fused frames in a temporary file, which the operating system removes.
 
-    A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
-    frame, or if ``gap`` frames were fused since; other frames increase the count of the stored frame before them.
-    Frames are encoded (16-bit PNG and JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about
-    1.5 kB per stored frame. Frames are numbered in the order of time; those whose images were removed keep their number
-    and their pose. Not for concurrent calls.
+    A frame is stored if one of these holds:
+
+    * the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored frame
+    * ``gap`` frames were fused since then
+    * the submap is another
+
+    Other frames increase the count of the last stored frame. One background thread encodes the frames (depth RVL,
+    colour JPEG, mask PNG). Memory grows by about 1.5 kB per stored frame. Frames are numbered in order of time; a frame
+    without images keeps its number and pose. Not thread-safe.
 
     Attributes:
-        registered: Registers the colour of a frame that was stored as it was recorded; None for registered colours.
+        registered: Registers recorded colour to the depth image; None if colour is registered already.
         frames: All frames, by number.
-        archived: Returns a frame, by its number, that is in the database of a continued run.
+        archived: Reads a frame, by number, from the database of a continued run.
     """
 
     frames: Remembered[list[KeptFrame]]
@@ -101,14 +105,14 @@ class FrameStore(Stateful):
         self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
         self.frames = []
         self.archived: Callable[[int], EncodedFrame] | None = None
-        self._first_own = 0  # number; the frames before it are archived
+        self._first_own = 0  # earlier numbers are archived
         self._file: ScratchStore | None = None
         self._encoder: ThreadPoolExecutor | None = None
-        self._pending: deque[tuple[int, Future[EncodedFrame]]] = deque()  # by number
+        self._pending: deque[tuple[int, Future[EncodedFrame]]] = deque()  # with their numbers
 
     @classmethod
     def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
-        """The store that a configuration asks for; None if neither loops nor submaps need one."""
+        """The store for a configuration; None if neither loops nor submaps need one."""
         loops = config.loops
         if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
             return None
@@ -126,9 +130,10 @@ class FrameStore(Stateful):
         submap: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> bool:
-        """Store a fused frame, with its colour as it was recorded, or increase the count of the last stored one.
+        """Store a fused frame with its recorded colour, or increase the count of the last stored frame.
 
-        Returns whether it was stored. Pixels that were not fused are stored too; the arrays must not change afterwards.
+        Returns whether the frame was stored. Pixels that were not fused are stored too; the arrays must not change
+        afterwards.
 
         Raises:
             MapError: The temporary file cannot be written.
@@ -149,7 +154,7 @@ class FrameStore(Stateful):
 
     @property
     def kept(self) -> list[int]:
-        """Numbers of the frames whose images were not removed."""
+        """Numbers of the frames with images."""
         return [number for number, frame in enumerate(self.frames) if frame.count]
 
     def in_submap(self, submap: int) -> list[int]:
@@ -157,11 +162,11 @@ class FrameStore(Stateful):
         return [number for number, frame in enumerate(self.frames) if frame.submap == submap]
 
     def kept_of(self, submap: int) -> list[int]:
-        """Numbers of the frames of a submap whose images were not removed."""
+        """Numbers of the frames of a submap with images."""
         return [number for number in self.in_submap(submap) if self.frames[number].count]
 
     def remove_submap(self, submap: int) -> None:
-        """Remove the frames of a submap as if they had never been."""
+        """Discard the frames of a submap."""
         for number in self.in_submap(submap):
             self.remove_images(number)
             self.frames[number].submap = -1
@@ -195,7 +200,7 @@ class FrameStore(Stateful):
         return StoredFrame(frame, mask > 0, kept.T_world_camera, kept.count)
 
     def encoded(self, number: int) -> EncodedFrame:
-        """The files of a stored frame."""
+        """The compressed files of a stored frame."""
         self._write(0)
         if number < self._first_own:
             assert self.archived is not None
@@ -205,7 +210,7 @@ class FrameStore(Stateful):
         return depth, color, mask
 
     def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
-        """Take the frames, whose times and poses are set, from an archive."""
+        """Read the images of the present frames from an archive."""
         self.archived, self._first_own = archived, len(self)
 
     def __iter__(self) -> Iterator[StoredFrame]:
@@ -217,15 +222,16 @@ class FrameStore(Stateful):
         numbers: Sequence[int] | None = None,
         Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
     ) -> None:
-        """Fuse stored frames (None = all that are kept) into a map, in the given order, at poses (4, 4) (None = the
-        stored ones), each with the weight of the frames it represents."""
+        """Fuse stored frames into a map, in the given order, each with the weight of its count.
+
+        ``numbers``: None = all with images. ``Ts_world_camera``: poses (4, 4), None = the stored ones.
+        """
         for i, number in enumerate(self.kept if numbers is None else numbers):
             stored = self[number]
             T = stored.T_world_camera if Ts_world_camera is None else Ts_world_camera[i]
             volume.integrate(stored.frame, T, stored.static, stored.count)
 
     def _write(self, max_pending: int) -> None:
-        """Write encoded frames to the file until at most this many are pending."""
         while self._pending and (len(self._pending) > max_pending or self._pending[0][1].done()):
             if self._file is None:
                 self._file = ScratchStore("fused frames")
@@ -234,7 +240,7 @@ class FrameStore(Stateful):
 
 
 def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
-    """The cells of an image in which most pixels are readings of the static world, bit by bit."""
+    """Bit mask of the image cells in which most pixels are static depth measurements."""
     import cv2
 
     used = (static & (frame.depth > 0)).astype(np.float32)
@@ -243,7 +249,7 @@ def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float], depth_unit: float) -> EncodedFrame:
-    """Depth in 16-bit steps of ``depth_unit`` metres, exposed colour as JPEG, static mask as 1-bit PNG."""
+    """Depth in 16-bit steps of ``depth_unit`` metres (RVL), exposed colour as JPEG, static mask as 1-bit PNG."""
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest

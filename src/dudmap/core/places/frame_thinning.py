@@ -1,8 +1,8 @@
-"""Images of kept frames that newer ones replace are removed, so that their number grows with the space that was seen.
+"""Removal of stored images that newer frames replace: their number grows with the observed space, not with time.
 
-The map is a running average whose weight is capped: of many readings of a surface only the newest count in it, and a
-kept frame whose view was fused often enough afterwards would hardly change a rebuilt map. Its pose stays a node of the
-pose graph, which takes less memory than the trajectory.
+The map is a running average with a capped weight, so that only the newest measurements of a surface count. An old frame
+whose view was fused often enough later would hardly change a rebuilt map. Its pose stays a node of the pose graph,
+which takes little memory.
 """
 
 import numpy as np
@@ -18,29 +18,30 @@ from dudmap.core.state import Remembered, Stateful
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
 """Largest distance (reference depths) and angle (deg) between equal views: half the spacing of keyframes."""
 MIN_KEPT = 256
-"""Kept frames of which none are removed: 50 MB at 640x480. Recordings of some minutes give fewer."""
+"""Number of frames that always keep their images: 50 MB at 640x480. Recordings of some minutes store fewer."""
 
 
 class FrameThinning(Stateful):
-    """Removes the images of kept frames of the current submap whose view newer ones show.
+    """Removes the images of frames of the current submap whose view newer frames show.
 
-    They are removed when, in every cell of its image that a frame was fused in, newer frames of the same view
-    (SAME_DISTANCE, SAME_ANGLE_DEG) stand for more than ``similarity.threshold`` of the readings that the running
-    average of a voxel can hold: what is seen behind somebody who stays there is kept. LOCAL_FRAMES of them must have
-    been kept before any keyframe nearby was last seen: a return to its place is compared with what was kept until then.
+    Two conditions must hold for newer frames of the same view (SAME_DISTANCE, SAME_ANGLE_DEG):
 
+    * In every cell where the frame was fused, they represent more than ``similarity.threshold`` of the measurements
+      that the running average of a voxel can hold. Background behind an object that stays is thus kept.
+    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, because a loop closure is
+      verified against frames stored until then.
     """
 
     _stored: Remembered[int] = 0  # number of frames stored until the last call
 
     def __init__(self, config: Config, atlas: Atlas) -> None:
         self.atlas = atlas
-        # an average capped at N readings has the variance of the mean of 2 N + 1: a / (2 - a) with a = 1 / (N + 1)
+        # an average capped at N measurements has the variance of the mean of 2 N + 1: a / (2 - a) with a = 1 / (N + 1)
         held = 2 * min(config.volume.max_readings, config.volume.max_weight) + 1
         self._enough = config.similarity.threshold * held
 
     def thin(self) -> None:
-        """Test the frames with the view of the newest one if that is new; call it with every frame."""
+        """Test the frames with the view of a newly stored frame; call it with every frame."""
         history = self.atlas.history
         if history is None or self.atlas.rebuildings or self.atlas.repainting or len(history) == self._stored:
             return
@@ -49,14 +50,14 @@ class FrameThinning(Stateful):
             return
         nodes = self.atlas.kept_nodes(self.atlas.current)
         Ts = np.array([history.frames[n].T_world_camera for n in nodes])
-        # the first one fixes the world; the oldest first
+        # oldest first; the first frame fixes the world
         for i in 1 + np.flatnonzero(_same_view(Ts[1:-1], Ts[-1], self.atlas.unit)):
             if spare > 0 and self._is_replaced(history, nodes, Ts, int(i)):
                 history.remove_images(nodes[i])
                 spare -= 1
 
     def _is_replaced(self, history: FrameStore, nodes: list[int], Ts: NDArray[np.float64], i: int) -> bool:
-        """Whether newer frames show what frame ``nodes[i]`` does; ``Ts`` (n, 4, 4) are the poses of the ``nodes``."""
+        """Whether newer frames replace frame ``nodes[i]``; ``Ts`` (n, 4, 4) are the poses of the ``nodes``."""
         newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i], self.atlas.unit))
         cells = np.array([history.frames[nodes[j]].cells for j in (i, *newer)], np.int64)
         fused = (cells[:, None] >> np.arange(np.prod(CELLS))) & 1
@@ -71,7 +72,7 @@ class FrameThinning(Stateful):
 
 
 def _same_view(Ts: NDArray[np.float64], T: NDArray[np.float64], unit: float) -> NDArray[np.bool_]:
-    """Which poses (n, 4, 4) have the view of a pose (4, 4)."""
+    """Mask of the poses (n, 4, 4) with the view of a pose (4, 4)."""
     relative = se3.inverse(T) @ Ts
     near = np.linalg.norm(relative[:, :3, 3], axis=1) < SAME_DISTANCE * unit
     return near & (se3.rotation_angles(relative) < np.radians(SAME_ANGLE_DEG))

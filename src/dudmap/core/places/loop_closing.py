@@ -1,4 +1,4 @@
-"""Loop closing: places seen before are recognised, and the drift since then is taken out of trajectory and map."""
+"""Loop closing: recognise places and remove the drift since their last visit from trajectory and map."""
 
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,20 +22,20 @@ from dudmap.core.tracking.tracker import Tracker
 NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
 """A keyframe within this distance (reference depths) and angle (deg) of the camera counts as seen."""
 CHECK_INTERVAL = 5
-"""Frames between two checks for keyframes nearby, and from the start of a search to its evaluation."""
+"""Frames between two checks for nearby keyframes, and between start and evaluation of a search."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.03, 1.0
-"""Two frames confirm each other if their corrections differ by less than this, reference depths and degrees."""
+"""Largest difference of the corrections of two frames that confirm each other, reference depths and degrees."""
 MAX_VERIFIED = 2
-"""Matches of one frame that are verified by registration at most."""
+"""Largest number of matches of one frame that are verified by registration."""
 MAX_BACKOFF = 4
-"""After n failed searches in a row the next one waits n times ``loops.gap`` frames, up to this factor."""
+"""Largest factor of the linear back-off: after n failed searches in a row the next one waits n ``loops.gap`` frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopSearch:
-    """A frame, tracked in a submap, that is being compared with keyframes in the background.
+    """A tracked frame that is matched with keyframes in the background.
 
-    ``returned``: Keyframes nearby have not been seen for ``loops.min_age``, so that a match is expected. ``due``:
+    ``returned``: Nearby keyframes have not been seen for ``loops.min_age``, so that a match is expected. ``due``:
     Number of the frame at which the matches are evaluated.
     """
 
@@ -49,12 +49,15 @@ class LoopSearch:
 class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
-    A match is accepted if its features (3D-3D RANSAC), the distances to the local map of the matched time and the
-    intensities of that map give the same camera pose, a second frame confirms the correction, and the newest frame has
-    not been registered to the older surfaces meanwhile.
+    A match is accepted if all of these hold:
 
-    Features are matched in one background thread. The result is evaluated ``CHECK_INTERVAL`` frames later whether or
-    not it is ready earlier, so that the same recording always gives the same result.
+    * features (3D-3D RANSAC), distances and intensities of the local map of the matched time give the same camera pose
+    * a second frame confirms the correction
+    * the newest frame has not been registered to the older surfaces meanwhile
+
+    One background thread matches features. The result is always evaluated ``CHECK_INTERVAL`` frames later, so that
+    results do not depend on timing.
+
     ``closed`` is the number of corrections and joins made.
     """
 
@@ -64,9 +67,10 @@ class LoopCloser(Stateful):
     _frame: Remembered[int] = 0
     _next_search: Remembered[int] = 0
     _failures: Remembered[int] = 0
-    _newest_keyframe: Remembered[float | None] = None  # timestamp; their number ends at ``max_keyframes``
+    # timestamp, because the number of keyframes saturates at ``max_keyframes``
+    _newest_keyframe: Remembered[float | None] = None
     _search: Remembered[LoopSearch | None] = None
-    # submap and correction (4, 4) of the current world that one frame measured, not yet confirmed
+    # submap, and unconfirmed correction (4, 4) of the current world that one frame measured
     _pending: Remembered[tuple[int, NDArray[np.float64]] | None] = None
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
@@ -80,8 +84,8 @@ class LoopCloser(Stateful):
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.
 
-        Returns the motion (4, 4) of the camera's pose by a correction of the atlas, None if nothing was corrected.
-        ``monitor`` judges registrations by the residuals of recent frames.
+        Returns the correction (4, 4) of the camera pose, None if nothing was corrected. ``monitor`` judges
+        registrations by the residuals of recent frames.
         """
         self._frame += 1
         self.thinning.thin()
@@ -103,12 +107,11 @@ class LoopCloser(Stateful):
         wanted = new_keyframe or returned or self._pending is not None or len(self.atlas.volumes) > 1
         if candidates and wanted and self._frame >= self._next_search:
             self._start_search(query, candidates, returned)
-        if not returned:  # keyframes the camera has returned to keep their age until the search is evaluated
+        if not returned:  # keyframes of a revisited place keep their age until the search is evaluated
             _mark_seen(near, now)
         return None
 
     def _start_search(self, query: LoopQuery, candidates: list[Keyframe], returned: bool) -> None:
-        """Match the features of a frame with those of the candidates in the background."""
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, thread_name_prefix="dudmap-loops")
             weakref.finalize(self, self._executor.shutdown, wait=False)
@@ -117,7 +120,7 @@ class LoopCloser(Stateful):
         self._next_search = self._frame + self.config.loops.gap
 
     def _features(self, query: LoopQuery) -> PlacedFeatures:
-        """Features of a frame; those of the newest keyframe if the frame has just become one."""
+        """Features of a frame, taken from the newest keyframe if the frame is that keyframe."""
         keyframes, T = self.atlas.keyframes.keyframes, query.tracking.T_world_camera
         newest = keyframes[-1] if keyframes else None
         # a keyframe of a saved map may have the same time, but not the same pose
@@ -136,7 +139,7 @@ class LoopCloser(Stateful):
         return correctable and self._is_old(keyframe, now)
 
     def _evaluate(self, search: LoopSearch, newest: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Verify the matches of a search; returns the motion of the pose by a correction, None if none was made."""
+        """Verify the matches of a search; returns the correction of the pose, None if none was made."""
         query, limits = search.query, self.config.loops
         T = query.tracking.T_world_camera
         pending, self._pending = self._pending, None
@@ -144,7 +147,7 @@ class LoopCloser(Stateful):
         for place in search.matches.result()[:MAX_VERIFIED]:
             submap = place.keyframe.submap
             in_current = submap == self.atlas.current
-            # the pose of the features alone is less accurate than the registration
+            # the feature pose is less accurate than the registration
             if in_current and agree(place.T_world_camera, T, 1.5 * limits.min_distance, 1.5 * limits.min_angle_deg):
                 return self._confirm_no_drift(place, query)
             if in_current and not self.verifier.is_plausible(place, T):
@@ -177,7 +180,7 @@ class LoopCloser(Stateful):
         return None
 
     def _confirm_no_drift(self, place: PlaceMatch, query: LoopQuery) -> None:
-        """Store that there was no drift between a place and now, as a constraint of later corrections."""
+        """Store the absence of drift as a constraint for later corrections."""
         self._failures = 0
         T = query.tracking.T_world_camera
         edge = self.corrector.measured_edge(place.keyframe, T, T)
@@ -187,14 +190,13 @@ class LoopCloser(Stateful):
         _mark_seen(near, query.observation.timestamp)
 
     def _correct(self, place: PlaceMatch, query: LoopQuery, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Correct the current submap by a verified place; returns the motion of the newest pose."""
+        """Correct the current submap by a verified place; returns the correction of the newest pose."""
         edge = self.corrector.measured_edge(place.keyframe, query.tracking.T_world_camera, T_found)
         correction = None if edge is None else self.corrector.correct(edge)
         self.closed += correction is not None
         return correction
 
     def _join(self, other: int, T_other_current: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Join the current submap with another; the world of the older one stays. Returns the motion of the pose."""
         current = self.atlas.current
         self.closed += 1
         if other < current:

@@ -13,25 +13,26 @@ from dudmap.core.places.pose_graph import Edge, optimize
 from dudmap.core.state import Remembered, Stateful
 
 TRUNCATED_DISTANCE = 0.05
-"""Distances to the map are truncated at this value in that comparison, reference depths."""
+"""Truncation of the distances in the misfit of frames to a map, reference depths."""
 ODOMETRY_NOISE = 0.002, 0.02
-"""Standard deviation of a tracked motion: reference depths (or radians), and per reference depth of its path."""
+"""Standard deviation of a tracked motion: reference depths (or radians), and the same per reference depth of its
+path."""
 LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a motion measured at a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
-"""Limits of the misfit of the new pass's frames to the old pass's map. The ratio refers to the misfit to their own map;
-the offset is added. A correction with a larger misfit is rejected. The offset of distances is the noise of the measured
-motion. The offset of intensities is in units of the range 0..1.
+"""Largest misfit of the new pass to the map of the old pass: the ratio times its misfit to its own map, plus the
+offset.
 
-The correct correction of a walk of 300 m round a corridor gives a ratio of 1.1. Motions with added errors of 2 cm and 1
-degree, or of 5 cm, gave more than 2.
+A correction with a larger misfit is rejected. The offset of distances is the noise of the measured motion, reference
+depths; the offset of intensities is in units of the range 0..1. Measured: a correct correction in a corridor has the
+ratio 1.1. Errors of 5 cm, or of 2 cm and 1 degree, have more than 2.
 """
 
 
 class LoopCorrector(Stateful):
     """Distributes the drift measured by loop closures over the stored frames of the current submap.
 
-    ``edges`` are the motions measured by the loop closures so far, between numbers of stored frames.
+    ``edges`` are the motions measured by loop closures, between numbers of stored frames.
     """
 
     edges: Remembered[list[Edge]]
@@ -43,9 +44,11 @@ class LoopCorrector(Stateful):
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Motion to the newest stored frame from the one nearest in time to a recognised keyframe of the current
-        submap, given the tracked pose (4, 4) of the frame that recognised it and its pose relative to the map at the
-        time of the keyframe; None if both are the same stored frame."""
+        """Measured motion to the newest stored frame from the stored frame nearest in time to a recognised keyframe.
+
+        ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose relative to the map at the
+        time of the keyframe. Returns None if both stored frames are the same.
+        """
         history = self.atlas.history
         assert history is not None
         nodes = self.atlas.nodes(self.atlas.current)
@@ -61,9 +64,8 @@ class LoopCorrector(Stateful):
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
 
-        The correction is applied to the atlas, and the edge stored, only if the poses are finite and the stored frames
-        of the new pass around the loop fit a map of those of the old pass about as well as a map of their own. Returns
-        the motion (4, 4) of the newest pose, None if the correction was rejected.
+        The correction is applied only if the poses are finite and the new pass fits a map of the old pass about as well
+        as its own map. Returns the motion (4, 4) of the newest pose, None if the correction was rejected.
         """
         history = self.atlas.history
         assert history is not None
@@ -89,7 +91,7 @@ class LoopCorrector(Stateful):
         return self.atlas.correct(nodes, Ts_new, volume, [nodes[i] for i in (*old, *new)])
 
     def _map_of(self, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]) -> TsdfVolume:
-        """Map of some of the stored frames ``nodes`` with poses (n, 4, 4)."""
+        """Map of the ``chosen`` stored frames of ``nodes`` with poses (n, 4, 4)."""
         assert self.atlas.history is not None
         volume = self.atlas.make_volume()
         self.atlas.history.reintegrate(volume, [nodes[i] for i in chosen], list(Ts[chosen]))
@@ -98,9 +100,8 @@ class LoopCorrector(Stateful):
     def _misfit(
         self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]
     ) -> tuple[float, float]:
-        """Mean distance (m) and mean intensity difference (0..1) of some of the stored frames ``nodes`` with poses (n,
-        4, 4) to a map, infinite where they see none of it.
-        """
+        """Mean distance (m) and mean intensity difference (0..1) of the ``chosen`` stored frames to a map; infinite
+        without overlap."""
         import cv2
 
         history = self.atlas.history
@@ -128,7 +129,7 @@ def _mean(parts: list[NDArray[np.float32]]) -> float:
 
 
 def _is_worse(after: tuple[float, float], before: tuple[float, float], unit: float) -> bool:
-    """Whether frames fit a map clearly worse than their own, in distance or intensity."""
+    """Whether frames fit a map clearly worse than their own map, in distance or intensity."""
     offsets = MAX_OFFSETS[0] * unit, MAX_OFFSETS[1]
     return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, offsets, strict=True))
 
@@ -136,8 +137,12 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float], unit: flo
 def _passes(
     Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int, unit: float
 ) -> tuple[list[int], list[int]]:
-    """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, where a loop from ``a``
-    closes: of the old pass, which ends where the path is farthest from there, and of the new one, about as many."""
+    """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, of the old and the new
+    pass.
+
+    ``a`` and ``b`` are the ends of a loop. The old pass ends at the farthest point of the path from ``b``. Both passes
+    have about as many poses.
+    """
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b], unit))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
     wanted = max(MAX_IMMEDIATE // 2, MAX_IMMEDIATE - len(before))
@@ -147,18 +152,18 @@ def _passes(
 
 
 def _odometry_edges(Ts: NDArray[np.float64], unit: float) -> list[Edge]:
-    """Tracked motion from each stored frame (n, 4, 4) to the next; its standard deviations, metres and radians, grow
-    with its length."""
+    """Tracked motions between consecutive stored frames (n, 4, 4); their standard deviations (m, rad) grow with their
+    length."""
     motions = se3.inverse(Ts[:-1]) @ Ts[1:]
     sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions, unit)).tolist()
     return [Edge(i, i + 1, T, sigma * unit, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]
 
 
 def step_lengths(Ts: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """Lengths (n - 1,) of the steps along a path (n, 4, 4), as of ``lengths``."""
+    """Lengths (n - 1,) of the steps along a path (n, 4, 4), see ``lengths``."""
     return lengths(se3.inverse(Ts[:-1]) @ Ts[1:], unit)
 
 
 def lengths(motions: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """Lengths (n,) of motions (n, 4, 4) in units of so many metres; a turn by one radian counts as one unit."""
+    """Lengths (n,) of motions (n, 4, 4) in multiples of ``unit`` (m); one radian counts as one."""
     return np.linalg.norm(motions[:, :3, 3], axis=1) / unit + se3.rotation_angles(motions)

@@ -24,11 +24,11 @@ from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
 LOCAL_FRAMES = 8
-"""Stored frames, those nearest to the recognised pose, of which the local map of a place is built."""
+"""Number of stored frames in the local map of a place, the nearest ones to the recognised pose."""
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
 """Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
 DRIFT_ALLOWANCE = 0.05
-"""Drift that is allowed after any path, reference depths and radians."""
+"""Drift that is plausible after any path, reference depths and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class LoopQuery:
         levels: Its image pyramid, coarse to fine.
         tracking: Its registration against the current map.
         dynamic_mask: (H, W) bool.
-        labels, unverified_mask: As of ``PoseEstimate``.
+        labels, unverified_mask: See ``PoseEstimate``.
     """
 
     observation: Observation
@@ -65,18 +65,22 @@ class LoopVerifier:
         self.tracker = tracker
 
     def is_plausible(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether the path since a place of the current submap was last seen is long enough for the drift that the
-        match implies, given the tracked pose (4, 4) of the frame."""
+        """Whether the path since the last visit of a place of the current submap explains the implied drift.
+
+        ``T_world_camera``: tracked pose (4, 4) of the frame.
+        """
         since = [pose.T_world_camera for pose in self._poses_since(place)]
         unit = self.atlas.unit
-        path = step_lengths(np.reshape(since[::3], (-1, 4, 4)), unit).sum()  # every third: less jitter
+        path = step_lengths(np.reshape(since[::3], (-1, 4, 4)), unit).sum()  # every third pose: less jitter
         limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
         return bool(np.linalg.norm(drift[:3, 3]) < limit * unit) and se3.rotation_angle(drift) < limit
 
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place (or in the
-        saved map that the place belongs to); None unless features, distances and intensities agree."""
+        """Pose (4, 4) of a frame in a local map of frames stored up to the time of the place, or in its saved map.
+
+        Returns None unless features, distances and intensities agree.
+        """
         local = self._local_map(place)
         if local is None:
             return None
@@ -86,13 +90,13 @@ class LoopVerifier:
         return found.T_world_camera if confirmed else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
-        """Whether the newest frame, too, fits the map of the time of a place better where a correction puts it.
+        """Whether a correction improves the fit of the newest frame to the map of the time of a place.
 
-        Frames are registered to the whole map, also to what was seen long ago. Where the passes come near each other,
-        the registration finds back to the older surfaces by itself: a correction that was measured a few frames before
-        would then move the camera away from where it belongs. The older pass is what was stored before the way since
-        the place was last seen has led farthest from here; where it does not show what the frame sees, nothing speaks
-        against the correction.
+        Frames are registered to the whole map, including old surfaces. Near a revisited place, registration can return
+        to the older surfaces by itself. A correction measured a few frames earlier would then displace the camera.
+
+        The older pass consists of the frames stored before the farthest point of the path since the last visit. Returns
+        True if no stored frame of it is near.
         """
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked
@@ -105,13 +109,13 @@ class LoopVerifier:
         return local is None or _misfit(local, newest, T_corrected) < _misfit(local, newest, T_tracked)
 
     def _poses_since(self, place: PlaceMatch) -> Iterator[TimedPose]:
-        """The poses in the current submap since a place was last seen."""
+        """Poses in the current submap since the last visit of a place."""
         poses = self.atlas.poses
         begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
         return (pose for pose in islice(poses, begin, None) if pose.submap == self.atlas.current)
 
     def _local_map(self, place: PlaceMatch) -> TsdfVolume | None:
-        """Map around a place at the time when it was last seen; None without stored frames of it."""
+        """Map around a place at the time of its last visit; None without stored frames nearby."""
         history, keyframe = self.atlas.history, place.keyframe
         assert history is not None
         if keyframe.submap == self.atlas.saved:
@@ -134,7 +138,7 @@ class LoopVerifier:
 
 
 def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
-    """Mean truncated distance of the static readings of a frame at a pose (4, 4) to a map, metres."""
+    """Mean truncated distance of the static depth measurements of a frame at a pose (4, 4) to a map, metres."""
     level = query.levels[-1]
     weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
     volume.look_at(T_world_camera)

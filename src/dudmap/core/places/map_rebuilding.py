@@ -1,9 +1,9 @@
-"""Rebuilding of a map from the stored frames of its submap, a few of them with every frame that comes.
+"""Rebuilding of a map from the stored frames of its submap, a few with every new frame.
 
-A map must be fused anew when its poses are corrected (Whelan et al. 2015, ElasticFusion, deform the surface instead;
-Dai et al. 2017, BundleFusion, re-integrate frame by frame, as here). Order matters, since later frames carve what
-earlier ones show, so that the new map is fused in the order of time and used when it is complete. Until then frames are
-registered to a provisional map of those stored frames that see what the camera sees.
+Corrected poses require a new map. ElasticFusion (Whelan et al. 2015) deforms the surface; BundleFusion (Dai et al.
+2017) re-integrates frame by frame, as here. The new map is fused in order of time, because later frames carve surfaces
+of earlier ones; it is used when complete. Until then frames are registered to a provisional map of stored frames with
+the present view.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,31 +16,33 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
 MAX_IMMEDIATE = 24
-"""A map of at most this many stored frames is rebuilt at once, of a larger one those nearest to the present view."""
+"""Largest number of stored frames of a map that is rebuilt at once. Of more frames, the nearest to the present view are
+fused at once."""
 PER_FRAME = 2
-"""Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
-one is stored with a frame, so that the rebuilding ends."""
+"""Stored frames that are fused with every later frame, one of them into the provisional map if it is near. At most one
+is stored per frame, so that the rebuilding ends."""
 MAX_ADDED = 8
-"""Stored frames that are added to the provisional map at once where a lost camera may be."""
+"""Stored frames that are added to the provisional map at once around the candidate pose of a lost camera."""
 VIEW_DEPTH = 2.0
 """Depth of the point for comparing views, reference depths: the middle of an indoor view."""
 NEAR = 3.0
-"""Largest distance between the points in the middle of the view and of a stored frame, reference depths. Nearer frames
-are added to the provisional map. Others show surface out of view; they are added when the camera approaches."""
+"""Largest distance between the view points of the camera and of a stored frame, reference depths. Nearer frames are
+added to the provisional map; farther ones show surface out of view until the camera approaches."""
 SPACING = 0.3
-"""Smallest distance, reference depths, between the points that two added frames look at: nearer ones see the same."""
+"""Smallest distance between the view points of two added frames, reference depths; nearer frames show the same
+surface."""
 
 
 @dataclass(eq=False)
 class MapRebuilding:
-    """A new map of a submap, not complete yet; it also gets all frames from now on.
+    """An incomplete new map of a submap, which also receives all new frames.
 
     Attributes:
         history: The stored frames.
         submap: Number of the submap.
         volume: Its new map.
-        fused: Numbers of the stored frames of the submap that this holds.
-        shown: Those that the provisional map holds, or does not need beside them.
+        fused: Numbers of the stored frames in the new map.
+        shown: Numbers of the stored frames that the provisional map has, or does not need because a near one is in it.
         start: Number of stored frames when the rebuilding began.
     """
 
@@ -53,7 +55,7 @@ class MapRebuilding:
 
     @classmethod
     def of(cls, history: FrameStore, submap: int, volume: TsdfVolume, shown: Iterable[int] = ()) -> "MapRebuilding":
-        """A rebuilding that begins now, with some frames in the provisional map."""
+        """A rebuilding that begins now; the provisional map has the frames ``shown``."""
         return cls(history, submap, volume, set(), set(shown), len(history))
 
     @property
@@ -62,7 +64,7 @@ class MapRebuilding:
         return [n for n in self.history.kept_of(self.submap) if n not in self.fused]
 
     def fuse(self, count: int | None = None) -> bool:
-        """Fuse the next stored frames, None = all, into the new map; returns whether it is complete now."""
+        """Fuse the next ``count`` stored frames (None = all) into the new map; returns whether it is complete."""
         missing = self.missing
         for n in missing[:count]:
             self.history.reintegrate(self.volume, [n])
@@ -70,12 +72,12 @@ class MapRebuilding:
         return count is None or len(missing) <= count
 
     def add_shown(self, numbers: Sequence[int]) -> None:
-        """Note that the provisional map holds stored frames of these numbers, too."""
+        """Note that the provisional map has these stored frames, too."""
         self.shown.update(numbers)
 
     def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> int:
-        """Add those stored frames to the provisional map, at most ``count``, that see what a camera sees; returns how
-        many."""
+        """Add at most ``count`` stored frames with the view of a camera to the provisional map; returns their
+        number."""
         unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self.start and n not in self.shown])
         unknown = unknown.astype(int)
         unit = self.volume.sensor.reference_depth
@@ -98,7 +100,7 @@ class MapRebuilding:
 def nearest_views(
     Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], count: int, unit: float = 1.0
 ) -> NDArray[np.int64]:
-    """Numbers, in order, of the poses (n, 4, 4), at most ``count``, whose view is nearest to that of a camera."""
+    """Sorted indices of at most ``count`` poses (n, 4, 4) whose views are nearest to the view of a camera."""
     return np.sort(np.argsort(view_distances(Ts, T_world_camera, unit), kind="stable")[:count])
 
 

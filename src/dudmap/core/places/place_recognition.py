@@ -1,6 +1,6 @@
 """Place recognition: keyframes with features of known 3D position, and the poses they suggest for a frame.
 
-SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012), pose by 3D-3D
+SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012). Poses by 3D-3D
 RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
 """
 
@@ -23,21 +23,21 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.tracker import TrackingResult
 
 COARSE_FEATURES = 64
-"""Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
+"""Number of strongest features per keyframe in the coarse comparison that selects keyframes for matching."""
 MAX_MATCHED = 5
-"""Keyframes per frame whose features are all matched; it bounds the time of a query."""
+"""Number of keyframes per frame whose features are all matched; it bounds the time of a query."""
 POSITION_ERROR = 0.01
 """Largest error of a feature's position beyond the sensor's noise, metres per metre of depth.
 
-That are 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
+It equals 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
 """
 DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
-"""Matches in one submap with poses nearer to each other than this (reference depths, deg) are duplicates."""
+"""Matches in one submap whose poses differ by less (reference depths, deg) are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedFeatures:
-    """SIFT features of a frame whose depth is known, strongest first.
+    """SIFT features of a frame with known depth, strongest first.
 
     Attributes:
         descriptors: (n, 128) float32, RootSIFT, unit length.
@@ -57,13 +57,13 @@ NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
 
 @dataclass(eq=False)
 class Keyframe:
-    """A tracked frame whose features are stored.
+    """A tracked frame with stored features.
 
     Attributes:
         timestamp: Seconds.
         T_world_camera: (4, 4) in the world of its submap; updated when the map is corrected.
         features: Its static features.
-        submap: Number of the submap it belongs to.
+        submap: Number of its submap.
         last_seen: Last time at which the camera was near its pose, seconds.
     """
 
@@ -76,7 +76,7 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class LastFrame:
-    """The last tracked frame; its features are extracted once a later frame is not tracked.
+    """The last tracked frame; its features are extracted when a later frame is lost.
 
     Attributes:
         keyframe: Its pose, without features.
@@ -91,7 +91,7 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class PlaceMatch:
-    """A frame recognised to show the place of a keyframe.
+    """A frame that shows the place of a keyframe.
 
     Attributes:
         keyframe: The keyframe.
@@ -104,8 +104,8 @@ class PlaceMatch:
     num_inliers: int
 
     def is_confirmed(self, found: TrackingResult, limits: RelocalizationConfig, static_share: float = 1.0) -> bool:
-        """Whether the registration of the frame, this share of whose readings is static, confirms the pose that its
-        features give."""
+        """Whether a registration of the frame confirms the pose from features; ``static_share``: static share of its
+        measurements."""
         return (
             found.converged
             and len(found.unobservable) == 0
@@ -115,10 +115,9 @@ class PlaceMatch:
 
 
 class KeyframeDatabase(Stateful):
-    """Keyframes along the trajectory, and the recognition of the places they show.
+    """Keyframes along the trajectory, and place recognition by their features.
 
-    The features of a new keyframe are extracted in another thread, and are there after ``settle``. Not for concurrent
-    calls of ``extract``.
+    Another thread extracts the features of a new keyframe; ``settle`` waits for them. ``extract`` is not thread-safe.
     """
 
     keyframes: Remembered[list[Keyframe]]
@@ -135,7 +134,7 @@ class KeyframeDatabase(Stateful):
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
     def state(self) -> dict[str, Any]:
-        """The keyframes, once their features are there."""
+        """The keyframes, after waiting for their features."""
         self.settle()
         return super().state()
 
@@ -144,7 +143,7 @@ class KeyframeDatabase(Stateful):
 
         Args:
             observation: The frame.
-            dynamic_mask: (H, W) bool, pixels that are left out; None = none.
+            dynamic_mask: (H, W) bool, excluded pixels; None = none.
         """
         self.settle()
         return self._extract(observation, dynamic_mask)
@@ -155,7 +154,7 @@ class KeyframeDatabase(Stateful):
             return NO_FEATURES
         height, width = observation.depth.shape
         reduced_height, reduced_width = features.image_shape
-        # pixel centres lie at whole numbers in both images
+        # pixel centres at integers in both images
         pixels = (features.pixels + 0.5) * (width / reduced_width, height / reduced_height) - 0.5
         depth, usable = _depth_at(observation.depth, pixels)
         if dynamic_mask is not None:
@@ -175,10 +174,10 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
-        """Make a tracked frame a keyframe if none of its submap is near; call with every tracked frame.
+        """Make a tracked frame a keyframe if no keyframe of its submap is near; call with every tracked frame.
 
-        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. One that turns out
-        to have fewer than ``relocalization.min_inliers`` features is removed when it is settled.
+        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. ``settle`` removes
+        it if it has fewer than ``relocalization.min_inliers`` features.
         """
         self.settle()
         self._frames_since_last += 1
@@ -199,7 +198,7 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> None:
-        """Remember the last tracked frame, which a frame that is not tracked is compared with first."""
+        """Remember the last tracked frame, the first candidate for recognition of a lost frame."""
         timestamp = observation.timestamp
         place = Keyframe(timestamp, T_world_camera.copy(), NO_FEATURES, submap, timestamp)
         self.last = LastFrame(place, observation, dynamic_mask)
@@ -212,7 +211,7 @@ class KeyframeDatabase(Stateful):
     def recognise(self, features: PlacedFeatures) -> list[PlaceMatch]:
         """Places that a frame with these features may show: the last tracked frame first, then the keyframes.
 
-        Half as many inliers suffice there: one frame is less often confused than one of many keyframes.
+        The last tracked frame needs half as many inliers: one frame is confused less often than one of many keyframes.
         """
         if self.last is not None and len(self.last.keyframe.features) == 0:
             self.last.keyframe.features = self.extract(self.last.observation, self.last.dynamic_mask)
@@ -220,7 +219,7 @@ class KeyframeDatabase(Stateful):
         return self.match(features, last, self.config.min_inliers // 2) + self.match(features)
 
     def settle(self) -> None:
-        """Wait for the features of the newest keyframe, and keep it if they are enough."""
+        """Wait for the features of the newest keyframe, and remove it if they are too few."""
         features, self._unsettled = self._unsettled(), _nothing
         if features is None:
             return
@@ -234,8 +233,7 @@ class KeyframeDatabase(Stateful):
     def match(
         self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None, min_inliers: int | None = None
     ) -> list[PlaceMatch]:
-        """Keyframes that match a frame with these features, each with the frame's pose; distinct poses, most inliers
-        first.
+        """Keyframes that match the features of a frame, each with the frame's pose; distinct poses, most inliers first.
 
         ``among`` limits the keyframes (None = all). ``min_inliers`` None takes the configured number.
         """
@@ -293,20 +291,20 @@ class KeyframeDatabase(Stateful):
         del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
 
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Largest believable error (n,) of the position of a feature, metres."""
+        """Largest plausible error (n,) of the position of a feature, metres."""
         z = points[:, 2]
         return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
 
 
 def _nothing() -> None:
-    """No keyframe waits for its features."""
+    """Placeholder while no features of a keyframe are pending."""
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
-    """The keyframes whose strongest features are most similar to the frame's, the best first.
+    """The keyframes whose strongest features are most similar to the frame's, best first.
 
-    The score of a keyframe sums, over the frame's features, how far its best cosine similarity exceeds the median of
-    all keyframes: features that many places share do not count.
+    The score of a keyframe is a sum over the frame's features: the excess of its best cosine similarity over the median
+    of all keyframes. Features that many places share thus do not count.
     """
     if len(among) <= MAX_MATCHED:
         return among
@@ -328,7 +326,7 @@ def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
 
 
 def _depth_at(depth: NDArray[np.float32], pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Median depth (n,) of 3x3 neighbourhoods, and whether all their readings lie on one surface.
+    """Median depth (n,) of 3x3 neighbourhoods, and whether their measurements lie on one surface.
 
     A corner at a depth edge has no well-defined position.
     """

@@ -39,14 +39,14 @@ def optimize(
 ) -> NDArray[np.float64]:
     """Minimize the sum over all edges of ``|e|^2`` with ``e = log(T_a_b^-1 T_a^-1 T_b)``, weighted by the variances.
 
-    ``covariances`` (E, 6, 6) of ``e`` take the place of the variances of the edges; ``huber`` is the threshold of the
-    Huber kernel in standard deviations.
+    ``covariances`` (E, 6, 6) of ``e`` replace the variances of the edges. ``huber``: threshold of the Huber kernel,
+    standard deviations.
 
-    Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. The sparse normal equations
-    are solved by SciPy (SuperLU). The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
-    series of the inverse right Jacobian; the derivative by ``xi_a`` is that times ``-Ad(T_b^-1 T_a)``.
+    Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. SciPy (SuperLU) solves the
+    sparse normal equations. The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the series
+    of the inverse right Jacobian. The derivative by ``xi_a`` is that matrix times ``-Ad(T_b^-1 T_a)``.
 
-    The edges must connect all initial poses (N, 4, 4). Returns the optimized ones; they are not finite if the normal
+    The edges must connect all initial poses (N, 4, 4). Returns the optimized poses; they are not finite if the normal
     equations are singular.
     """
     from scipy.sparse import coo_matrix

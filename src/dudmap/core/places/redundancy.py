@@ -1,8 +1,8 @@
-"""Redundant views: frames that tell the map nothing new, and are not fused (thesis section 4.3).
+"""Redundant views: frames without new information for the map, which are not fused (thesis section 4.3).
 
 The thesis calls a view redundant if more than 84 % of the SIFT features of the last fused frame are found in it again.
-Noise alone keeps that share below 84 % on real sensors, even with a camera on a tripod. What the test is for, that
-little is averaged twice, can be measured in the map itself: its weights are the information it has.
+On real sensors noise alone keeps this share below 84 %, even on a tripod. The map's weights measure the same directly:
+the information that the map has already.
 """
 
 from dataclasses import dataclass
@@ -21,21 +21,21 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MIN_FEATURES = 20
-"""With fewer features than this in either frame the share is meaningless and the frame counts as new."""
+"""Smallest number of features in both frames; with fewer, the frame counts as new."""
 SCALES, EXPONENTS = (0.25, 0.5, 1.0), (2.6, 1.6, 1.4)
-"""Share on the full image = share on an image reduced by a scale, with 500 features, to the power of its exponent.
+"""Share on the full image = share on an image reduced by a scale, with 500 features, to the power of the exponent.
 
-Fitted on 115 pairs of 640x480 frames (hand-held, tripod, and one view twice with noise and sub-pixel shifts), rms of
-the fit 0.05, at a quarter of the width 0.10.
+Fitted on 115 pairs of 640x480 frames (hand-held, tripod, and one view with added noise and sub-pixel shifts). The rms
+error of the fit is 0.05, at a quarter of the width 0.10.
 """
 
 
 class SimilarityTest(Stateful):
-    """Compares the appearance of a frame with that of a reference frame.
+    """Compares the appearance of a frame with a reference frame.
 
-    The share of the reference's SIFT features that are found again is measured on a reduced image and converted to
-    the share on the full image, so that the threshold keeps the meaning it has in the thesis. Features are extracted
-    when a comparison needs them, once per image. Not for concurrent calls.
+    The share of the reference's SIFT features that are found again is measured on a reduced image. It is converted to
+    the share on the full image, so that the threshold keeps its meaning of the thesis. Features are extracted on
+    demand, once per image. Not thread-safe.
     """
 
     _reference: Remembered[NDArray[np.uint8] | None] = None
@@ -44,19 +44,19 @@ class SimilarityTest(Stateful):
     def __init__(self, config: SimilarityConfig | None = None) -> None:
         self.config = config or SimilarityConfig()
         self._sift = SiftExtractor(self.config.max_features)
-        # reduced images and the descriptors of their features: at most the reference and the latest frame
+        # reduced images and their descriptors: at most the reference and the latest frame
         self._cache = []
 
     def set_reference(self, rgb: NDArray[np.uint8]) -> None:
-        """Compare the frames that follow with this one, (H, W, 3)."""
+        """Set the reference (H, W, 3) for later frames."""
         self._reference = reduced_grey(rgb, self.config.image_width)
 
     def is_redundant(self, rgb: NDArray[np.uint8]) -> bool:
-        """Whether a frame (H, W, 3) shows what the reference shows; False before there is a reference."""
+        """Whether a frame (H, W, 3) shows the view of the reference; False without a reference."""
         return self.similarity(rgb) > self.config.threshold
 
     def similarity(self, rgb: NDArray[np.uint8]) -> float:
-        """Share in [0, 1] of the reference's features found again in a frame; 0 without enough features."""
+        """Share in [0, 1] of the reference's features that are found again in a frame; 0 without enough features."""
         if self._reference is None:
             return 0.0
         images = self._reference, reduced_grey(rgb, self.config.image_width)
@@ -68,7 +68,7 @@ class SimilarityTest(Stateful):
         return float(share ** np.interp(self._reference.shape[1] / rgb.shape[1], SCALES, EXPONENTS))
 
     def _descriptors(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Descriptors (n, 128) of a reduced image, from the cache if it is one of the last two."""
+        """Descriptors (n, 128) of a reduced image, cached for the last two images."""
         known = (descriptors for other, descriptors in self._cache if np.array_equal(other, image))
         found = next(known, None)
         return self._sift.extract(image).descriptors if found is None else found
@@ -76,9 +76,13 @@ class SimilarityTest(Stateful):
 
 @dataclass(eq=False)
 class _Place:
-    """What was fused from one place: pose (4, 4) of the first frame fused from there, depth (h, w) float32 (m) of the
-    static reading of each pixel that was fused last, 0 = none, and in how many more frames each pixel (h, w) is to be
-    fused because something has gone from there."""
+    """Record of the frames fused from one place.
+
+    Attributes:
+        T_world_camera: (4, 4) pose of the first frame fused from there.
+        depth: (h, w) float32, metres, last fused static measurement of each pixel; 0 = none.
+        to_carve: (h, w), number of further frames to fuse at each pixel, to carve an object that left.
+    """
 
     T_world_camera: NDArray[np.float64]
     depth: NDArray[np.float32]
@@ -86,10 +90,10 @@ class _Place:
 
 
 class RedundantViews(Stateful):
-    """Decides which frames are left out of the fusion because they show what the map already has.
+    """Decides which frames are not fused because the map has their information already.
 
-    A view is only redundant at the place of the last fused frames: from elsewhere the same surface is seen at another
-    angle, with other systematic errors, which the average is to contain as well.
+    A view is redundant only at the place of the last fused frames. From another place the surface is seen at another
+    angle, with other systematic errors, which the average should contain as well.
     """
 
     features: Remembered[SimilarityTest]
@@ -101,17 +105,17 @@ class RedundantViews(Stateful):
         self._learnt = 2 * config.volume.free_after
 
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:
-        """Whether a registered frame is to be left out of the fusion into a map.
+        """Whether to leave a registered frame out of the fusion into a map.
 
-        With ``similarity.measure`` "features" the rule is that of the thesis. With "information" a frame is redundant
-        if the map has more than ``similarity.threshold`` of the information on the static surface in view, on average,
-        and no region of it is news:
+        ``similarity.measure`` "features" applies the rule of the thesis. With "information" a frame is redundant if the
+        map has on average more than ``similarity.threshold`` of the information on the visible static surface.
+        Exceptions are regions with news:
 
-        * a surface that has been observed fewer than 2 ``volume.free_after`` times, until which the space in front of
-          it is not known to be free (each frame observes every second plane of blocks),
-        * readings off the surface of the map: something was put there,
-        * readings behind what was fused at their pixel, until they are fused as often: something was taken away, and is
-          to be carved.
+        * a surface with fewer than 2 ``volume.free_after`` observations, because the space before it is not yet known
+          to be free (each frame observes every second plane of blocks)
+        * measurements off the surface of the map: a new object
+        * measurements behind the last fused depth of their pixel, until they are fused as often: an object left and is
+          carved
         """
         place, config, level = self._place, self.config.similarity, view.labelled
         if place is None or not config.enabled or not self._is_near(place, estimate.T_world_camera):
@@ -127,7 +131,7 @@ class RedundantViews(Stateful):
         return bool(np.count_nonzero(opened_mask(news, level)) < MIN_REGION * news.size)
 
     def update(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> None:
-        """Remember a frame that was fused into a map."""
+        """Record a frame that was fused into a map."""
         config, level, T_world_camera = self.config.similarity, view.labelled, estimate.T_world_camera
         if not config.enabled:
             return
@@ -150,13 +154,13 @@ class RedundantViews(Stateful):
             self._place.T_world_camera = T_new_old @ self._place.T_world_camera
 
     def reset(self) -> None:
-        """Forget the place: the frames that follow are fused into another map."""
+        """Forget the place, because later frames are fused into another map."""
         self._place = None
 
     def _known_share(
         self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share of the information on the surface at each reading (h, w) that the map has; 0 off its surface."""
+        """Share (h, w) of the information on the surface at each measurement that the map has; 0 off its surface."""
         volume.look_at(T_world_camera)
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)
@@ -164,12 +168,13 @@ class RedundantViews(Stateful):
         return np.where(on_surface, volume.known_share(level.depth, level.camera, T_world_camera), np.float32(0))
 
     def _is_behind(self, place: _Place, level: Level, volume: TsdfVolume) -> NDArray[np.bool_]:
-        """Readings (h, w) behind the surface that was last fused at their pixel, and not next to it on the same one."""
+        """Measurements (h, w) behind the last fused surface of their pixel, beyond the depth tolerance of one
+        surface."""
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)
         return (place.depth > 0) & (level.depth - place.depth > depth_tolerance(sigma, level))
 
     def _is_near(self, place: _Place, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether a camera is still at the place, or ``max_translation`` is 0: no limit."""
+        """Whether the camera is still at the place; always if ``max_translation`` is 0."""
         config = self.config.similarity
         if config.max_translation == 0:
             return True
@@ -177,6 +182,6 @@ class RedundantViews(Stateful):
 
 
 def _static(view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
-    """Readings (h, w) of a frame, label resolution, that are not known to move."""
+    """Measurements (h, w) of a frame, label resolution, that are not labelled as dynamic."""
     readings = view.labelled.depth > 0
     return readings if estimate.labels is None else readings & ~estimate.labels.dynamic

@@ -19,13 +19,13 @@ from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
-"""Registers and labels the lost frame against a map, starting from a pose (4, 4) in the world of that map."""
+"""Registers and labels the lost frame against a map, starting at a pose (4, 4) in the world of that map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relocalization:
-    """Verified pose and labels of a frame after tracking was lost, in the map of the submap that it was recognised in,
-    which may differ from the current one."""
+    """Verified pose and labels of a lost frame in the map of the recognised submap, which may differ from the current
+    one."""
 
     estimate: PoseEstimate
     submap: int
@@ -34,15 +34,14 @@ class Relocalization:
 class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
-    A lost frame is compared with the last tracked one and with all keyframes of the atlas. Each candidate pose is
-    verified by registering the frame against the map of the candidate's submap. The atlas is not changed: the caller
-    switches to the submap of the frame or starts a new submap.
-
+    A lost frame is compared with the last tracked frame and with all keyframes of the atlas. Each candidate pose is
+    verified by registration against the map of its submap. The atlas is not changed: the caller switches submaps or
+    starts a new one.
     """
 
     _lost_since: Remembered[float | None] = None
     _mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
-    # time, images and segments of the last lost frames, those of LONGEST_BASELINE
+    # time, images and segments of the lost frames of the last LONGEST_BASELINE seconds
     _recent: Remembered[deque[tuple[float, Pyramid, Segmentation]]]
     _place_unknown: Remembered[bool] = False
     _counted: Remembered[tuple[float, int]]
@@ -52,7 +51,7 @@ class Relocalizer(Stateful):
         self.atlas = atlas
         self.prior_map = prior_map
         self._recent = deque()
-        self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
+        self._counted = -np.inf, 0  # time and number of features of the last frame with extracted features
 
     @property
     def is_lost(self) -> bool:
@@ -65,12 +64,12 @@ class Relocalizer(Stateful):
 
     @property
     def reason(self) -> str:
-        """Reason why no registration from a predicted pose can be trusted, empty if one can."""
+        """Reason to trust no registration from a predicted pose, empty if there is none."""
         return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
 
     def lost(self, timestamp: float, *, mostly_dynamic: bool = False) -> None:
-        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized, and whether most of the view
-        moved in the last tracked one."""
+        """Record a lost frame (timestamp in seconds); ``mostly_dynamic``: most of the view moved in the last tracked
+        frame."""
         if self._lost_since is None:
             self._lost_since, self._mostly_dynamic = timestamp, mostly_dynamic
 
@@ -82,11 +81,11 @@ class Relocalizer(Stateful):
     def recover(
         self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
     ) -> Relocalization | None:
-        """Pose of a lost frame, verified by the registration against the map; None if no candidate passes.
+        """Pose of a lost frame, verified by registration against the map; None if no candidate passes.
 
-        Candidates in the current submap are tried first: the pose by the last tracked frame, then poses in the order of
-        their matching features. The result is the first pose whose registration confirms it and is accepted. The view's
-        timer receives the time of feature matching as stage ``recognise``.
+        Candidates in the current submap are tried first: the pose by the last tracked frame, then poses by decreasing
+        number of feature matches. The result is the first pose that its registration confirms and ``accept`` accepts.
+        The view's timer records feature matching as stage ``recognise``.
         """
         limits = self.config.relocalization
         if not limits.enabled:
@@ -114,16 +113,18 @@ class Relocalizer(Stateful):
 
     @property
     def may_start_submaps(self) -> bool:
-        """Whether a map may be given up for a new, empty one."""
+        """Whether a map may be discarded for a new, empty one."""
         return self.config.submaps.enabled and self.atlas.history is not None
 
     def wants_new_submap(self, view: FrameView) -> bool:
-        """Whether tracking should go on in a new, empty submap that starts with this lost frame.
+        """Whether to start a new, empty submap with this lost frame.
 
-        Three conditions must hold. The camera has been lost for ``submaps.patience`` seconds. The frame has enough
-        depth for a map and, if it has colour, enough features for a keyframe. It does not show people
-        (``_shows_static_world``). Comparison with the last lost image finds fast people; comparison with an image
-        LONGEST_BASELINE older finds slow ones.
+        All of these conditions must hold:
+
+        * The camera has been lost for ``submaps.patience`` seconds.
+        * The frame has enough depth for a map and, if it has colour, enough features for a keyframe.
+        * The image motion is camera motion (``_shows_static_world``), compared with the last lost image, which reveals
+          fast people, and with an image LONGEST_BASELINE older, which reveals slow people.
         """
         config, observation = self.config.submaps, view.observation
         if not self.may_start_submaps or self._lost_since is None:
@@ -138,7 +139,7 @@ class Relocalizer(Stateful):
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
         timestamp, count = self._counted
-        if timestamp != observation.timestamp and observation.has_color:  # relocalisation is off
+        if timestamp != observation.timestamp and observation.has_color:  # relocalization is off
             count = len(self.atlas.keyframes.extract(observation))
         if observation.has_color and count < self.config.relocalization.min_inliers:
             return False
@@ -151,13 +152,17 @@ class Relocalizer(Stateful):
         return self.config.dynamics.method == "em" and self.config.dynamics.start_seconds > 0
 
     def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
-        """Whether the motion from an earlier lost image to this one is certainly that of the camera.
+        """Whether the motion between an earlier lost image and this one is certainly the camera's.
 
-        Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
-        near; the static world may fill most of the surface, since it is far. A map is only begun where one motion does
-        both: at least AGREED of the surface and most of the pixels follow it. Without a common motion, as in images
-        without texture, it is begun unless most of the view moved when the camera was lost. Nothing is examined where
-        images are not compared (``dynamics.start_seconds`` = 0).
+        Two images do not determine which of two motions is the camera's. A near crowd may fill most of the pixels; the
+        far static world may fill most of the surface. A map starts only if one motion explains both at least AGREED of
+        the surface and most of the pixels.
+
+        Exceptions:
+
+        * Without a common motion, as in images without texture: True unless most of the view moved when the camera was
+          lost.
+        * Images are not compared (``dynamics.start_seconds`` = 0): True.
         """
         if not self._compares_images:
             return True

@@ -1,4 +1,4 @@
-"""A map on disk that a later run goes on in: its volume, its keyframes and how well frames used to fit it."""
+"""A saved map that a later run continues: its volume, its keyframes and the residuals of its last registrations."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -18,13 +18,19 @@ from dudmap.input_files import DAMAGE, open_arrays
 MAP_FILE, KEYFRAME_FILE = "map.npz", "keyframes.npz"
 """Files of a run folder that hold its map."""
 KIND, VERSION = "dudmap keyframes", 1
-"""Content and version of a keyframe file. A version is raised when older programs cannot read the file."""
+"""Content and version of a keyframe file. The version increases when older programs cannot read the file."""
 
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """The main map of a run, in the world frame of that run: volume, keyframes of the submap 0, residuals of the last
-    registrations, by which the first ones of the next run are judged, and the folder that it was read from."""
+    """The main map of a run, in the world frame of that run.
+
+    Attributes:
+        volume: The map.
+        keyframes: Keyframes of the main submap.
+        registrations: Residuals of the last registrations, which judge the first ones of the next run.
+        folder: Folder from which the map was read.
+    """
 
     volume: TsdfVolume
     keyframes: list[Keyframe]
@@ -33,7 +39,8 @@ class SavedMap:
 
     @classmethod
     def load(cls, folder: str | Path, voxel_size: float | None = None) -> "SavedMap":
-        """Read the map of a run folder, whose voxels must have a size (m), unless it is None.
+        """Read the map of a run folder; its voxels must have ``voxel_size`` (m), unless that is None.
+
         Raises:
             MapError: A file is missing, damaged or of a newer version, or there are no keyframes.
             ConfigError: The map has another voxel size.
@@ -42,7 +49,7 @@ class SavedMap:
         missing = [name for name in (MAP_FILE, KEYFRAME_FILE) if not (folder / name).is_file()]
         if missing:
             raise MapError(
-                f"{folder} holds no {' and no '.join(missing)}, so no map to go on in; name a complete run folder"
+                f"{folder} holds no {' and no '.join(missing)}, so no map to continue; name a complete run folder"
             )
         keyframes, registrations, stored_size = load_keyframes(folder / KEYFRAME_FILE)
         if voxel_size is not None and not np.isclose(voxel_size, stored_size):
@@ -61,7 +68,7 @@ class SavedMap:
         return cls(volume, keyframes, registrations, folder)
 
     def save_keyframes(self, path: str | Path) -> None:
-        """Write all but the volume, which ``TsdfVolume.save`` writes.
+        """Write everything except the volume, which ``TsdfVolume.save`` writes.
 
         Raises:
             MapError: The file cannot be written.
@@ -87,9 +94,9 @@ class SavedMap:
 
 
 def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistory, float]:
-    """Keyframes, registrations and voxel size (m) of the map of a keyframe file.
+    """Keyframes, registrations and voxel size (m) of a keyframe file.
 
-    Descriptors are stored with 11 bits and points with 24, the rounding is far below their noise.
+    Descriptors are stored with 11 bits and points with 24; the rounding is far below their noise.
 
     Raises:
         MapError: The file is missing, damaged or of a newer version.
@@ -127,7 +134,7 @@ def _check_arrays(data: "Mapping[str, NDArray]") -> None:
     """Check the arrays of a keyframe file.
 
     Raises:
-        ValueError: Their types, shapes or values are not those of keyframes.
+        ValueError: A type, shape or value does not fit keyframes.
     """
     n, total = len(data["counts"]), len(data["points"])
     wanted = {
@@ -148,15 +155,21 @@ def _check_arrays(data: "Mapping[str, NDArray]") -> None:
 
 
 def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:
-    """Rows of all parts (n, width) below each other."""
+    """Rows of all parts (n, width), concatenated."""
     return np.concatenate([np.empty((0, width), dtype), *(part.astype(dtype) for part in parts)])
 
 
 @dataclass(frozen=True, eq=False)
 class PriorMap:
-    """The map of a whole recording, which a second pass registers and labels its frames with: that of the largest
-    submap, the poses (4, 4) of its frames by timestamp, the keyframes of all submaps, and the detector, which holds
-    the remembered frames of the first seconds."""
+    """The map of a first pass, against which a second pass registers and labels its frames.
+
+    Attributes:
+        volume: Map of the largest submap.
+        submap: Its number.
+        Ts_world_camera: Poses (4, 4) of its frames by timestamp.
+        keyframes: Keyframes of all submaps.
+        detector: The dynamic detector, with its state of the first seconds.
+    """
 
     volume: TsdfVolume
     submap: int
