@@ -35,7 +35,7 @@ SETTINGS = {
     "sync_slop": 0.02,
     "autostart": True,
 }
-"""Parameters of the node itself; all others are keys of the configuration. README.md describes them."""
+"""Parameters of the node; all others are keys of the configuration. docs/robot.md describes them."""
 
 
 def message_type(name: str) -> Any:  # noqa: ANN401
@@ -126,7 +126,7 @@ class DudmapNode(LifecycleNode):
     # -- data ----------------------------------------------------------------------------------------------------------
 
     def process(self, depth: Image, color: Image, info: CameraInfo) -> None:
-        """Process a synchronised set of messages and publish what it gave."""
+        """Process a synchronised set of messages and publish the results."""
         assert self.session is not None
         try:
             result = self.session.process(depth, color, info)
@@ -174,17 +174,17 @@ class DudmapNode(LifecycleNode):
         return self.answer(response, lambda: f"saved to {self.session.save(self.setting('save_to')).resolve()}")
 
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Begin a new map with the next images."""
+        """Start a new map with the next images."""
         self.shown = []
         return self.answer(response, lambda: self.session.reset() or "the map is empty")
 
     def localize(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Stop changing the map (true) or go on mapping (false)."""
+        """Stop changing the map (true) or continue mapping (false)."""
         mode = "localising, the map is kept" if request.data else "mapping"
         return self.answer(response, lambda: self.session.set_localize(request.data) or mode)
 
     def end(self) -> None:
-        """Save a map that was not saved, as the node is stopped; a run folder that is there is kept."""
+        """Save an unsaved map when the node is stopped; an existing run folder is kept."""
         try:
             folder = self.session.save_rest(self.setting("save_to")) if self.session is not None else None
             if folder is not None:
@@ -193,7 +193,7 @@ class DudmapNode(LifecycleNode):
             self.get_logger().error(str(error))
 
     def answer(self, response: Any, act: Any) -> Any:  # noqa: ANN401
-        """Fill a response with what an action says, or with the sentence of its error."""
+        """Fill a response with the result text of an action, or with its error."""
         try:
             response.success, response.message = True, act()
         except DudmapError as error:

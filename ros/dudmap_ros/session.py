@@ -1,4 +1,4 @@
-"""A mapping session on ROS messages, without ROS: what the node does with a pair of images, and its services."""
+"""A mapping session on ROS messages, without ROS: processing of image pairs, and the services of the node."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +31,7 @@ def default_parameters() -> dict[str, Any]:
 
 
 def config_of(values: Mapping[str, Any], range_name: str = "room") -> Config:
-    """Configuration of dotted keys. Keys with the default value leave the choice to the preset and the range.
+    """Configuration of dotted keys. Keys with the default value leave the choice to the range.
 
     Raises:
         ConfigError: A value is invalid.
@@ -55,15 +55,15 @@ class Session:
 
     Args:
         config: All parameters.
-        saved_map: Run folder to continue in, None for a new map.
+        saved_map: Run folder to continue, None for a new map.
         localize: Only find the camera in the saved map.
-        watch: Look for changes against the saved map.
-        ignore: Image, white at the pixels that never count; None counts all.
+        watch: Report changes against the saved map.
+        ignore: Image, white at the pixels to ignore; None uses all.
 
     Attributes:
         slam: The system; None before the first pair.
-        watch: Changes against the saved map, None without one or before the first pair.
-        processed, stale: Numbers of processed pairs, and of pairs dropped as older than the one before.
+        watch: Changes against the saved map; None before the first pair or without a saved map.
+        processed, stale: Numbers of processed pairs, and of dropped pairs that were not newer than the previous one.
 
     Raises:
         ConfigError: ``localize`` or ``watch`` without a saved map.
@@ -87,7 +87,7 @@ class Session:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the map; a saved map is loaded anew with the next pair, without one mapping begins again."""
+        """Drop the map; the next pair reloads the saved map, or starts a new one."""
         self.localize = self.localize and self.saved_map is not None
         self.slam: Slam | None = None
         self.watch: ChangeWatch | None = None
@@ -95,7 +95,7 @@ class Session:
         self._last = float("-inf")
 
     def set_localize(self, localize: bool) -> None:
-        """Stop, or go on with, changing the map.
+        """Stop or continue changing the map.
 
         Raises:
             MapError: There is no map to localise in.
@@ -164,7 +164,7 @@ class Session:
         return folder
 
     def save_rest(self, folder: str | Path) -> Path | None:
-        """Save a map that has grown since it was saved as the first of ``folder``, ``folder-2``, ... that is new.
+        """Save a map that has grown since the last save into the first free of ``folder``, ``folder-2``, ...
 
         Raises:
             MapError: A file cannot be written.
@@ -182,6 +182,7 @@ class Session:
         slam = Slam(camera, self.config, live=True, saved_map=saved, ignore=ignored)
         slam.localize = self.localize
         if self.watching:
-            self.watch = ChangeWatch(SavedMap.load(self.saved_map))  # of its own: the run changes the other one
+            # an own copy, because the run changes the other one
+            self.watch = ChangeWatch(SavedMap.load(self.saved_map))
             self.watch.start(slam, None, None)
         return slam

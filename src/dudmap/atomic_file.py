@@ -1,6 +1,6 @@
-"""Files that are either written completely or not at all.
+"""Write files either completely or not at all.
 
-What cannot be written is an ``OSError`` with the name of the file that was asked for.
+An ``OSError`` names the file that cannot be written.
 """
 
 import errno
@@ -28,20 +28,21 @@ __all__ = [
 ]
 
 UNFINISHED = r"\..+\.\d+\.part(\.\w+)?"
-"""Regular expression of the temporary names, under which a process that is killed leaves what it was writing."""
+"""Regular expression of the temporary names under which a killed process leaves unfinished files."""
 
 
 @contextmanager
 def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> Iterator[IO[bytes]]:
-    """Open a binary file that takes the place of ``path`` when the block ends without an error.
+    """Open a binary file that replaces ``path`` when the block ends without an error.
 
-    It is written beside ``path`` under a temporary name, flushed to the disk and renamed, so that a process that is
-    killed leaves the old file, and a power cut leaves the old or the new one. A link at ``path`` is replaced.
+    It is written under a temporary name in the same folder, flushed to the disk and renamed. A killed process leaves
+    the old file, a power cut the old or the new one. A link at ``path`` is replaced.
 
     Args:
         path: The file.
-        sync: Wait until the file and its name are on the disk. Without it a power cut may lose the file, also the old.
-        own: The folder of the file is one that dudmap made itself, and must be no link.
+        sync: Wait until the file and its name are on the disk. Without it a power cut may lose the new and the old
+            file.
+        own: The folder of the file was made by dudmap and must be no link.
     """
     with _unfinished(Path(path), sync, own) as (_, number), open(number, "wb") as file:
         yield file
@@ -49,7 +50,7 @@ def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> It
 
 @contextmanager
 def atomic_path(path: str | Path, *, sync: bool = True) -> Iterator[Path]:
-    """A temporary path with the ending of ``path``, for writers that want a name; see ``atomic_file``."""
+    """Temporary path with the suffix of ``path``, for writers that need a name; see ``atomic_file``."""
     with _unfinished(Path(path), sync, own=False) as (temporary, number):
         os.close(number)
         yield temporary
@@ -73,7 +74,7 @@ def _unfinished(path: Path, sync: bool, own: bool) -> Iterator[tuple[Path, int]]
 
 
 def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
-    """Give a complete file on the same disk its name, as ``atomic_file`` does."""
+    """Rename a complete file on the same disk, as ``atomic_file`` does."""
     if sync:
         bring_to_disk(temporary)
     temporary.replace(path)
@@ -83,10 +84,10 @@ def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
 
 @contextmanager
 def writing(what: object) -> Iterator[None]:
-    """Turn any error of the operating system into one sentence on what cannot be written.
+    """Turn an error of the operating system into one sentence on the target that cannot be written.
 
     Raises:
-        DudmapError: Instead of it.
+        DudmapError: Instead of that error.
     """
     try:
         yield
@@ -110,7 +111,7 @@ def write_image(path: str | Path, image: "NDArray", *, sync: bool = True, own: b
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in UTF-8 as ``atomic_file`` does; what UTF-8 cannot hold, of a file name, becomes an escape."""
+    """Write a UTF-8 text file as ``atomic_file`` does; characters of file names that UTF-8 cannot hold are escaped."""
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 

@@ -36,16 +36,16 @@ class SensorConfig(ConfigSection):
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
     reference_depth: float = Field(default=1.0, ge=0.1, le=10)
-    """Depth at which thresholds of distances are given, metres, and the unit of all lengths that are constants of the
-    program: 1 for rooms. It belongs to the range: ``Config.for_range`` scales it with all other lengths."""
+    """Depth at which distance thresholds are given, metres, and unit of the program's constant lengths: 1 for rooms.
+    ``Config.for_range`` scales it with all other lengths."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
-    """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
-    row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters.
-    Where the timing was estimated, its own standard deviation counts."""
+    """Standard deviation of the time between colour and depth of a pixel, seconds; 0 for synchronous global shutters.
+    The default is the row time of a rolling shutter with 30 ms readout (30 ms / sqrt 12). An estimated timing brings
+    its own standard deviation."""
 
     self_calibration: bool = True
-    """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
-    before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
+    """Calibrate the colour camera against the depth camera during the run, unless a given calibration was estimated.
+    The result repaints the map. It needs the stored frames of loop closing or submaps."""
 
     @property
     def reference_sigma(self) -> float:
@@ -93,10 +93,10 @@ class SimilarityConfig(ConfigSection):
     """Detection of redundant views, which are not fused (thesis section 4.3)."""
 
     enabled: bool = True
-    """Do not fuse frames that show what the map already has; they are still tracked."""
+    """Do not fuse frames whose view the map already contains; they are still tracked."""
     measure: Literal["information", "features"] = "information"
-    """What the map knows of the view by its weights (information), or the SIFT features of the last fused frame that
-    are found again (features; thesis section 4.3)."""
+    """Redundancy test: weights of the map in the view (information), or matched SIFT features of the last fused frame
+    (features; thesis section 4.3)."""
     threshold: float = Field(default=0.84, gt=0, le=1)
     """Share of the view that is known, by either measure, above which it is redundant (thesis section 4.3)."""
     ratio: float = Field(default=0.7, gt=0, lt=1)
@@ -123,12 +123,12 @@ class VolumeConfig(ConfigSection):
     truncation_noise: float = Field(default=3.0, ge=0)
     """Smallest truncation distance in standard deviations of the depth reading; 0 keeps it fixed."""
     take_turns: bool = True
-    """Integrate into a block only every second frame, with double weight, where the noise exceeds the voxel size."""
+    """Integrate into a block only every second frame, with double weight, if the noise exceeds the voxel size."""
     max_weight: int = Field(default=255, ge=1, le=255)
     """Largest weight of the running average (thesis eq. 4.19)."""
     max_readings: int = Field(default=48, ge=1, le=255)
-    """Largest weight to which a reading can raise a voxel, in multiples of its own weight, so that the influence of
-    readings of low weight fades once there are better ones."""
+    """Largest weight to which a measurement can raise a voxel, in multiples of its own weight. Measurements of low
+    weight so lose influence once better ones arrive."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
@@ -140,14 +140,14 @@ class VolumeConfig(ConfigSection):
     free_after: int = Field(default=4, ge=1, le=200)
     """Number of free-space observations after which a block counts as free space."""
     adaptive: bool = False
-    """Smaller voxels where the surface is curved or finely coloured and the sensor resolves it (thesis section 7.1)."""
+    """Halve voxels on surfaces that are curved or finely coloured and that the sensor resolves (thesis section 7.1)."""
     adaptive_levels: int = Field(default=1, ge=1, le=2)
-    """How often the voxel size may be halved: once, or twice (adaptive only)."""
+    """Most halvings of the voxel size: one or two (adaptive only)."""
     adaptive_bend: float = Field(default=0.4, gt=0)
-    """Curvature of the surface from which on voxels are halved, times the voxel size (adaptive only): 0.4 is a radius
-    of two and a half voxels, that of edges and thin things."""
+    """Smallest curvature times voxel size at which voxels are halved (adaptive only): 0.4 is a radius of two and a half
+    voxels, as of edges and thin things."""
     adaptive_texture: float = Field(default=0.6, gt=0)
-    """Bend of the intensities (0..1) between neighbouring voxels from which on they are halved (adaptive only)."""
+    """Smallest bend of the intensities (0..1) between neighbouring voxels at which they are halved (adaptive only)."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":
@@ -177,7 +177,7 @@ class TrackerConfig(ConfigSection):
     color_huber: float = Field(default=0.07, gt=0)
     """Huber threshold of the intensity residual, intensity in [0, 1]."""
     exposure: bool = True
-    """Fit gain and offset of the image intensities to those of the map on the coarsest pyramid level."""
+    """Fit gain and offset between image and map intensities on the coarsest pyramid level."""
     noise_weighting: bool = True
     """Weight each distance residual by the sensor noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 6)
@@ -197,15 +197,15 @@ class TrackerConfig(ConfigSection):
     min_inliers: float = Field(default=0.15, ge=0, le=1)
     """Smallest share of the readings that lie on the map in a tracked frame."""
     max_residual: float = Field(default=4.0, gt=0)
-    """Largest root mean square of the robust distance residual of a tracked frame, in standard deviations sigma(z) of
-    the reading, whether or not the registration weighs by them."""
+    """Largest robust root mean square of the distance residuals of a tracked frame, in standard deviations sigma(z) of
+    a measurement, with or without ``noise_weighting``."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
     min_information: float = Field(default=2.3, ge=0)
-    """Smallest information on a direction of motion, in multiples of what the noise of the gradients alone gives, from
-    which on the registration moves along it in any case. Below, it does so only where map and image have the same
-    texture along it; else it keeps the predicted motion and reports it. Above 2, which an endless tunnel gives where
-    only noise shows the way along it; some corridors with texture at 320x240 give less, too. 0 moves along all."""
+    """Smallest information on a direction of motion with which the registration always moves along it, in multiples of
+    the information from gradient noise alone. Below it, the registration moves only if map and image have the same
+    texture along the direction; otherwise it keeps the predicted motion and reports it. An endless tunnel gives 2 from
+    noise; some textured corridors at 320x240 give less than the limit. 0 always moves."""
     max_speed: float = Field(default=5.0, gt=0)
     """Largest plausible speed of the camera, m/s."""
     max_turn_deg: float = Field(default=360.0, gt=0)
@@ -234,12 +234,12 @@ class DynamicsConfig(ConfigSection):
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; rounded to a halving of the camera image."""
     threshold: float = Field(default=0.07, gt=0)
-    """Distance to the map above which method ``threshold`` labels a reading as dynamic, metres (10 cm / sqrt 2 in the
-    published code of ReFusion); limited to the truncation distance."""
+    """Distance to the map above which method ``threshold`` labels a pixel as dynamic, metres, limited to the truncation
+    distance. ReFusion's published code uses 10 cm / sqrt 2."""
     noise_threshold: float = Field(default=0.03, gt=0)
     """Smallest distance to the static map of a dynamic reading, metres (theta in thesis eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
-    """The same distance in standard deviations of the reading; the larger of the two applies."""
+    """The same distance in standard deviations of the measurement; the larger of the two applies."""
     pieces: bool = True
     """Classify whole surface segments, and remember dynamic ones until they have settled (with regions only)."""
     settle_time: float = Field(default=1.5, gt=0, le=60)
@@ -247,9 +247,9 @@ class DynamicsConfig(ConfigSection):
     max_share: float = Field(default=0.9, gt=0, le=1)
     """Largest share of dynamic readings in a tracked frame; above it the frame is lost."""
     start_seconds: float = Field(default=1.0, ge=0)
-    """Time after the first frame in which moving objects are also detected by ego-motion compensation between images,
-    since the map has no free space yet, seconds. It is extended while this finds objects that the map does not reveal;
-    0 disables it (em only)."""
+    """Time after the first frame in which motion between images, with compensated ego-motion, also detects objects,
+    seconds; the map has no free space yet. It is extended while this finds objects that the map does not reveal; 0
+    disables it (em only)."""
     margin_px: int = Field(default=5, ge=0, le=50)
     """Margin around dynamic regions that is not fused, pixels of an image 640 wide."""
 
@@ -278,7 +278,7 @@ class RelocalizationConfig(ConfigSection):
     min_share: float = Field(default=0.25, ge=0, le=1)
     """Smallest share of RANSAC inliers among the matches with a keyframe."""
     min_on_map: float = Field(default=0.4, ge=0, le=1)
-    """Smallest share of the readings that are static and lie on the map at an accepted pose."""
+    """Smallest share of the measurements that are static and lie on the map at an accepted pose."""
     max_distance: float = Field(default=0.06, gt=0)
     """Largest correction of the feature-based pose by the registration, metres,"""
     max_angle_deg: float = Field(default=3.0, gt=0)
@@ -299,7 +299,8 @@ class LoopsConfig(ConfigSection):
     min_angle_deg: float = Field(default=0.7, ge=0)
     """and below this, degrees, are within the noise and not applied."""
     max_drift: float = Field(default=0.1, gt=0)
-    """Largest plausible drift as a share of the path since the place was last seen; 1 rad of rotation counts as 1 m."""
+    """Largest plausible drift as a share of the path since the last visit to the place; 1 rad of rotation counts as 1
+    m."""
     keep_distance: float = Field(default=0.08, gt=0)
     """A fused frame is stored on disk if it is this far from the last stored one, metres,"""
     keep_angle_deg: float = Field(default=5.0, gt=0)
@@ -309,7 +310,7 @@ class LoopsConfig(ConfigSection):
 
 
 class SubmapsConfig(ConfigSection):
-    """Submaps: a new map is started where the camera is lost and cannot be relocalised."""
+    """Submaps: a camera that is lost and cannot be relocalised starts a new map."""
 
     enabled: bool = True
     """Start a new submap when relocalisation fails, and merge it when a known place is recognised."""
@@ -344,11 +345,11 @@ class Config(ConfigSection):
     """All parameters."""
 
     system: Literal["dudmap", "thesis"] = "dudmap"
-    """System that processes the frames: ``dudmap``, the default, or ``thesis``, the thesis as written, which uses the
-    parameters of the section ``thesis`` alone."""
+    """System that processes the frames: ``dudmap``, or ``thesis``, the thesis as written, which uses only the
+    parameters of the section ``thesis``."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
-    """Where the frames are computed: cpu, cuda, or cuda:1 for the second GPU (extra gpu); auto takes a GPU where one
-    works and ``volume.adaptive`` is off; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""
+    """Device of the computation: cpu, cuda, cuda:1 for the second GPU (extra gpu), or auto. auto takes a working GPU if
+    ``volume.adaptive`` is off. warp-cpu runs the GPU kernels on the CPU, slowly, for tests."""
     sensor: SensorConfig = SensorConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     similarity: SimilarityConfig = SimilarityConfig()
@@ -374,8 +375,7 @@ class Config(ConfigSection):
 
     @classmethod
     def load(cls, path: str | Path, size: float = 1.0) -> "Config":
-        """Configuration of a TOML file; parameters it does not set keep their defaults for a scene of a ``size``, in
-        rooms.
+        """Load a TOML file; other parameters keep their defaults for a scene of ``size`` rooms.
 
         Raises:
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
@@ -390,8 +390,7 @@ class Config(ConfigSection):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], size: float = 1.0) -> "Config":
-        """Configuration of nested dictionaries; parameters they do not set keep their defaults for a scene of a
-        ``size``, in rooms.
+        """Configuration from nested dictionaries; other parameters keep their defaults for a scene of ``size`` rooms.
 
         Raises:
             ConfigError: A key is unknown or a value invalid.
@@ -430,10 +429,10 @@ class Config(ConfigSection):
         return self.from_tree(_merged(self.model_dump(), known))
 
     def check_used(self) -> None:
-        """Refuse parameters that differ from their defaults and that ``system`` does not have.
+        """Refuse changed parameters that ``system`` does not have.
 
         Raises:
-            ConfigError: There is such a parameter; the sentence names it.
+            ConfigError: There is such a parameter; the message names it.
         """
         used, default = self.system == "thesis", Config()
         for key in keys():

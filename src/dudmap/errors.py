@@ -1,17 +1,17 @@
 """Exceptions of dudmap, with one common base class.
 
-A message is one sentence that states what was found, what was expected and how to correct it.
+A message is one sentence that states the finding, the expectation and the remedy.
 """
 
 LARGEST_MESSAGE = 2000
-"""Characters of a message; a damaged file may hold one line of a hundred megabytes, which messages quote."""
+"""Most characters of a message, because messages quote lines of damaged files, which may have a hundred megabytes."""
 
 
 def printable(text: object) -> str:
-    """A text as one line that shows what it says, for terminals, pages and files in UTF-8.
+    """Text as one printable line, for terminals, pages and files in UTF-8.
 
-    Characters that are not printable, such as a line break, a terminal's escape sequence, another direction of writing
-    or a byte that is no UTF-8 in the name of a file, are written as escapes.
+    Unprintable characters are escaped: line breaks, terminal escape sequences, changes of the writing direction, bytes
+    of file names that are no UTF-8.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
@@ -63,7 +63,7 @@ class DeviceError(DudmapError):
 
 
 class InternalError(DudmapError):
-    """A defect of dudmap itself: something happened that it does not foresee, and a report of it was written."""
+    """A defect of dudmap itself; a report of it was written."""
 
 
 class MapError(DudmapError):

@@ -1,11 +1,10 @@
-"""Files from elsewhere: plain files of a bounded size only, without objects, and nothing nested without end.
+"""Read files of unknown origin: only plain files of limited size, without objects, and with limited nesting.
 
-Whoever hands over a recording, a map or a configuration decides what is in these files. All readers of them go through
-this module, so that a pipe does not block, a device does not fill the memory, and a declared size is compared with what
-is there before memory is taken for it.
+Recordings, maps and configurations may come from anybody. All their readers use this module: a pipe does not block, a
+device does not fill the memory, and declared sizes are checked before memory is allocated.
 
-A file that cannot be read, is no plain file or is too large is an ``OSError``. Content that is not as its format says,
-is nested too deeply, or would unpack to too much is a ``ValueError``, or what zipfile and zlib raise (``DAMAGE``).
+A file that cannot be read, is no plain file or is too large raises ``OSError``. Content that violates its format, is
+nested too deeply, or unpacks to too much raises ``ValueError`` or an error of zipfile and zlib (``DAMAGE``).
 """
 
 import codecs
@@ -36,11 +35,11 @@ LARGEST_TEXT = 2**28
 LARGEST_TREE = 2**26
 """Largest JSON file, bytes; transforms.json with 10 000 frames has 5 MB."""
 LARGEST_TOML = 2**20
-"""Largest TOML file, bytes: all parameters with their meanings have 30 kB, and the parser takes 1 s for this size."""
+"""Largest TOML file, bytes: all parameters with their meanings have 30 kB; this size takes 1 s to parse."""
 LARGEST_COUNT = 2**23
-"""Largest number of values of a JSON text: they take less than 1 GB. transforms.json with 10 000 frames has 200 000."""
+"""Largest number of values of a JSON text, less than 1 GB. transforms.json with 10 000 frames has 200 000."""
 DEEPEST = 64
-"""Largest depth of a JSON or TOML tree; those of the formats that are read have 8 levels at most."""
+"""Largest depth of a JSON or TOML tree; known formats have at most 8 levels."""
 LARGEST_FILE = 2**28
 """Largest file that is read as a whole, bytes: an uncompressed image of ``LARGEST_PIXELS``."""
 LARGEST_ARCHIVE = 2**36
@@ -51,17 +50,17 @@ deflate reaches 1000."""
 RATIO_FREE_BYTES = 2**26
 """Unpacked size below which the ratio does not matter."""
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
-"""First bytes of the text that stands for a large file where a repository was cloned without Git LFS."""
+"""First bytes of a pointer file, which replaces a large file if a repository is cloned without Git LFS."""
 LARGEST_POINTER = 1024
-"""Bytes that such a text does not reach (specification of Git LFS)."""
+"""Upper bound of the size of such a pointer, bytes (specification of Git LFS)."""
 SAFE_KINDS = "biufUS"
-"""Kinds of NumPy types that are no objects and hold none: numbers and text."""
+"""Kinds of NumPy types that contain no objects: numbers and text."""
 DAMAGE = (
     ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RecursionError, struct.error,
     zlib.error, lzma.LZMAError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, OSError,
 )  # fmt: skip
-"""What the standard library and NumPy raise where content is not as its format says. ``MemoryError`` is not among them:
-sizes are limited before memory is taken."""
+"""Errors of the standard library and NumPy for content that violates its format. ``MemoryError`` is excluded, because
+sizes are limited before memory is allocated."""
 
 
 def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
@@ -69,7 +68,7 @@ def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
 
     Args:
         path: The file.
-        pointers: Whether a pointer of Git LFS is opened as any text.
+        pointers: Whether a Git LFS pointer is opened like any text.
     """
     try:
         _check_plain(os.stat(path).st_mode, path)
@@ -78,7 +77,7 @@ def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
     except ValueError as error:  # a zero byte or half a surrogate pair in the name
         raise OSError(errno.ENOENT, f"there can be no file of this name ({error})", str(path)) from None
     try:
-        _check_plain(os.fstat(number).st_mode, path)  # not that it was replaced in the meantime
+        _check_plain(os.fstat(number).st_mode, path)  # it may have been replaced in the meantime
         if not pointers and os.fstat(number).st_size < LARGEST_POINTER:
             if os.read(number, len(GIT_LFS)) == GIT_LFS:
                 raise OSError(errno.EINVAL, "it is a Git LFS pointer, not the file itself; run git lfs pull", str(path))
@@ -110,7 +109,8 @@ def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
 
 
 def decode_text(data: bytes) -> str:
-    """Text in UTF-8, or in UTF-16 as its mark or a zero byte in the first character says; the mark is left out."""
+    """Decode UTF-8, or UTF-16 if a byte order mark or a zero byte in the first character indicates it; the mark is
+    removed."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     zeros = data[0:1] == b"\0", data[1:2] == b"\0"
@@ -137,7 +137,7 @@ TOO_DEEP = f"it is nested too deeply, by more than {DEEPEST} levels"
 
 
 def _shallow(tree: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """The tree, if what goes through it by recursion is safe."""
+    """Return the tree if its nesting is safe for recursion."""
     level = [tree]
     for _ in range(DEEPEST):
         parts = (one.values() if isinstance(one, dict) else one for one in level)
@@ -180,10 +180,10 @@ def inflated(packed: bytes, largest: int) -> bytes:
 
 @contextmanager
 def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None) -> Iterator[None]:
-    """Turn what a parser raises for damaged content into one sentence of class ``kind`` about ``what``.
+    """Turn parser errors for damaged content into one sentence of class ``kind`` about ``what``.
 
-    It stands around readers, behind their own checks, for the defects that these do not name. ``errors`` are those
-    that mean damage, by default ``DAMAGE`` and the errors of OpenCV; our own errors pass unchanged.
+    It surrounds readers with their own checks and catches remaining defects. ``errors`` are the classes that mean
+    damage, by default ``DAMAGE`` and the errors of OpenCV; errors of dudmap pass unchanged.
     """
     import cv2
 
@@ -199,12 +199,12 @@ def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception]
 
 
 def foreign(kind: type[DudmapError], what: object) -> AbstractContextManager[None]:
-    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh."""
+    """Like ``damaged``, for packages whose exceptions for damaged content have no common base: rosbags, trimesh."""
     return damaged(kind, what, (Exception,))
 
 
 def describe(error: BaseException) -> str:
-    """An exception of a library in words."""
+    """Text of a library's exception."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, KeyError):
@@ -214,14 +214,14 @@ def describe(error: BaseException) -> str:
 
 @contextmanager
 def open_arrays(path: str | Path) -> "Iterator[Mapping[str, NDArray[Any]]]":
-    """Open a NumPy archive (``.npz``) as mapping of names to arrays of numbers or text, read when asked for."""
+    """Open a NumPy archive (``.npz``) as a mapping of names to arrays of numbers or text, read on access."""
     with open_plain(path) as file, zipfile.ZipFile(file) as archive:
         check_unpacked(archive, os.fstat(file.fileno()).st_size)
         yield _Arrays(archive)
 
 
 def check_unpacked(archive: zipfile.ZipFile, packed: int) -> None:
-    """Check what a ZIP file of ``packed`` bytes says it unpacks to; more than it says is never read."""
+    """Check the declared unpacked size of a ZIP file of ``packed`` bytes; no more than declared is ever read."""
     limit = min(LARGEST_ARCHIVE, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed))
     total = sum(info.file_size for info in archive.infolist())
     if total > limit:
@@ -229,8 +229,6 @@ def check_unpacked(archive: zipfile.ZipFile, packed: int) -> None:
 
 
 class _Arrays(Mapping[str, NDArray[Any]]):
-    """Arrays of a NumPy archive."""
-
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
 

@@ -1,9 +1,9 @@
-"""Folders that dudmap writes: what is opened, made or deleted in them lies in them, and is a plain file or a folder.
+"""Folders that dudmap writes; files in them are opened, made and deleted only as plain files or folders inside them.
 
-A run may go on in a folder that comes from elsewhere, or replace its results. Files are found relative to the open
-folder, so that a link in it leads nowhere, and only names that dudmap itself gives are ever deleted.
+A run may continue in a folder of unknown origin, or replace its results. Files are accessed relative to the open
+folder, so that links in it are not followed. Only names that dudmap gives are ever deleted.
 
-A link, a pipe, or anything else that is no plain file or folder of its own is an ``OSError`` that names it.
+A link, a pipe, or anything else that is no plain file or folder raises an ``OSError`` that names it.
 """
 
 import errno
@@ -24,7 +24,7 @@ class OwnFolder:
 
     Args:
         path: The folder.
-        linked: The folder itself may be a link, as one that the command line names; what is in it may not.
+        linked: The folder itself may be a link, such as one named on the command line; its content may not.
 
     Raises:
         OSError: There is no such folder, or it is something else; the text names it.
@@ -49,34 +49,34 @@ class OwnFolder:
         self.close()
 
     def status(self, name: str) -> os.stat_result | None:
-        """Status of a file itself, not of what it leads to; None if there is none."""
+        """Status of a file itself, without following links; None if it does not exist."""
         try:
             return os.stat(self._place(name), dir_fd=self._at, follow_symlinks=False)
         except FileNotFoundError:
             return None
 
     def open(self, name: str, flags: int) -> int:
-        """Open a plain file that has this one name."""
+        """Open a plain file without other hard links."""
         self.check(name, alone=True)
         number = os.open(self._place(name), flags | NO_LINK, 0o644, dir_fd=self._at)
-        if not stat.S_ISREG(os.fstat(number).st_mode):  # not that it was replaced in the meantime
+        if not stat.S_ISREG(os.fstat(number).st_mode):  # it may have been replaced in the meantime
             os.close(number)
             raise _refused(self.path / name, "is no plain file")
         return number
 
     def create(self, name: str) -> int:
-        """Open a new file for writing; an old one of this name, or a link, makes room for it."""
+        """Create a file for writing; an old file of this name, or a link, is removed."""
         self.remove(name)
         return os.open(self._place(name), os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666, dir_fd=self._at)
 
     def check(self, name: str, *, alone: bool = False) -> None:
-        """Check that a name is free or that of a plain file, which with ``alone`` has no second name."""
+        """Check that a name is free or a plain file, with ``alone`` one without other hard links."""
         status = self.status(name)
         if status is not None and not (stat.S_ISREG(status.st_mode) and (status.st_nlink == 1 or not alone)):
             raise _refused(self.path / name, "is a link or no plain file")
 
     def files(self, form: str) -> list[str]:
-        """Names of the plain files that a regular expression describes wholly."""
+        """Names of the plain files that a regular expression matches fully."""
         names = os.listdir(self.path if self._at is None else self._at)
         found = sorted(name for name in names if re.fullmatch(form, name))
         for name in found:
@@ -106,7 +106,7 @@ def check_outside(path: Path, recording: object, option: str = "--out") -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder in one of ours, unless it is there."""
+    """Make a folder in one of dudmap's folders, unless it exists."""
     path.mkdir(exist_ok=True)
     OwnFolder(path).close()
 

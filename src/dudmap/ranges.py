@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RANGES = {"near": 0.2, "room": 1.0, "far": 2.5}
-"""Size of the scene, in rooms. near: voxels of 2 mm, readings from 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
+"""Size of the scene, in rooms. near: voxels of 2 mm, depth from 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
 SMALLEST, LARGEST = 0.2, 5.0
 """Bounds of the size: voxels of 2 mm and of 5 cm."""
 MEDIAN, FARTHEST = 5.0, 6.0

@@ -86,7 +86,7 @@ def test_a_run_chooses_says_and_obeys(slam, tmp_path):
     near = recording_from(tmp_path / "near", 0.11, 0.22)
     done = call("run", near, "--out", tmp_path / "a", "--quiet")
     assert done.exit_code == 0, done.output
-    assert "voxels of 2 mm, depth from 0.04 to 1.2 m, chosen from the readings" in done.stderr
+    assert "voxels of 2 mm, depth from 0.04 to 1.2 m, chosen from the depth images" in done.stderr
     assert stored(tmp_path / "a").override(["sensor.self_calibration=true"]) == Config.for_range("near")
     metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert metrics["readings"] == {"too_near": 0.0, "too_far": 0.0}
@@ -116,7 +116,7 @@ def test_a_range_that_changes_nothing_is_refused(slam, tmp_path):
 def test_a_camera_chooses_from_its_first_frames(slam, tmp_path):
     far = recording_from(tmp_path / "far", 6.3, 12.5)
     done = call("live", f"replay:{far}", "--out", tmp_path / "a", "--quiet")
-    assert "chosen from the readings" in done.stderr
+    assert "chosen from the depth images" in done.stderr
     assert stored(tmp_path / "a").volume.voxel_size == 0.021
     call("live", f"replay:{far}", "--range", "far", "--out", tmp_path / "b", "--quiet")
     assert stored(tmp_path / "b").preprocess.depth_max == 15

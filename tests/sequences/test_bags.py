@@ -242,7 +242,7 @@ def test_missing_intrinsics_are_asked_for(tmp_path):
     bag.write("/depth/image", bag.image(millimetres(0), "16UC1", START, "c"), START)
     bag.write("/rgb/image", bag.image(color_image(0), "rgb8", START, "c"), START)
     bag.close()
-    with pytest.raises(DatasetError, match=r"no camera_info beside /depth/image; .* --camera fx,fy,cx,cy"):
+    with pytest.raises(DatasetError, match=r"no camera_info for /depth/image; .* --camera fx,fy,cx,cy"):
         open_sequence(tmp_path / "a.bag")
     sequence = open_sequence(tmp_path / "a.bag", "60,60,31.5,23.5,64,48,500")
     assert sequence[0].depth.max() == pytest.approx(millimetres(0).max() / 500)

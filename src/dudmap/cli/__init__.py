@@ -1,8 +1,8 @@
 """The command line: ``dudmap COMMAND``.
 
-Each command is a function of its name in ``dudmap.cli.<command>``, or an application ``app`` there with commands of its
-own. The module is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one
-sentence. Exit codes: 1 error, 2 wrong usage, 3 useless run, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
+A command is the function of its name in ``dudmap.cli.<command>``, or an application ``app`` there with subcommands. Its
+module is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one sentence.
+Exit codes: 1 error, 2 wrong usage, 3 useless run, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
 """
 
 import ctypes
@@ -26,14 +26,14 @@ COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
     "view": "Show a run folder in the browser.",
     "report": "Write one page on a run that opens offline.",
-    "merge": "Join the maps of two or more runs of one place.",
-    "diff": "Say what changed between two visits to a place.",
+    "merge": "Merge the maps of two or more runs of one place.",
+    "diff": "List the changes between two visits to a place.",
     "export": "Write the results of a run for another program.",
     "render": "Render the map along a camera path, as a video or a recording.",
-    "clean": "Write a recording as it would have been without what moves.",
+    "clean": "Write a recording without its dynamic objects.",
     "live": "Run on a camera, or on a recording as if it were one.",
-    "info": "Say what a recording holds, and what looks wrong in it.",
-    "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",
+    "info": "Describe a recording, and warn of suspected faults in it.",
+    "calibrate": "Estimate pose, lens and timing of the colour camera relative to the depth camera.",
     "demo": "Render a short recording with a walking person and run on it.",
     "synth": "Render a synthetic recording with exact ground truth.",
     "evaluate": "Score a trajectory, mesh or masks against the ground truth.",
@@ -41,7 +41,7 @@ COMMANDS = {
     "study": "Run a designed experiment over configurations and analyse it.",
     "config": "Print all parameters with their meanings as TOML.",
     "warmup": "Compile all kernels in advance.",
-    "doctor": "Check the installation and say what to do.",
+    "doctor": "Check the installation and name remedies.",
 }
 """Name and one-line help of every command, in the order of the help page."""
 
@@ -87,7 +87,7 @@ class CommandGroup(TyperGroup):
             fail(not_enough_memory(error))
         except (typer.Exit, typer.Abort, _USAGE):
             raise
-        except Exception as error:  # a defect of ours, whatever it is
+        except Exception as error:  # a defect of dudmap
             if isinstance(error, ImportError) and "failed to map segment" in str(error):
                 fail(not_enough_memory(error))
             from dudmap.app.pipeline.observer import report_crash
@@ -98,7 +98,7 @@ class CommandGroup(TyperGroup):
 
 
 def not_enough_memory(error: MemoryError | ImportError) -> str:
-    """Sentence on what memory was missing for."""
+    """Sentence on an allocation that failed."""
     return f"there is not enough memory ({str(error) or 'none is left'}); give the process more, or less to do"
 
 
@@ -170,8 +170,10 @@ def _show_warning(message: Warning | str, *_: object) -> None:
 
 
 def _share_one_heap() -> None:
-    """Have all threads allocate from one heap (glibc): an image that one thread makes and another frees would leave its
-    room to the first one alone."""
+    """Make all threads allocate from one heap (glibc).
+
+    Otherwise only the allocating thread could reuse the memory of an image that another thread frees.
+    """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         mallopt(M_ARENA_MAX, 1)

@@ -24,8 +24,8 @@ SystemsOption = Annotated[
     str,
     Option(
         "--systems",
-        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of ablation and sensors, "
-        "those that they compare.",
+        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; ablation and sensors have "
+        "systems of their own.",
     ),
 ]
 
@@ -143,7 +143,7 @@ def faults(
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
+    """Inject every fault of a stream into a recording; fail on a wrong tracked pose, or if tracking stays lost."""
     from dudmap.lab.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
 
     config = o.read_config(None, None, assignments)

@@ -18,15 +18,15 @@ def changes(
     out: Annotated[Path, Option(help="Output folder for changes.md, .csv and .json.")] = RUNS / "changes",
     into: Annotated[
         Path | None,
-        Option(help="Put things into, and cut them out of, the second half of a real recording.", metavar="PATH"),
+        Option(help="Insert and remove things in the second half of a real recording.", metavar="PATH"),
     ] = None,
     changes: Annotated[
         str | None,
-        Option(help="These in each pair, as for `synth`; none: nothing changed.", metavar="THING:KIND,..."),
+        Option(help="Changes of each pair, as for `synth`; none: nothing changed.", metavar="THING:KIND,..."),
     ] = None,
     edge: Annotated[float | None, Option(help="Longest edge of boxes, balls and bins.", metavar="M")] = None,
     keep_runs: Annotated[
-        Path | None, Option(help="Keep the run folders of rendered pairs here, and use them again.", metavar="FOLDER")
+        Path | None, Option(help="Keep the run folders of rendered pairs here, and reuse them.", metavar="FOLDER")
     ] = None,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,

@@ -21,7 +21,7 @@ def _announced(what: str) -> None:
 
 
 def gpu(
-    device: Annotated[str, Option(help="Device beside the CPU: auto, cuda or cuda:N.", metavar="DEVICE")] = "auto",
+    device: Annotated[str, Option(help="GPU to compare: auto, cuda or cuda:N.", metavar="DEVICE")] = "auto",
     max_frames: Annotated[int, Option(min=2, help="Number of frames of each run.")] = 120,
     voxels: Annotated[str, Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
     sequence: Annotated[
@@ -32,7 +32,7 @@ def gpu(
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Measure a GPU and the CPU beside it: time by stage and kernel, and memory.
+    """Measure a GPU and the CPU: time by stage and kernel, and memory.
 
     Without a GPU, only the CPU is measured, and the table says why.
     """
@@ -63,7 +63,7 @@ def speed(
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Measure time and memory on this machine, which should be idle otherwise, and what the stages of a frame cost."""
+    """Measure time and memory on this otherwise idle machine, and the time of a frame's stages."""
     from dudmap.lab.benchmark.measure import save
     from dudmap.lab.benchmark.speed import markdown, speed_figures, stages
 

@@ -1,4 +1,4 @@
-"""``dudmap calibrate``: find where and when the colour camera of a recording looks, relative to the depth camera."""
+"""``dudmap calibrate``: estimate pose, lens and timing of the colour camera relative to the depth camera."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,8 +30,8 @@ def calibrate(
 ) -> None:
     """Estimate geometry, lens and timing of the colour camera relative to the depth camera.
 
-    Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
-    the images do not prove stays as the files give it.
+    Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation.
+    Parameters that the images do not prove keep the values of the files.
     """
     from dudmap.app.pipeline.calibration import calibrate_sequence, known_calibration
     from dudmap.app.pipeline.inspection import sample
@@ -62,7 +62,7 @@ def calibrate(
 
 
 def table(given: "Calibration", estimate: "Estimate") -> "Table":
-    """One row per parameter: what was given, what was found, and the standard deviation."""
+    """One row per parameter: change of the given value and standard deviation."""
     import numpy as np
     from rich.table import Table
 
@@ -86,11 +86,11 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
 
 
 def remarks(estimate: "Estimate") -> list[str]:
-    """Sentences on what was decided and why."""
+    """Sentences on the decisions and their reasons."""
     from dudmap.app.pipeline.calibration import findings
 
     return [
         *findings(estimate),
-        f"{estimate.pairs} pairs of images; cost of images that were not used: {-100 * estimate.gain:+.1f} %",
+        f"{estimate.pairs} pairs of images; change of the cost of held-out images: {-100 * estimate.gain:+.1f} %",
         "the scale of the depth is not observable: it scales all motions and the offset alike",
     ]

@@ -1,4 +1,4 @@
-"""``dudmap clean``: a recording as it would have been without what moves."""
+"""``dudmap clean``: write a recording without its dynamic objects."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ def clean(
     parameters: o.ParameterOptions,
     sequence: o.SequenceArgument,
     out: Annotated[
-        Path, Argument(help="New folder for the recording without what moves, in TUM layout.", metavar="OUT")
+        Path, Argument(help="New folder for the recording without dynamic objects, in TUM layout.", metavar="OUT")
     ],
     run: Annotated[
         Path | None,
@@ -29,7 +29,7 @@ def clean(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Replace what moves in every frame of a recording by the map and by what other frames show there."""
+    """Replace dynamic objects in every frame of a recording by the background from the map and from other frames."""
     from dataclasses import asdict
 
     from dudmap.app.pipeline.inspection import sample

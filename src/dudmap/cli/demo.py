@@ -58,11 +58,11 @@ class MostDynamicFrame(RunObserver):
         self._slam: Slam | None = None
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """Keep the system, of whose map a view is rendered."""
+        """Keep the system, whose map is rendered."""
         self._slam = slam
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Keep the frame if its dynamic share exceeds that of all earlier ones."""
+        """Keep the frame if its dynamic share is the largest so far."""
         frame, mask = read.frame, read.true_mask
         if isinstance(frame, FrameError) or isinstance(mask, FrameError) or mask is None or result.state == "lost":
             return

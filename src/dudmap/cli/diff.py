@@ -1,4 +1,4 @@
-"""``dudmap diff``: what changed between two visits to a place."""
+"""``dudmap diff``: list the changes between two visits to a place."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,10 +17,10 @@ def diff(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """List what appeared, disappeared, moved or got other colours between two runs of one place.
+    """List things that appeared, disappeared, moved or got other colours between two runs of one place.
 
-    Writes changes.json, changes/<id>.ply and report.html. Something changed where one visit has a surface and the other
-    saw free space, beyond noise and alignment; what only one visit saw is unknown.
+    Writes changes.json, changes/<id>.ply and report.html. A surface of one visit is a change if the other visit saw
+    free space there, beyond noise and alignment. A surface that only one visit saw is unknown.
     """
     from dudmap.fleet.diff import diff_runs, summary
 

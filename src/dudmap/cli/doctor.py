@@ -12,7 +12,7 @@ MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", 
 
 
 def doctor(as_json: o.JsonOption = False) -> None:
-    """Check the installation and say what to do: versions, processor, threads, GPU, caches, extras, port of the page.
+    """Check the installation and name remedies: versions, processor, threads, GPU, caches, extras, port of the page.
 
     Ends with 1 if something stops the program. Notes only limit a part of it.
     """

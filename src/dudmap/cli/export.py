@@ -15,7 +15,7 @@ _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS
 
 def export(
     run: o.RunArgument,
-    out: Annotated[Path, Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],
+    out: Annotated[Path, Option(help=f"File to write; its suffix or name selects the format. {_NAMES}.")],
     max_triangles: Annotated[
         int | None, Option(min=4, help="Decimate the mesh to so many triangles.", metavar="N")
     ] = None,
@@ -37,7 +37,7 @@ def export(
         Option(help="The recording of the run, for images and masks; default: the one it names.", metavar="SEQUENCE"),
     ] = None,
     camera: o.CameraOption = None,
-    every: Annotated[int, Option(min=1, help="Every so many frames of the recording.", metavar="N")] = 1,
+    every: Annotated[int, Option(min=1, help="Use every N-th frame of the recording.", metavar="N")] = 1,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:

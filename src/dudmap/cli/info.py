@@ -1,4 +1,4 @@
-"""``dudmap info``: say what a recording holds, and what looks wrong in it."""
+"""``dudmap info``: describe a recording and its suspected faults."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 SHOWN_GAPS = 5
-"""Number of gaps in the times that are printed one by one."""
+"""Most gaps in the times that are printed one by one."""
 
 
 def info(
@@ -23,10 +23,9 @@ def info(
     sheet: Annotated[Path | None, Option(help="Write a contact sheet (PNG) of twelve frames.", metavar="FILE")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
+    """Describe a recording: format, frames, rates, both cameras, depth, ground truth, gaps.
 
-    Warnings name what looks wrong: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are
-    read.
+    Warn of suspected faults: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are read.
     """
     from dataclasses import asdict
 
@@ -44,8 +43,8 @@ def info(
     found = inspect(recording, frames, unreadable)
     found.repeats = repeats(recording)
     if (magnification := color_magnification(recording)) is not None:
-        said = f"the colour camera is not that given, or colours are not registered: {unregistered(magnification)}"
-        found.warnings.append(f"{said}; dudmap run calibrates it, where --camera is the camera of the depth")
+        said = f"the colour camera is not the given one, or colours are not registered: {unregistered(magnification)}"
+        found.warnings.append(f"{said}; dudmap run calibrates it, if --camera is the camera of the depth")
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:
@@ -63,7 +62,7 @@ def info(
 
 
 def rows(found: "Inspection") -> list[tuple[str, str]]:
-    """Names and values of what was found, as text."""
+    """Names and values of a description, as text."""
     color = found.color_rate
     rates = [] if found.rate is None else [f"{found.rate:.4g} Hz depth"] + ([f"{color:.4g} Hz colour"] if color else [])
     registered = found.T_color_depth is None

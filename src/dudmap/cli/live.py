@@ -38,7 +38,7 @@ def live(
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene while a camera moves; Ctrl-C ends and writes the results.
 
-    Frames wait for at most 0.1 s; those for which there is no time are counted as dropped, but recorded with --record.
+    Frames wait for at most 0.1 s; later ones are dropped and counted, but recorded with --record.
     """
     from dudmap.app.pipeline.run import PREVIEW, run
     from dudmap.core.geometry.calibration import Calibration

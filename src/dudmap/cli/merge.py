@@ -1,4 +1,4 @@
-"""``dudmap merge``: join the maps of two or more runs of one place."""
+"""``dudmap merge``: merge the maps of two or more runs of one place."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ def merge(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Join maps whose views overlap, and refuse where geometry or colour disagree.
+    """Merge maps whose views overlap; refuse maps whose geometry or colours disagree.
 
     Two runs become a run folder: map.npz, keyframes.npz, mesh.ply, config.toml, merge.json and the trajectories of both
     in the world frame of the first. More runs become a world: map/ (parts of the map), tileset.json and tiles/ (3D

@@ -1,6 +1,6 @@
-"""Options that several commands share, and the values that are written as text in them.
+"""Options that several commands share, and the parsing of their values.
 
-A text that cannot be understood is a ``ConfigError``.
+A value that cannot be parsed raises a ``ConfigError``.
 """
 
 import inspect
@@ -33,18 +33,17 @@ GROUPS = {
     "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
     "Advanced": "--system --config --range --set --device --jobs --resume --checkpoint-every --help",
 }
-"""Options by the group of the help pages that they stand in; those of a single command stand before them."""
+"""Shared options by their group in the help pages; options of a single command come before all groups."""
 
 METAVARS = {
     "--out": "PATH", "--max-frames": "N", "--jobs": "N", "--seeds": "N", "--count": "N", "--only": "NAMES",
     "--systems": "NAMES", "--width": "PIXELS", "--max-runs": "N",
 }  # fmt: skip
-"""What stands in the help pages for the value of options that commands explain in their own words."""
+"""Placeholder values in the help pages for options whose help text differs between commands."""
 
 
 def arranged(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-    """The command with its options in ``GROUPS``, and its help wrapped at the width of the terminal and not where the
-    source wraps its docstring."""
+    """Sort the options of a command into ``GROUPS``, and join the lines of its help, so that the terminal wraps it."""
     group_of = {name: group for group, names in GROUPS.items() for name in names.split()}
     order = list(group_of)
     command.help = "\n\n".join(" ".join(part.split()) for part in (command.help or "").split("\n\n"))
@@ -59,19 +58,19 @@ def arranged(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved bet
 
 
 def system_names(incomplete: str) -> list[str]:
-    """Systems that begin so, for the shell."""
+    """Shell completion of system names."""
     return [name for name in ("dudmap", "thesis") if name.startswith(incomplete)]
 
 
 def parameter_names(incomplete: str) -> list[str]:
-    """Parameters that begin so, with the sign that follows, for the shell."""
+    """Shell completion of parameters, with the equals sign."""
     from dudmap.config import keys
 
     return [f"{key}=" for key in keys() if key.startswith(incomplete)]
 
 
 def camera_names(incomplete: str) -> list[str]:
-    """Kinds of cameras that begin so, for the shell."""
+    """Shell completion of camera kinds."""
     from dudmap.io.cameras import CAMERAS
 
     return [name for name in CAMERAS if name.startswith(incomplete)]
@@ -90,13 +89,13 @@ FramesOption = Annotated[int, Option("--max-frames", min=1, help="Number of fram
 PassesOption = Annotated[
     int, Option(min=1, max=2, help="2: second pass with the map of the first; removes ghosts.", metavar="N")
 ]
-SeedOption = Annotated[int, Option(min=0, help="Seed of all that is random.", metavar="N")]
+SeedOption = Annotated[int, Option(min=0, help="Seed of the random numbers.", metavar="N")]
 SizeOption = Annotated[str, Option(help="Image size in pixels.", metavar="WxH")]
 
 SystemOption = Annotated[
     str | None,
     Option(
-        help="System that processes the frames: dudmap, or thesis as its chapter 4 describes it.",
+        help="System that processes the frames: dudmap, or thesis (chapter 4 of the thesis).",
         metavar="NAME",
         autocompletion=system_names,
     ),
@@ -116,7 +115,7 @@ JobsOption = Annotated[
 
 IgnoreOption = Annotated[
     Path | None,
-    Option(help="Image, white at pixels that never count, such as a robot's arm in view.", metavar="MASK.png"),
+    Option(help="Image, white at pixels to ignore, such as a robot's arm in view.", metavar="MASK.png"),
 ]
 SaveMasksOption = Annotated[bool, Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")]
 HostOption = Annotated[
@@ -133,7 +132,7 @@ TokenOption = Annotated[
 UpOption = Annotated[
     str | None,
     Option(
-        help="Direction against gravity in the world of the run, by default measured, else its floor's.",
+        help="Direction against gravity in the world of the run; default: measured, else normal to the floor.",
         metavar="X,Y,Z",
     ),
 ]
@@ -141,11 +140,11 @@ UpOption = Annotated[
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Options that say how a recording is read, as far as its files do not."""
+    """Options for reading a recording whose files are ambiguous."""
 
     camera: CameraOption = None
     fps: Annotated[
-        float | None, Option(help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ")
+        float | None, Option(help="Frames per second of frames without times; default: 30.", metavar="HZ")
     ] = None
     depth_unit: Annotated[
         float | None, Option(help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES")
@@ -159,13 +158,13 @@ class ReadingOptions:
     topics: Annotated[
         str | None,
         Option(
-            help="Of a bag: color=, depth=, color_info=, depth_info= and world= (the frame), separated by commas.",
+            help="Topics of a bag: color=, depth=, color_info=, depth_info= and world= (frame), comma-separated.",
             metavar="KEY=TOPIC",
         ),
     ] = None
 
     def open(self, path: Path) -> "Recording":
-        """The recording."""
+        """Open the recording."""
         from dudmap.io.sequences import open_sequence
 
         return open_sequence(
@@ -175,7 +174,7 @@ class ReadingOptions:
 
 @dataclass(frozen=True)
 class ParameterOptions:
-    """Options that give the parameters."""
+    """Options for the parameters."""
 
     config: Annotated[Path | None, Option(help="TOML file of parameters.", metavar="FILE")] = None
     system: SystemOption = None
@@ -183,14 +182,14 @@ class ParameterOptions:
         str | None,
         Option(
             help="Voxels, depth range and all other lengths: near (0.1 to 0.5 m), room or far (6 to 15 m); default: "
-            "chosen from the first readings.",
+            "chosen from the depth images.",
             metavar="NAME",
         ),
     ] = None
     assignments: SetOption = None
 
     def read(self, *more: str, seen: "Iterable[Frame]" = ()) -> "Config":
-        """The parameters, some of them set by ``more``, for ``--range`` or else for the range of the frames ``seen``.
+        """Read the parameters, with assignments ``more``, for ``--range`` or else the range of the frames ``seen``.
 
         Lengths that ``--config`` or ``--set`` give are not scaled.
         """
@@ -210,7 +209,7 @@ class ParameterOptions:
 
 @dataclass(frozen=True)
 class WatchingOptions:
-    """Options on how a run is watched and recorded."""
+    """Options for viewers and logs of a run."""
 
     report: Annotated[
         bool, Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
@@ -229,11 +228,11 @@ class WatchingOptions:
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Options on the map that a run goes on in, and where its map is kept."""
+    """Options for the map that a run continues, and for its memory and device."""
 
     saved: Annotated[
         Path | None,
-        Option("--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"),
+        Option("--map", help="Run folder of an earlier run: continue its map in its world frame.", metavar="RUN"),
     ] = None
     localize: Annotated[
         bool, Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
@@ -244,14 +243,12 @@ class MapOptions:
     ] = None
     device: Annotated[
         str | None,
-        Option(
-            help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU.", metavar="DEVICE"
-        ),
+        Option(help="cpu, cuda or cuda:N (extra gpu); default auto: a working GPU, else the CPU.", metavar="DEVICE"),
     ] = None
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with single options in place of its arguments that are dataclasses of options."""
+    """Replace arguments of a command that are dataclasses of options by single options."""
     signature = inspect.signature(command)
     annotations: dict[str, Any] = {name: found.annotation for name, found in signature.parameters.items()}
     groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
@@ -272,7 +269,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def numbers(text: str, count: int | None, option: str) -> list[float]:
-    """Numbers of an option, separated by commas; any count of them for None."""
+    """Parse comma-separated numbers of an option; ``count`` None allows any number."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:
@@ -284,7 +281,7 @@ def numbers(text: str, count: int | None, option: str) -> list[float]:
 
 
 def direction(text: str | None) -> tuple[float, float, float] | None:
-    """Direction of ``--up``."""
+    """Parse ``--up``."""
     if text is None:
         return None
     x, y, z = numbers(text, 3, "--up")
@@ -292,7 +289,7 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
 
 
 def image_size(text: str) -> tuple[int, int]:
-    """Width and height of ``--size``."""
+    """Parse width and height of ``--size``."""
     match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
     if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
         raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
@@ -300,7 +297,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def memory_size(text: str | None) -> int | None:
-    """Number of bytes of a text such as 1GB or 800MB."""
+    """Parse a number of bytes such as 1GB or 800MB."""
     from pydantic import ByteSize, TypeAdapter, ValidationError
 
     if text is None:

@@ -1,4 +1,4 @@
-"""What commands have in common: the answer on stdout, as text or as JSON, progress, and groups of commands."""
+"""Shared parts of commands: the answer on stdout, as text or as JSON, and groups of commands."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,10 +11,10 @@ from dudmap.app.terminal import say
 
 
 class DefaultGroup(TyperGroup):
-    """Command group whose first command is meant where none is named: ``dudmap evaluate RUN``."""
+    """Command group whose first command is the default: ``dudmap evaluate RUN``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-        """Insert the first command where the arguments name none."""
+        """Insert the first command if the arguments name none."""
         if args and args[0] not in self.commands and args[0] != "--help":
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
@@ -27,7 +27,7 @@ class DefaultGroup(TyperGroup):
 
 
 def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False, out: Path | None = None) -> None:
-    """Print the result of a command, and where it is written, to stdout: as one JSON object, as text, or not at all."""
+    """Print a command's result and output folder to stdout: as one JSON object, as text, or not at all."""
     if out is not None:
         tree, text = {**tree, "out": out}, f"{text}\nwritten to {out}"
     if as_json:
@@ -49,7 +49,7 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
     """Print the metrics of a run to stdout: as one JSON object, as a table, or not at all.
 
     Raises:
-        typer.Exit: The run is of no use, which the last line on stderr says; the code is ``USELESS``.
+        typer.Exit: The run is of no use, as the last line on stderr states; the code is ``USELESS``.
     """
     from dudmap.cli import USELESS, fail
 

@@ -1,4 +1,4 @@
-"""``dudmap render``: the map of a run seen along a trajectory."""
+"""``dudmap render``: render the map of a run along a trajectory."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ def render(
     trajectory: Annotated[
         Path | None, Option(help="Camera poses (TUM or EuRoC), in the world of the run.", metavar="FILE")
     ] = None,
-    orbit: Annotated[bool, Option("--orbit", help="A camera that circles about the whole map.")] = False,
+    orbit: Annotated[bool, Option("--orbit", help="Circle the camera around the whole map.")] = False,
     sweep: Annotated[
         float, Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
@@ -28,7 +28,7 @@ def render(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Render the map as a camera would see it: a picture, a video, or a recording without anything that moves.
+    """Render the map as a picture, a video, or a recording of the static scene.
 
     A picture shows the first pose of the trajectory, or without one the whole map.
     """

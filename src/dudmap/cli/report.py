@@ -1,4 +1,4 @@
-"""``dudmap report``: one page on a run that needs nothing but a browser."""
+"""``dudmap report``: one offline page on a run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ def report(
     out: Annotated[Path | None, Option(help="HTML file; default: report.html in the run folder.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.
+    """Write report.html: map and trajectory in 3D, images, masks, plots, metrics, configuration, lost frames.
 
     The page is one file and loads nothing, so that it can be sent by mail and opened offline.
     """

@@ -27,7 +27,7 @@ def run(
     watching: o.WatchingOptions,
     sequence: Annotated[
         Path | None,
-        Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.", metavar="SEQUENCE"),
+        Argument(help="Recording: folder, file or archive; `dudmap info` describes it.", metavar="SEQUENCE"),
     ] = None,
     masks: Annotated[
         Path | None,
@@ -36,18 +36,16 @@ def run(
     poses: Annotated[
         str | None,
         Option(
-            help="Known poses of the frames, with which they are fused without registration: a file (TUM, EuRoC, KITTI "
-            "or 4x4), a folder with one 4x4 file per frame, or 'recording' for those that the recording brings.",
+            help="Fuse the frames at known poses, without registration: a file (TUM, EuRoC, KITTI or 4x4), a folder "
+            "with one 4x4 file per frame, or 'recording' for the recording's own poses.",
             metavar="FILE|recording",
         ),
     ] = None,
-    refine: Annotated[
-        bool, Option("--refine", help="Register from --poses on, in place of constant velocity; they may drift.")
-    ] = False,
+    refine: Annotated[bool, Option("--refine", help="Start the registration from --poses, which may drift.")] = False,
     poses_as: Annotated[
         str | None,
         Option(
-            help="How --poses is written, if not camera-to-world, x right, y down, z forward: tum, euroc, kitti, "
+            help="Convention of --poses, if not camera-to-world, x right, y down, z forward: tum, euroc, kitti, "
             "world-to-camera, opengl, ros, wxyz, millimetres.",
             metavar="NAMES",
         ),
@@ -59,28 +57,28 @@ def run(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     watch: Annotated[
-        bool, Option("--watch", help="Report what changed against --map as soon as it is certain (changes.jsonl).")
+        bool, Option("--watch", help="Report changes against --map during the run (changes.jsonl).")
     ] = False,
     passes: o.PassesOption = 1,
     calibration: Annotated[
         str,
         Option(
-            help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while "
-            "it runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
+            help="Calibration of the colour camera: auto estimates it from the first ten seconds (during a live "
+            "replay); given takes the recording's; or a calibration.toml of another run or of calibrate.",
             metavar="auto|given|FILE",
         ),
     ] = "auto",
     live: Annotated[
-        bool, Option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
+        bool, Option("--live", help="Replay in real time; frames are dropped if processing is too slow.")
     ] = False,
     resume: Annotated[
         Path | None,
-        Option(help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"),
+        Option(help="Continue the interrupted run in this folder; alone or with --device.", metavar="RUN"),
     ] = None,
     checkpoint_every: Annotated[
         float | None,
         Option(
-            help="Seconds from one checkpoint to the next; 0 for none. Default: as often as takes 2 % of the time.",
+            help="Seconds between checkpoints; 0 for none. Default: as often as 2 % of the time allows.",
             min=0,
             metavar="SECONDS",
         ),
@@ -102,13 +100,13 @@ def run(
 
     if resume is not None:
         if sequence is not None or out is not None:
-            raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
+            raise typer.BadParameter("--resume continues a run with its own options; leave out the recording and --out")
         with observers(replace(watching, report=False)) as watchers:
             done = resume_run(resume, device=mapped.device, progress=not quiet, observers=watchers)
             print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
-        raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
+        raise typer.BadParameter("name a recording, or a run folder to continue (--resume RUN)")
     checked_options(has_poses=poses is not None, refine=refine, saved_map=mapped.saved is not None)
     config, saved_map = run_parameters(parameters, mapped, out)
     recording = reading.open(sequence)
@@ -149,7 +147,7 @@ def run(
 def run_parameters(
     parameters: o.ParameterOptions, mapped: o.MapOptions, out: Path | None
 ) -> "tuple[Config, SavedMap | None]":
-    """Configuration of a run, by default that of the run whose map it goes on in, and this map."""
+    """Configuration and saved map of a run; the default configuration is the saved map's."""
     from dudmap.core.backends.device import resolve
     from dudmap.core.places.saved_map import SavedMap
 
@@ -169,10 +167,10 @@ def run_parameters(
 def for_range(
     config: "Config", parameters: o.ParameterOptions, mapped: o.MapOptions, frames: "list[Frame]"
 ) -> "Config":
-    """The configuration for the given range, or for the range in some frames; prints a chosen one."""
+    """Configuration for the given range, or for the range of some frames; prints a chosen range."""
     chosen = _config(parameters, mapped, frames)
     if chosen != config:
-        say(f"{chosen.range_text}, chosen from the readings; --range room keeps those of a room", err=True)
+        say(f"{chosen.range_text}, chosen from the depth images; --range room keeps the defaults of a room", err=True)
     return chosen
 
 

@@ -1,4 +1,4 @@
-"""``dudmap study``: designed experiments over configurations, the thesis' chapter 6, and a search that is judged."""
+"""``dudmap study``: designed experiments over configurations, the thesis' chapter 6, and a validated search."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -29,9 +29,9 @@ app = typer.Typer(
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """Options of all studies: where the results lie, and what does the runs."""
+    """Options of all studies: results folder and execution of the runs."""
 
-    out: Annotated[Path | None, Option("--out", help="Study folder; an interrupted study in it goes on.")] = None
+    out: Annotated[Path | None, Option("--out", help="Study folder; an interrupted study in it continues.")] = None
     jobs: Annotated[int, Option("--jobs", min=0, help="Runs at a time; 0: one per core.", metavar="N")] = 0
     max_runs: Annotated[int, Option("--max-runs", min=1, help="Refuse a design with more runs.")] = 1000
     as_json: o.JsonOption = False
@@ -45,7 +45,7 @@ class SearchOptions:
             return conduct(runs, out, self.jobs or machine()["cores_usable"], keep=keep, progress=progress)
 
     def answer(self, outcome: str, out: Path) -> None:
-        """Print the outcome, and where the study lies."""
+        """Print the outcome and the study folder."""
         answer({"outcome": outcome}, outcome, as_json=self.as_json, out=out)
 
 
@@ -105,7 +105,7 @@ def tune(
     options: SearchOptions,
     design: Annotated[Path, Argument(help="Design file with a second set of recordings (judge).")],
 ) -> None:
-    """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
+    """Search for a configuration on the recordings of a design file, and judge it on other recordings."""
     from dudmap.lab.study.plan import load_plan
     from dudmap.lab.study.tune import run_tune
 

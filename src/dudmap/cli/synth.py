@@ -33,9 +33,7 @@ def synth(
     coverage: Annotated[
         float | None, Option(help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE")
     ] = None,
-    start_dynamic: Annotated[
-        bool, Option("--start-dynamic", help="Movers are in view from the first frame on.")
-    ] = False,
+    start_dynamic: Annotated[bool, Option("--start-dynamic", help="Movers are in view in the first frame.")] = False,
     situation: Annotated[
         str | None, Option(help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away.")
     ] = None,
@@ -77,7 +75,7 @@ def synth(
         Option(
             metavar="THING:KIND,...",
             help="box, ball, bin, chair or shelf :moved, :appeared or :disappeared, door:opened, poster:recoloured; or "
-            "none. With --movers people these walk through the second visit.",
+            "none. With --movers people, these people walk through the second visit.",
         ),
     ] = "none",
     overwrite: Annotated[bool, Option("--overwrite", help="Write into a folder that is not empty.")] = False,
@@ -87,8 +85,8 @@ def synth(
     """Render a synthetic recording with exact ground truth.
 
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
-    surface_observed.ply, scene.json and sensor_truth.json. With --visits 2 these are in visit-1 and visit-2, beside
-    changes.json: what each visit could see of the changes.
+    surface_observed.ply, scene.json and sensor_truth.json. With --visits 2 these are in visit-1 and visit-2, and
+    changes.json lists the changes and their visible surface in each visit.
     """
     from dudmap.lab import synthetic
     from dudmap.lab.synthetic.faults import parse_faults

@@ -1,4 +1,4 @@
-"""``dudmap view``: a run folder in the browser. Also what ``dudmap run`` and ``demo`` need to be watched."""
+"""``dudmap view``: a run folder in the browser; also the observers of ``dudmap run`` and ``demo``."""
 
 import sys
 import time
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def view(
     run: o.RunArgument, host: o.HostOption = "127.0.0.1", port: o.PortOption = 8080, token: o.TokenOption = None
 ) -> None:
-    """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
+    """Show a run folder in the browser until ctrl-C: map, camera, moving objects, images, plots (extra view)."""
     from dudmap.app.viewing.live_view import open_run
 
     window = open_run(run, host, port, token)
@@ -32,10 +32,10 @@ def view(
 
 @contextmanager
 def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
-    """Observers of a run as wanted.
+    """Yield the wanted observers of a run.
 
-    An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
-    until ctrl-C, unless nobody sits at the terminal.
+    An unforeseen error becomes one sentence and a report in the run folder. A page stays open after the run until
+    ctrl-C, if the input is a terminal.
     """
     from dudmap.app.pipeline.observer import EventLog, report_crash
 
@@ -65,7 +65,7 @@ def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
             yield tuple(watching)
         except (DudmapError, OSError, MemoryError, typer.Exit):
             raise
-        except Exception as error:  # a defect of ours, whatever it is
+        except Exception as error:  # a defect of dudmap
             raise report_crash(error, events.out or Path.cwd(), events.recent) from error
         if wanted.view and sys.stdin.isatty() and not interruption.must_end():
             say("the page stays open; ctrl-C ends it", err=True)

@@ -9,7 +9,7 @@ from dudmap.cli.output import answer
 def warmup(quiet: o.QuietOption = False, as_json: o.JsonOption = False) -> None:
     """Compile all kernels in advance.
 
-    Processes a few small images with every part of the system, in two processes where there are two cores; the compiled
+    Processes a few small images with every part of the system, in two processes on two or more cores. The compiled
     kernels are cached on disk.
     """
     from contextlib import nullcontext

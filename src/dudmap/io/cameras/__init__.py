@@ -25,19 +25,19 @@ CAMERAS = {
     "iphone": "drivers:IPhoneCamera",
     "replay": "replay:ReplayCamera",
 }
-"""Module and class of every camera by its name; without a name the first of them that is connected is taken."""
+"""Module and class of every camera by name; without a name the first connected camera is used."""
 MAX_WAIT = 0.1
-"""Time for which a frame may wait for its processing, seconds: at 30 Hz one that takes three times as long as usual
-delays the next ones and drops none, and nothing is processed that is much older."""
+"""Longest time for which a frame may wait, seconds. At 30 Hz, one frame of triple duration delays the next ones and
+drops none."""
 
 
 class CameraFrame(NamedTuple):
     """One frame of a camera.
 
     Attributes:
-        number: Number of the frame in the stream; a gap tells that the camera or its driver lost frames.
-        frame: The frame, or why it cannot be read.
-        time: When it arrived, seconds of ``time.perf_counter``.
+        number: Number of the frame in the stream; a gap means that the camera or its driver lost frames.
+        frame: The frame, or the error of reading it.
+        time: Time of arrival, seconds of ``time.perf_counter``.
     """
 
     number: int
@@ -53,8 +53,8 @@ class LiveCamera(ABC):
         camera: Intrinsics of the depth images.
         calibration: Of the colour camera; None for colour that is registered to depth.
         ground_truth: True poses; a camera knows none.
-        length: Number of frames in the stream, None where it has no end.
-        timed: Whether the times of the frames are those of a clock.
+        length: Number of frames in the stream, None for an endless one.
+        timed: Whether frame times come from a clock.
     """
 
     name: str
@@ -82,8 +82,10 @@ class LiveCamera(ABC):
         return None
 
     def preview(self, count: int) -> "list[Frame]":
-        """Some frames before the stream begins, with which the kernels are loaded; fewer if the stream ends. Later
-        calls return the frames of the first one."""
+        """Some frames before the stream begins, to load the kernels; fewer if the stream ends.
+
+        Later calls return the frames of the first call.
+        """
         if self._previewed is None:
             self._previewed = []
             while len(self._previewed) < count and (arrived := self.read()) is not None:
@@ -93,7 +95,7 @@ class LiveCamera(ABC):
 
 
 def open_camera(text: str | None = None) -> LiveCamera:
-    """Open a camera by ``name`` or ``name:argument``; None takes the first that is connected.
+    """Open a camera by ``name`` or ``name:argument``; None takes the first connected one.
 
     Raises:
         CameraError: There is no such name, no such camera is connected, or its driver is missing.
@@ -122,7 +124,7 @@ def _first_connected() -> LiveCamera:
 
 
 def driver(module: str, extra_name: str) -> Any:  # noqa: ANN401 - an optional package
-    """The module of a driver.
+    """Import the module of a driver.
 
     Raises:
         MissingExtraError: It is not installed, or a system library that it needs is missing.

@@ -1,7 +1,7 @@
 """Cameras by the packages of their makers: RealSense, OAK, Orbbec, and iPhones by Record3D.
 
-Constructors raise a ``CameraError`` where no camera is connected or it does not start, and a ``MissingExtraError``
-where the package is missing.
+Constructors raise a ``CameraError`` if no camera is connected or it does not start, and a ``MissingExtraError`` if the
+package is missing.
 """
 
 import time
@@ -23,19 +23,19 @@ from dudmap.io.cameras import CameraFrame, LiveCamera, driver
 from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 WIDTH, HEIGHT, RATE = 640, 480, 30
-"""Mode of both streams of a RealSense camera, which all of the D400 and L500 series have."""
+"""Mode of both streams of a RealSense camera, supported by all of the D400 and L500 series."""
 OAK_SIZE = (640, 400)
 """Size of all images of an OAK: the mono cameras halved, in the aspect ratio of all OAK cameras."""
 PATIENCE_MS = 200
-"""Time after which it is looked whether the camera was closed or a recording has ended, milliseconds."""
+"""Interval of checks for a closed camera or the end of a recording, milliseconds."""
 LONGEST_SILENCE = 5.0
-"""Time without frames after which a camera counts as lost, seconds; the first frame takes up to 2 s."""
+"""Time without frames after which a camera is lost, seconds; the first frame takes up to 2 s."""
 FRONT_CAMERA = 0
 """Type of device of the front camera of an iPhone, whose images Record3D sends mirrored."""
 
 
 class _PolledCamera(LiveCamera):
-    """A camera whose driver is asked for frames again and again; each image has a lens, which is removed."""
+    """A camera whose driver is polled for frames; the lens distortion of each image is removed."""
 
     kind = ""
     _lenses: tuple[Lens, Lens]
@@ -131,7 +131,7 @@ class RealSenseCamera(_PolledCamera):
         return super().read()
 
     def preview(self, count: int) -> list[Frame]:
-        """Some frames; a recording goes on when the next is read, not while the kernels are loaded."""
+        """Some frames; a recording pauses while the kernels are loaded."""
         frames = super().preview(count)
         self._pause()
         return frames
@@ -170,7 +170,7 @@ class RealSenseCamera(_PolledCamera):
 class OrbbecCamera(_PolledCamera):
     """An Orbbec camera by pyorbbecsdk2; the Femto series has the sensors of the Azure Kinect.
 
-    Depth and colour are not registered, the factory calibration tells their places.
+    Depth and colour are not registered; the factory calibration gives their poses.
     """
 
     kind = "Orbbec"
@@ -217,7 +217,7 @@ class OrbbecCamera(_PolledCamera):
 
 
 def _rational_lens(own: Any, lens: Any) -> Lens:  # noqa: ANN401
-    """Lens of the factory intrinsics of an Orbbec, whose eight coefficients are those of the rational model."""
+    """Lens of an Orbbec's factory intrinsics: eight coefficients of the rational model."""
     camera = Camera(own.fx, own.fy, own.cx, own.cy, own.width, own.height)
     coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
     return Lens.of(camera, RATIONAL, coefficients)
@@ -287,7 +287,7 @@ class OakCamera(LiveCamera):
 class IPhoneCamera(LiveCamera):
     """An iPhone or iPad that streams by USB with Record3D (package record3d, LGPL-2.1: only optional).
 
-    Its depth images are smaller and seen from the same place. Record3D sends no times, so a frame has that of its
+    Its depth images are smaller and seen from the same place. Record3D sends no times; frames have their time of
     arrival.
     """
 

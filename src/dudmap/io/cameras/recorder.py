@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
 
 AHEAD = 60
-"""Frames that wait for the disk at most: two seconds of a camera, about 130 MB at 640x480."""
+"""Most frames that wait for the disk: two seconds of a camera, about 130 MB at 640x480."""
 UNSAVED = 0.5
-"""Seconds after which a frame is on the disk, if that is fast enough."""
+"""Seconds after which a frame is on the disk, if the disk is fast enough."""
 COLOR, ALIGNED, DEPTH = "/camera/color", "/camera/aligned_depth_to_color", "/camera/depth"
 """Namespaces of the topics ``image_raw`` and ``camera_info``; depth that is registered to colour is ``ALIGNED``."""
 COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
@@ -85,7 +85,7 @@ class Recorder:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what waits and move the file to its place.
+        """Write the waiting frames and move the file to its place.
 
         Raises:
             CameraError: The disk is full or the file cannot be written.
@@ -150,7 +150,7 @@ class Recorder:
             writer.write(f"{space}/image_raw", recorded, ros.image(types, stamp, pixels, encoding, name))
 
     def _depth(self, depth: NDArray[np.float32]) -> tuple[NDArray[Any], str]:
-        """16-bit millimetres where they hold the depth exactly, else metres as floats."""
+        """16-bit millimetres if they are exact, else metres as floats."""
         if self._camera.depth_scale == 1000:
             millimetres = np.rint(depth * np.float32(1000))
             if millimetres.max(initial=0) <= np.iinfo(np.uint16).max:

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class ReplayCamera(LiveCamera):
-    """Delivers the frames of a recording at their times; the first one when it is first asked for.
+    """Delivers the frames of a recording at their times; the clock starts at the first ``read``.
 
-    Of the frames that become due while an earlier one is read from disk, those due since ``MAX_WAIT`` are read; the
-    others are lost, as with a camera.
+    While a frame is read from disk, others become due. Frames due for longer than ``MAX_WAIT`` are lost, as with a
+    camera.
 
     Args:
         recording: Path of a recording in any format that is read, or the opened sequence.

@@ -16,8 +16,8 @@ class Exporter:
     """A format that results can be written in.
 
     Attributes:
-        summary: What the file holds, for the help page.
-        target: ``module:function`` of a function ``write(run, path, options) -> None``, imported when it is needed.
+        summary: Content of the file, for the help page.
+        target: ``module:function`` of a function ``write(run, path, options) -> None``, imported on use.
         options: Names of the fields of ``ExportOptions`` that it takes.
     """
 
@@ -27,7 +27,7 @@ class Exporter:
 
     @property
     def write(self) -> Callable[[RunContent, Path, ExportOptions], None]:
-        """Writes the results of a run; it raises what ``export_run`` names."""
+        """Function that writes the results of a run; errors as in ``export_run``."""
         module, _, name = self.target.partition(":")
         return getattr(import_module(f"dudmap.io.exporting.{module}"), name)
 
@@ -72,7 +72,7 @@ def find_exporter(name: str) -> Exporter:
 
 
 def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None = None) -> Path:
-    """Write the results of a run folder in the format that the name of ``to`` tells; returns the path.
+    """Write the results of a run folder in the format given by the name of ``to``; return the path.
 
     Raises:
         ConfigError: The ending is unknown, an option does not fit, or the format needs a library that is not installed.

@@ -1,4 +1,4 @@
-"""Level surfaces and the floor of a map, and axes that stand on it. A direction without length is a ``ConfigError``."""
+"""Level surfaces and the floor of a map, and axes that stand on it. A zero direction raises a ``ConfigError``."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,17 @@ from dudmap.errors import ConfigError
 from dudmap.io.exporting.mesh_editing import face_vectors
 
 CONE = np.cos(np.radians(45))
-"""The floor's normal is looked for within 45 degrees of the mean direction that the cameras held up."""
+"""Cosine of the largest angle between the floor's normal and the mean up direction of the cameras."""
 PARALLEL = np.cos(np.radians(5))
-"""Normals within 5 degrees belong to one direction: the noise of a plane's triangles at 1 cm voxels."""
+"""Cosine of the largest angle within one direction: the noise of a plane's triangles at 1 cm voxels."""
 CANDIDATES = 500
-"""Directions that are tried, spread evenly over the surface."""
+"""Candidate directions, spread evenly over the surface."""
 LEAST_SHARE = 0.02
-"""Least share of the whole surface that must face up."""
+"""Smallest share of the whole surface that must face up."""
 LAYER = 0.05
-"""Half the thickness of the layer that counts as one height, metres."""
+"""Half the thickness of a layer of one height, metres."""
 FLOOR_SHARE = 0.1
-"""The floor is the lowest layer that has at least this share of all surface that faces up."""
+"""Smallest share of upward surface in the layer of the floor; the lowest such layer is the floor."""
 
 
 class Floor(NamedTuple):
@@ -36,7 +36,7 @@ class Floor(NamedTuple):
 
 
 def level_normal(mesh: Mesh, held: NDArray[np.float64], cone: float = CONE) -> NDArray[np.float64] | None:
-    """The most frequent surface normal (3,) near a direction (3,), None if none is frequent.
+    """Most frequent surface normal (3,) near a direction (3,), None if none is frequent.
 
     ``cone`` is the cosine of the largest angle between both.
     """
@@ -77,8 +77,10 @@ def floor_height(mesh: Mesh, up: NDArray[np.float64]) -> float | None:
 
 
 def fitted(mesh: Mesh, floor: Floor) -> Floor:
-    """The plane through the vertices of the floor by least squares, in layers that get thinner to leave out what
-    stands on it: the mean of normals leans towards clutter."""
+    """Least-squares plane through the vertices of the floor, in ever thinner layers, which exclude objects on it.
+
+    A mean of normals would be biased towards clutter.
+    """
     for half in (2 * LAYER, LAYER, LAYER / 2, LAYER / 2):
         facing = mesh.normals @ floor.up > np.cos(np.radians(15))
         points = mesh.vertices[facing & (np.abs(mesh.vertices @ floor.up - floor.height) < half)].astype(np.float64)
@@ -98,8 +100,10 @@ def y_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def z_up(floor: Floor) -> NDArray[np.float64]:
-    """Motion (4, 4) from the world to axes with z up from the floor, x along the first camera's view, and the origin
-    below it (REP 103)."""
+    """Motion (4, 4) from the world to axes with z up from the floor, x along the first camera's view (REP 103).
+
+    The origin is on the floor below the first camera.
+    """
     forward = _across(floor.up)
     T = np.eye(4)
     T[:3, :3] = np.stack([forward, np.cross(floor.up, forward), floor.up])
@@ -108,7 +112,7 @@ def z_up(floor: Floor) -> NDArray[np.float64]:
 
 
 def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The first camera's view direction (0, 0, 1) without its part along ``up``, or its x axis if nothing is left."""
+    """View direction (0, 0, 1) of the first camera without its part along ``up``, or its x axis if nothing is left."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:
         forward = np.array([1.0, 0.0, 0.0]) - up[0] * up

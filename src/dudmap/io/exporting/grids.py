@@ -1,4 +1,4 @@
-"""Grids for robots: occupied, free and unknown space and distances to the surface, z up, and a 2D map for nav2."""
+"""Grids for robots: occupied, free and unknown space, distances to the surface, z up, and a 2D map for nav2."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,29 +20,29 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.exporting.up import Up, checked_floor, run_up
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-"""Values of cells, those of ROS' ``nav_msgs/OccupancyGrid``."""
+"""Cell values of ROS' ``nav_msgs/OccupancyGrid``."""
 LARGEST = 20_000_000
-"""Largest number of cells: distances then take about a minute and 1 GB."""
+"""Largest number of cells; distances then take about a minute and 1 GB."""
 BORDER = 2
 """Cells around the surface on every side."""
 CHUNK = 1_000_000
-"""Cells that are looked up at once, to bound memory."""
+"""Cells per look-up, to bound memory."""
 FORMAT = "dudmap grid 1"
 PIXELS = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
-"""Grey values of the cells, those of nav2's map saver."""
+"""Grey values of the cells in nav2's map saver."""
 FLOOR_LAYER = 0.1
 """A surface within this height of the floor is floor, metres."""
 SEEN_SHARE = 0.5
-"""Without a floor in view a column is free if at least this share of its cells is."""
+"""Smallest share of free cells for a free column without a visible floor."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpaceGrid:
-    """Cells of equal size in axes of their own, z up.
+    """Cells of equal size in separate axes, z up.
 
     Attributes:
         occupancy: (X, Y, Z) int8, ``OCCUPIED``, ``FREE`` or ``UNKNOWN``.
-        behind: (X, Y, Z) bool, whether the centre of a cell lies behind a seen surface.
+        behind: (X, Y, Z) bool, whether the centre of a cell lies behind an observed surface.
         origin: (3,) lower corner of the first cell, metres, in the axes of the grid.
         resolution: Edge of a cell, metres.
         T_grid_map: (4, 4) motion from the world of the map to the axes of the grid.
@@ -58,8 +58,8 @@ class SpaceGrid:
     def of(cls, volume: TsdfVolume, mesh: Mesh, T_grid_map: NDArray[np.float64], resolution: float) -> "SpaceGrid":
         """Grid around a surface.
 
-        A cell is occupied if the surface passes through it (one of its vertices lies inside), else free if its centre
-        was observed in front of a surface or in known free space, else unknown.
+        A cell is occupied if it contains a vertex of the surface. Otherwise it is free if its centre was observed in
+        front of a surface or in known free space, else unknown.
 
         Args:
             volume: The map.
@@ -80,7 +80,7 @@ class SpaceGrid:
         if np.prod(shape.astype(float)) > LARGEST:
             size = " x ".join(f"{number * resolution:.0f}" for number in shape)
             raise ConfigError(
-                f"cells of {resolution:g} m in {size} m would be more than {LARGEST:,}; give a larger --resolution, or "
+                f"{size} m hold more than {LARGEST:,} cells of {resolution:g} m; give a larger --resolution, or "
                 "a part of the map by --crop or --drop-pieces-below"
             )
         grid = cls(np.full(shape, UNKNOWN, np.int8), np.zeros(shape, bool), first * resolution, resolution, T_grid_map)
@@ -100,8 +100,8 @@ class SpaceGrid:
             yield cells, self.origin + (numbers + 0.5) * self.resolution
 
     def distances(self, mesh: Mesh) -> NDArray[np.float32]:
-        """Euclidean signed distance (X, Y, Z) of each centre to the nearest vertex of the surface, metres; negative
-        behind a seen surface.
+        """Euclidean signed distance (X, Y, Z) of each centre to the nearest surface vertex, metres; negative behind a
+        surface.
 
         The vertices are at most a voxel v apart, so a distance d is at most v^2 / (4 d) too large.
         """
@@ -114,10 +114,10 @@ class SpaceGrid:
 
 
 def look_up(volume: TsdfVolume, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What a map knows of points (n, 3) in its world frame.
+    """Look up points (n, 3), world frame, in a map.
 
     Returns:
-        sdf: (n,) float32 signed distance of the nearest voxel, metres, NaN where none was observed.
+        sdf: (n,) float32 signed distance of the nearest voxel, metres, NaN if unobserved.
         free: (n,) bool, whether the point lies in a block of known free space.
     """
     blocks = volume.blocks
@@ -135,9 +135,14 @@ def look_up(volume: TsdfVolume, points: NDArray[np.float64]) -> tuple[NDArray[np
 def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write occupancy and Euclidean signed distances as NumPy archive.
 
-    Arrays: ``format``; ``occupancy`` (X, Y, Z) int8, 100 = occupied, 0 = free, -1 = unknown; ``esdf`` (X, Y, Z)
-    float32, metres; ``origin`` (3,), lower corner of the first cell; ``resolution``, metres; ``T_grid_map`` (4, 4)
-    from the world of the run to the axes of the grid: z up from the floor, x along the first view.
+    Arrays:
+
+    - ``format``: ``FORMAT``.
+    - ``occupancy``: (X, Y, Z) int8, 100 = occupied, 0 = free, -1 = unknown.
+    - ``esdf``: (X, Y, Z) float32, metres.
+    - ``origin``: (3,), lower corner of the first cell, metres.
+    - ``resolution``: metres.
+    - ``T_grid_map``: (4, 4) world of the run to the axes of the grid: z up from the floor, x along the first view.
     """
     mesh, grid, _ = _grid(run, options)
     with atomic_file(path) as file:
@@ -148,7 +153,7 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``map.yaml`` and ``map.pgm`` beside it, as nav2's map server reads them."""
+    """Write ``map.yaml`` and ``map.pgm`` for nav2's map server."""
     if not options.heights[0] < options.heights[1]:
         raise ConfigError(f"found --heights {options.heights}; expected the lower one first")
     _, grid, up = _grid(run, options)
@@ -177,7 +182,7 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
 def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
     """Occupancy (X, Y) for a robot that reaches from the lower to the upper height above the floor, metres.
 
-    A column is occupied if any of its cells between the heights is, else free if its floor was seen or at least half
+    A column is occupied if any cell between the heights is. Otherwise it is free if its floor was seen or at least half
     of these cells are free, else unknown.
     """
     z = grid.origin[2] + (np.arange(grid.occupancy.shape[2]) + 0.5) * grid.resolution
@@ -190,6 +195,6 @@ def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
 
 
 def _grid(run: RunContent, options: ExportOptions) -> tuple[Mesh, SpaceGrid, Up]:
-    """The chosen part of the surface, the space around it, and the direction that is up in it."""
+    """Chosen part of the surface, grid around it, and upward direction."""
     mesh, up = edited(run.surface, options), run_up(run, options)
     return mesh, SpaceGrid.of(run.volume, mesh, z_up(checked_floor(run, up)), options.resolution), up

@@ -1,7 +1,7 @@
 """Mesh files: PLY, OBJ, STL, binary glTF 2.0 and USDZ; and point clouds, the vertices of the mesh: PLY, PCD, LAZ, E57.
 
-glTF is written here and not by trimesh, since it wants linear vertex colours with a material that says that they are
-not to be lit again: sRGB bytes look pale, and without a material a viewer takes metal.
+This module writes glTF itself instead of trimesh, for linear vertex colours with an unlit material. sRGB bytes would
+look pale, and viewers default to metal without a material.
 """
 
 import json
@@ -32,11 +32,11 @@ MATERIAL = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "extensions": {"KHR_materials_unlit": {}},
 }
-"""Colours hold the light of the recording already; a program without the extension sees a matt surface."""
+"""Colours already contain the light of the recording; a program without the extension shows a matt surface."""
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh in the axes of the map, in the format of the file's ending: PLY, OBJ or STL."""
+    """Write the mesh in the axes of the map, in the format of the file's suffix: PLY, OBJ or STL."""
     edited(run.surface, options).save(path)
 
 
@@ -109,7 +109,7 @@ def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
 def write_usdz(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write the mesh as USDZ, y up, metres, with its colours as ``displayColor``."""
     with extra("export", "writing .usdz"):
-        # by name, since type checkers see none of the classes of usd-core
+        # by name, because type checkers see no classes of usd-core
         sdf, usd, geom, utils, vt = (import_module(f"pxr.{n}") for n in ("Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"))
     mesh = rotated(edited(run.surface, options), y_up(up_of(run, options)))
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:

@@ -1,9 +1,7 @@
 """ROS 2 messages from and to arrays, and MCAP files of them. Message classes come from the caller (rosbags or rclpy).
 
-Frames follow REP 105 with the optical camera axes of REP 103: ``map`` is the world of the map and ``camera`` has x
-right, y down and z forward.
-
-A message that cannot be understood is a ``DatasetError``.
+Frames follow REP 105 with the optical axes of REP 103: ``map`` is the world of the map, ``camera`` has x right, y down,
+z forward. Unsupported messages raise a ``DatasetError``.
 """
 
 import tempfile
@@ -36,11 +34,11 @@ TRIANGLE_LIST, CUBE, ADD, DELETE_ALL = 11, 1, 0, 3
 
 @dataclass(frozen=True)
 class MessageTypes:
-    """Where message classes come from.
+    """Access to message classes.
 
     Attributes:
         find: Class of a type such as ``nav_msgs/msg/Path``, which takes its fields as keywords.
-        octets: Bytes of an array in the form that a field ``uint8[]`` takes.
+        octets: Bytes of an array in the form of a field ``uint8[]``.
     """
 
     find: Callable[[str], Any]
@@ -146,7 +144,7 @@ def cloud(types: MessageTypes, seconds: float, points: NDArray, colors: NDArray[
 
 
 def image(types: MessageTypes, seconds: float, pixels: NDArray, encoding: str, frame: str) -> Any:  # noqa: ANN401
-    """``sensor_msgs/Image`` of an array (H, W) or (H, W, 3) whose bytes are those of the encoding."""
+    """``sensor_msgs/Image`` of an array (H, W) or (H, W, 3) in the byte layout of the encoding."""
     height, width = pixels.shape[:2]
     return types.make(
         "sensor_msgs/msg/Image",
@@ -250,7 +248,7 @@ def camera_of(message: Any) -> Camera:  # noqa: ANN401
 
 
 MESH_TRIANGLES = 50_000
-"""Triangles of the mesh marker: viewers take every corner as a message of its own. The point cloud has all vertices."""
+"""Triangles of the mesh marker, because viewers treat every corner as a message. The point cloud has all vertices."""
 
 
 class McapWriter:
@@ -258,7 +256,7 @@ class McapWriter:
 
     Args:
         folder: Of the bag; it must not exist.
-        purpose: What needs the package rosbags, for the message that it is missing.
+        purpose: Purpose of the package rosbags, for the error that it is missing.
         compressed: Whether the file is compressed by zstd.
 
     Attributes:

@@ -1,6 +1,6 @@
-"""What exporters take: the results in a run folder, and the options of an export.
+"""Input of exporters: the results in a run folder, and the options of an export.
 
-What is missing, damaged or of a newer version is a ``DatasetError``, and a ``MapError`` if it is the mesh or the map.
+Missing, damaged or newer files raise a ``DatasetError``, or a ``MapError`` for mesh and map.
 """
 
 import re
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 NEAR = 0.001
-"""Largest difference between the time stamp of a frame and those of its pose and mask, seconds."""
+"""Largest time difference between a frame and its pose or mask, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunContent:
-    """Results of a run; each file is read when it is first asked for.
+    """Results of a run; each file is read on first access.
 
     Attributes:
         folder: The run folder.
@@ -74,7 +74,7 @@ class RunContent:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses at which the depth images of the tracked frames were taken."""
+        """Poses at the exposure times of the tracked frames' depth images."""
         taken = self.folder / "image_poses.txt"
         return Trajectory.load(taken if taken.is_file() else self.folder / "trajectory.txt")
 
@@ -120,21 +120,24 @@ class RunContent:
         return Calibration.load(path) if path.is_file() else None
 
     def color_pose(self, timestamp: float) -> NDArray[np.float64]:
-        """Pose (4, 4) of the colour camera for an image with this time stamp; a second camera and its delay are
-        those of the calibration. Before the first and after the last pose it is that pose."""
+        """Pose (4, 4) of the colour camera for an image with this time stamp.
+
+        Pose and delay of a separate colour camera come from the calibration. Times outside the trajectory take its
+        first or last pose.
+        """
         calibration, stamps = self.calibration, self.trajectory.timestamps
         delay = 0.0 if calibration is None else calibration.delay
         T = self.trajectory.interpolate(float(np.clip(timestamp + delay, stamps[0], stamps[-1])))
         return T if calibration is None else T @ np.linalg.inv(calibration.T_color_depth)
 
     def mask_files(self) -> dict[float, Path]:
-        """Masks of what moves by time stamp of the depth image."""
+        """Dynamic masks by time stamp of the depth image."""
         from dudmap.io.sequences.masks import stamped_masks
 
         folder = self.folder / "masks"
         masks = dict(stamped_masks(folder)) if folder.is_dir() else {}
         if not masks:
-            raise DatasetError(f"{self.folder} holds no masks of what moves; repeat the run with --save-masks")
+            raise DatasetError(f"{self.folder} holds no dynamic masks; repeat the run with --save-masks")
         return masks
 
     def frames_of(self, sequence: "Sequence") -> Iterator[tuple[int, NDArray[np.float64], Path]]:
@@ -156,10 +159,10 @@ class RunContent:
             )
 
     def color_camera(self, sequence: "Sequence") -> "Camera":
-        """Camera of the recorded colour images: that of depth if they are registered to it.
+        """Camera of the recorded colour images: the depth camera if they are registered to it.
 
         Raises:
-            DatasetError: They are not, and the run does not say where their camera is.
+            DatasetError: They are not registered, and the run holds no pose of their camera.
         """
         if sequence.calibration is None:
             return sequence.camera
@@ -169,7 +172,7 @@ class RunContent:
 
 
 def _index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
-    """Number of the time in (N,) increasing ones that belongs to a frame's, None if there is none."""
+    """Index of a frame's time in increasing times (N,), None if there is none."""
     nearest = int(np.argmin(np.abs(stamps - timestamp)))
     return nearest if abs(float(stamps[nearest]) - timestamp) <= NEAR else None
 
@@ -181,8 +184,8 @@ def _numbers(version: str) -> list[int]:
 
 Box = tuple[float, float, float, float, float, float]
 SPECK = 4e-4
-"""Surface of a connected piece of the mesh below which it is left out unless an option says otherwise, square metres,
-that of a square of 2 cm: loose pieces of a few voxels are noise of the depth readings."""
+"""Smallest surface of a connected piece that is exported by default, square metres: a square of 2 cm. Loose pieces of a
+few voxels are depth noise."""
 MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
 """Options that change the mesh."""
 
@@ -194,15 +197,15 @@ class ExportOptions:
     Attributes:
         max_triangles: Largest number of triangles.
         crop: Lower and upper corner of the part of the map to keep, metres, world frame.
-        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres.
-        fill_holes: Holes whose border is at most so long are closed, metres.
+        drop_pieces_below: Connected pieces of the mesh with a smaller surface are omitted, square metres.
+        fill_holes: Longest border of holes that are closed, metres.
         up: Direction against gravity in the world frame; None for the measured one, else the normal of the floor.
         z_up: Whether surface and trajectory are written with z up from the floor and x along the first view.
         resolution: Edge of the cells of grids, metres.
         heights: Lower and upper end of the robot above the floor, metres.
-        sequence: Recording that the run was made from; None for the one that the run names.
-        camera: Intrinsics of that recording, as ``--camera`` takes them; None for the run's intrinsics.
-        every: Every so many frames of the recording are exported.
+        sequence: Recording of the run; None for the recording that the run names.
+        camera: Intrinsics of that recording, as for ``--camera``; None for the run's intrinsics.
+        every: Every N-th frame of the recording is exported.
     """
 
     max_triangles: int | None = None

@@ -26,17 +26,18 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PIXEL = 0.5
-"""These programs put the corner of the first pixel at the origin, dudmap its centre."""
+"""Offset between pixel conventions: the origin is the corner of the first pixel in these programs, its centre in
+dudmap."""
 
 
 class View(NamedTuple):
     """A posed image.
 
     Attributes:
-        name: File name without its ending.
+        name: File name without its suffix.
         color: (h, w, 3) uint8, as recorded.
-        depth: (h, w) float32, metres, seen from the colour camera; of a camera beside the depth camera with gaps.
-        moving: (h, w) bool, what moves in the colour image.
+        depth: (h, w) float32, metres, seen from the colour camera; with gaps if colour has a separate camera.
+        moving: (h, w) bool, dynamic pixels of the colour image.
         T_world_color: (4, 4) pose of the colour image.
     """
 
@@ -48,8 +49,9 @@ class View(NamedTuple):
 
 
 def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``transforms.json`` and beside it images/, depth/ (16 bit, millimetres), masks/ (0 = moves, left out of
-    training) and the seed points points.ply. Poses are camera to world with OpenGL's camera axes.
+    """Write ``transforms.json``, images/, depth/ (16 bit, millimetres), masks/ (0 = dynamic, ignored) and points.ply.
+
+    Poses are camera to world with OpenGL's camera axes; points.ply holds the seed points.
     """
     sequence = _open(run, options)
     _seeds(run, options).save(path.parent / "points.ply")
@@ -78,8 +80,9 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
 
 
 def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` (points without tracks), and beside them images/ and
-    masks/ (``NAME.png.png``, 0 = moves, as COLMAP's ``ImageReader.mask_path`` wants them).
+    """Write ``cameras.txt``, ``images.txt``, ``points3D.txt`` (points without tracks), images/ and masks/.
+
+    Masks are named ``NAME.png.png``, 0 = dynamic, as for COLMAP's ``ImageReader.mask_path``.
     """
     sequence, seeds = _open(run, options), _seeds(run, options)
     images, masks = _folders(path.parent, "images", "masks")
@@ -102,7 +105,7 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def _folders(parent: Path, *names: str) -> list[Path]:
-    """Folders of images, made where they are missing."""
+    """Image folders, created if missing."""
     for name in names:
         (parent / name).mkdir(exist_ok=True)
     return [parent / name for name in names]
@@ -135,7 +138,7 @@ def _open(run: RunContent, options: ExportOptions) -> "Sequence":
         raise DatasetError(
             f"the recording that the run names cannot be read; name it by --sequence: {error}"
         ) from error
-    run.color_camera(sequence)  # refused before anything is written
+    run.color_camera(sequence)  # errors occur before anything is written
     return sequence
 
 
@@ -144,7 +147,7 @@ def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
 
 
 def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
-    """The frames that have a pose and a mask."""
+    """Frames that have a pose and a mask."""
     other = None
     if sequence.calibration is not None:
         other = OtherView(Lens(sequence.camera), Lens(run.color_camera(sequence)))

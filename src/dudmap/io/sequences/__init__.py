@@ -30,7 +30,7 @@ class Sequence(Protocol):
 
     Attributes:
         name: Short name, usable as a folder name.
-        camera: Intrinsics of the depth images, and of the colour images where these are registered to them.
+        camera: Intrinsics of the depth images, and of registered colour images.
         calibration: Of the colour camera; None for colour that is registered to depth.
         timestamps: (N,) float64 strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses if known; used for evaluation only.
@@ -65,11 +65,11 @@ class Sequence(Protocol):
 
 
 class Recording(ABC):
-    """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame when asked for it.
+    """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame on access.
 
-    A format sets the times, the cameras and their sources in its constructor, and reads a frame in ``_frame``.
-    Constructors also take the options of the format. They raise a ``DatasetError`` for a recording that is damaged or
-    of another kind, and a ``MissingExtraError`` if a package is missing.
+    A format sets times, cameras and their sources in its constructor, and reads a frame in ``_frame``. Constructors
+    also take the options of the format. They raise a ``DatasetError`` for a damaged recording or another kind, and
+    a ``MissingExtraError`` if a package is missing.
 
     Args:
         path: The folder or file.
@@ -80,10 +80,10 @@ class Recording(ABC):
         options: Names of the options of ``open_sequence`` that the format has.
         sources: Origin of ``intrinsics``, ``depth unit`` and ``times``: a file, a data set's name, an option, or an
             assumption.
-        remarks: Sentences on data that were left out as unnecessary, and on assumptions.
+        remarks: Sentences on omitted data and on assumptions.
         timed: Whether the times were read or their rate was given; False for assumed times.
         has_color: Whether there are colour images; without, the ``color`` of all frames is None.
-        gravity: Directions against gravity that were measured, if they are; reading them may raise a ``DatasetError``.
+        gravity: Measured directions against gravity, None without; reading them may raise a ``DatasetError``.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
 
@@ -92,9 +92,9 @@ class Recording(ABC):
     truth = ""
     """Conversion of the published poses into the ground truth, if they are no camera poses in our axes."""
     suffix = ""
-    """Suffix of the files of the format, where it is that of files."""
+    """Suffix of the files, for formats of single files."""
     layout: tuple[str, ...] = ()
-    """Patterns of files and folders that all lie in every folder of the format."""
+    """Patterns of files and folders that every folder of the format contains."""
     timed = True
     has_color = True
     camera: Camera
@@ -145,7 +145,7 @@ class Recording(ABC):
         """A frame; ``name`` is used in messages."""
 
     def _set_cameras(self, own: Camera, color: Calibration, source: str, given: Camera | str | None) -> None:
-        """Set the cameras: those of the file, where the depth camera may be given instead."""
+        """Set the cameras of the file; ``given`` may replace the depth camera."""
         known = intrinsics.given(given) if given else None
         self.camera = known.camera(own.width, own.height, own.depth_scale) if known else own
         one_size = (color.camera.width, color.camera.height) == (own.width, own.height)
@@ -181,17 +181,17 @@ READERS = (
     "bag:RealSenseRecording",
     "bag:RosBag",
 )
-"""Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
+"""Module and class of the reader of every format, in the order of the attempts: specific layouts first."""
 NUMBERED = READERS.index("numbered:NumberedSequence")
 MOST_NAMES = 5
-"""Recordings that a message names."""
+"""Most recordings named in a message."""
 DEPTH_OF_SEARCH = 3
-"""Levels of folders below the given one in which a recording is looked for."""
+"""Levels of folders below the given one that are searched for a recording."""
 
 
 @cache
 def readers() -> tuple[type[Recording], ...]:
-    """Readers of all formats, in the order in which they are tried."""
+    """Readers of all formats, in the order of the attempts."""
     names = (reader.split(":") for reader in READERS)
     return tuple(getattr(import_module(f"dudmap.io.sequences.{module}"), name) for module, name in names)
 
@@ -209,17 +209,17 @@ def is_recording(path: Path) -> bool:
 
 
 def is_timed(sequence: object) -> bool:
-    """Whether the times of a sequence are known: not those of a recording whose frames are only numbered."""
+    """Whether the times of a sequence are known, not only frame numbers."""
     return getattr(sequence, "timed", True)
 
 
 def has_color(sequence: object) -> bool:
-    """Whether a sequence has colour images, which a recording of depth alone has not."""
+    """Whether a sequence has colour images."""
     return getattr(sequence, "has_color", True)
 
 
 def read_frame(sequence: "Sequence", index: int) -> Frame:
-    """A frame of a sequence in memory of its own: a class of a user may fill the same images for every frame.
+    """Read a frame into its own memory, because a user's class may reuse its images for every frame.
 
     Raises:
         FrameError: This frame cannot be read; the others may be valid.
@@ -242,11 +242,12 @@ def open_sequence(
 
     Args:
         path: Folder, file or archive.
-        camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
-            (default: the size of the images, and the depth scale that is usual in the format).
-        fps: Frames per second of a recording whose frames are numbered, not timed; else 30 are assumed.
-        depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces that of camera and recording.
-        options: Of one format, e.g. ``topics`` of bags; None stands for an option that is not given.
+        camera: Intrinsics that replace the recording's: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+            Defaults: the size of the images, and the format's usual depth scale.
+        fps: Frames per second of a recording with frame numbers instead of times; default 30.
+        depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces the unit of camera and
+            recording.
+        options: Of one format, e.g. ``topics`` of bags; None means not given.
 
     Raises:
         DatasetError: There is nothing at the path, no known format, several recordings, a defect, or an option that the
@@ -285,7 +286,7 @@ def _option(name: str) -> str:
 
 
 def _find(path: Path) -> tuple[Path, type[Recording]]:
-    """The recording at a path, in it, or in the archive at it, and its reader."""
+    """Recording at a path, in it, or in the archive at it, and its reader."""
     from dudmap.io.sequences.archive import split, unpack
 
     reader = reader_of(path) if path.exists() else None
@@ -314,7 +315,7 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
 
 
 def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording] | None]]":
-    """Recordings below a folder with their readers, and archives with None; not those inside of other recordings."""
+    """Recordings below a folder with their readers, and archives with None; none inside of other recordings."""
     from dudmap.io.sequences.archive import is_archive
 
     found: list[tuple[Path, type[Recording] | None]] = []
@@ -330,7 +331,7 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
 
 
 def _places_by_content(path: Path) -> list[Path]:
-    """The folder or subfolders whose images are depth and colour by their content, else depth alone."""
+    """The folder or subfolders whose content is depth and colour images, else depth alone."""
     from dudmap.io.sequences.image_series import alone, by_content, unknown
 
     def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:
@@ -356,4 +357,4 @@ def _unknown(path: Path) -> str:
         return images
     formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
     kind = "folder" if path.is_dir() else "file"
-    return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"
+    return f"{path} is a {kind} in no known format; dudmap reads {formats} (described in docs/formats.md)"

@@ -1,4 +1,4 @@
-"""Recordings in archives: unpacked once into a cache, with everything refused that an image sequence does not need."""
+"""Unpack recordings in archives once into a cache; members that no image sequence needs are refused."""
 
 import bz2
 import errno
@@ -22,21 +22,21 @@ from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged,
 
 SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 LARGEST_BYTES = 256 * 2**30
-"""Largest unpacked size. The largest recording of the data sets that are read (a CoRBS scene) has less than 30 GB."""
+"""Largest unpacked size. The largest known recording (a CoRBS scene) has less than 30 GB."""
 LARGEST_COUNT = 1_000_000
 """Largest number of members, 4.6 hours of colour and depth files at 30 frames a second."""
 LARGEST_HEADER = 2**20
-"""Largest header of a member of a tar archive with what extends it, bytes: a long name and its times have 10 kB."""
+"""Largest header of a tar member with its extensions, bytes: a long name and its times have 10 kB."""
 LARGEST_DICTIONARY = 2**27
 """Largest memory for unpacking xz, bytes; the preset 9 needs 65 MB."""
 CHUNK = 2**20
 NAME_FOLDER = "name a folder that you can write in the environment variable DUDMAP_CACHE"
 ORIGIN = "origin.txt"
-"""File beside the unpacked folder that names the archive."""
+"""File next to the unpacked folder that names the archive."""
 
 
 Member = tuple[str, str, Callable[[], IO[bytes] | None]]
-"""Name of a member of an archive, whether it is a file, a folder or something else, and what opens it."""
+"""Name of a member, its kind (file, folder or something else), and a function that opens it."""
 
 
 def is_archive(path: Path) -> bool:
@@ -68,7 +68,7 @@ def cache_folder() -> Path:
 
 
 def unpack(path: Path) -> Path:
-    """Folder with the content of an archive; unpacked when it is opened first or has changed since.
+    """Folder with the content of an archive; unpacked at the first opening and after changes.
 
     Raises:
         DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths that lead out of it,
@@ -120,7 +120,7 @@ def stem(path: Path) -> str:
 
 
 def _unpack_into(path: Path, folder: Path, packed: int) -> None:
-    """Write all files of an archive below a new folder, counting what really comes out of it."""
+    """Write all files of an archive into a new folder; limit the bytes that are actually unpacked."""
     folder.mkdir(parents=True)
     limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
     written = 0
@@ -180,7 +180,7 @@ def _tar_members(path: Path) -> "Generator[Member]":
 
 
 def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile":
-    """Content of a file that may be packed, which is found by its first bytes."""
+    """Open the content of a file, which may be compressed, by its first bytes."""
     start = file.read(6)
     file.seek(0)
     if start.startswith(b"\x1f\x8b"):
@@ -188,7 +188,7 @@ def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzm
     if start.startswith(b"BZh"):
         return bz2.BZ2File(file)
     if start.startswith((b"\xfd7zXZ\0", b"]\0\0\x80", b"]\0\0\0")):
-        # a dictionary that is declared larger than that of any preset is refused before memory is taken for it
+        # refuse a declared dictionary larger than any preset's before memory is allocated
         lzma.LZMADecompressor(memlimit=LARGEST_DICTIONARY).decompress(file.read(CHUNK), max_length=1)
         file.seek(0)
         return lzma.LZMAFile(file)
@@ -196,13 +196,13 @@ def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzm
 
 
 class _Bounded:
-    """A stream that ends with an error where the headers of one member take more than ``LARGEST_HEADER`` bytes."""
+    """A stream that fails if the headers of one member exceed ``LARGEST_HEADER`` bytes."""
 
     def __init__(self, content: "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile") -> None:
         self._content, self.left = content, LARGEST_HEADER
 
     def read(self, size: int) -> bytes:
-        """At most ``size`` bytes, which the library keeps until a header is whole."""
+        """At most ``size`` bytes, which the library keeps until a header is complete."""
         data = self._content.read(size)
         self.left -= len(data)
         if self.left < 0:

@@ -21,12 +21,12 @@ from dudmap.io.sequences.bag_file import MessageStream
 from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 BEFORE = 1_000_000_000
-"""A pass starts this long before the wanted time, nanoseconds, as a seek need not be exact."""
+"""Time by which a pass starts earlier than wanted, nanoseconds, because a seek may be inexact."""
 DEPTH_MODES = {
     (320, 288): (512, 96, 90), (640, 576): (1024, 192, 180), (512, 512): (512, 0, 0), (1024, 1024): (1024, 0, 0),
 }  # fmt: skip
-"""Size of depth images to the size of the sensor's image, in which the calibration is, and the place of the cut-out
-(Azure Kinect Sensor SDK, src/transformation/mode_specific_calibration.c)."""
+"""Size of depth images to size of the sensor image, which the calibration refers to, and offset of the crop (Azure
+Kinect Sensor SDK, src/transformation/mode_specific_calibration.c)."""
 RAW_COLORS = {"nv12": "COLOR_YUV2RGB_NV12", "yuyv422": "COLOR_YUV2RGB_YUY2", "bgra": "COLOR_BGRA2RGB"}
 """Conversion of uncompressed colour images."""
 
@@ -114,7 +114,7 @@ class AzureKinectRecording(Recording):
         ]
 
     def _passing(self, _: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
-        """All images from a time in nanoseconds on."""
+        """All images, starting at a time in nanoseconds."""
         streams = {track.stream.index: name for name, track in (("COLOR", self._color), ("DEPTH", self._depth))}
         first = self._depth.stream
         self._container.seek(max(0, int((start - BEFORE) * 1e-9 / first.time_base)), stream=first)
@@ -151,9 +151,9 @@ def _nanoseconds(packet: Any) -> int:  # noqa: ANN401
 
 
 def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float], cut: tuple[float, float]) -> Lens:
-    """Lens of a camera in calibration.json, whose numbers are parts of the width and height of the sensor's image.
+    """Lens of a camera in calibration.json, whose numbers are shares of the sensor image's width and height.
 
-    ``size`` is that of the images, ``whole`` that of the sensor's image, in which they begin at ``cut``.
+    ``size`` is the size of the images and ``whole`` of the sensor image, in which they begin at ``cut``.
     """
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":

@@ -1,7 +1,7 @@
-"""ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), and RealSense recordings, through the package rosbags.
+"""ROS 1 bags, ROS 2 bags (folders, SQLite and MCAP files), and RealSense recordings, through the package rosbags.
 
-RealSense recordings (``.db3`` files of librealsense since March 2026, ``.bag`` files of earlier ones) are ROS bags with
-topics of their own; the package reads them without the driver, with random access, which the driver does not offer.
+RealSense recordings are ROS bags with special topics: ``.db3`` files of librealsense since March 2026, ``.bag`` files
+before. rosbags reads them without the driver and with random access, which the driver does not offer.
 """
 
 import re
@@ -38,7 +38,7 @@ MAGIC = {".bag": b"#ROSBAG V2.0", ".active": b"#ROSBAG V2.0", ".db3": b"SQLite f
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
-"""Number of first /tf messages that tell which frames there are: some seconds of a robot that publishes at 100 Hz."""
+"""First /tf messages that list the frames: some seconds of a robot that publishes at 100 Hz."""
 
 
 class RosBag(Recording):
@@ -97,7 +97,7 @@ class RosBag(Recording):
         magic = MAGIC.get(path.suffix.lower())
         if magic is None or not path.is_file():
             return False
-        with open_plain(path, pointers=True) as file:  # which Git LFS may have to fetch
+        with open_plain(path, pointers=True) as file:  # Git LFS may have to fetch it
             return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
     def _frame(self, index: int, name: str) -> Frame:
@@ -129,7 +129,7 @@ class RosBag(Recording):
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
+        """True poses of the depth camera, None if /tf has no world frame; read from the bag at the first use."""
         with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()
 
@@ -186,20 +186,20 @@ class RosBag(Recording):
             depth_lens = Lens(known.camera(depth_size[0], depth_size[1], self._units()))
             source = known.source
         else:
-            info, beside = topics.depth_info, topics.depth
+            info, image_topic = topics.depth_info, topics.depth
             if info is None and one_size and topics.registered:
-                info, beside = topics.color_info, topics.color
-            depth_lens = self._lens(info, beside, depth_size)
+                info, image_topic = topics.color_info, topics.color
+            depth_lens = self._lens(info, image_topic, depth_size)
             source = info.topic if info else ""
         if depth_lens is None:
             raise DatasetError(
-                f"{self.path} holds no camera_info beside {topics.depth.topic}{self._without()}; choose it with "
+                f"{self.path} holds no camera_info for {topics.depth.topic}{self._without()}; choose it with "
                 "--topics depth_info=/..., or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
             )
         if color_lens is None and not one_size:
             raise DatasetError(
                 f"{self.path}: depth is {size(values)} and colour {size(image)} pixels, and there is no camera_info "
-                f"beside {topics.color.topic}{self._without()}; choose it with --topics color_info=/..."
+                f"for {topics.color.topic}{self._without()}; choose it with --topics color_info=/..."
             )
         if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
@@ -213,7 +213,7 @@ class RosBag(Recording):
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
     def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
-        """The first frame that can be decoded."""
+        """First frame that can be decoded."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -238,7 +238,7 @@ class RosBag(Recording):
         return None if calibration.is_registered(depth.camera) else calibration
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
-        """Motion of points of the depth camera into the colour camera, None if the bag does not tell."""
+        """Motion of points of the depth camera into the colour camera, None if the bag does not contain it."""
         return self._transforms.between(color_frame, self._depth_frame)
 
     def _units(self) -> float:
@@ -246,12 +246,12 @@ class RosBag(Recording):
         return MILLIMETRES
 
     def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
-        """Lens of a camera_info for images of a width and height; for rectified ones it is in the projection matrix."""
+        """Lens of a camera_info for images of a width and height; a rectified one comes from the projection matrix."""
         info = self._bag.first(connection)
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
-        if not K[0] > 0 and connection is not None:  # as drivers have it for a camera that is not calibrated
+        if not K[0] > 0 and connection is not None:  # drivers write this for a camera that is not calibrated
             self._uncalibrated.append(connection.topic)
             return None
         rectified = "rect" in bag_messages.base(image.topic).rpartition("/")[2] and P[0] > 0
@@ -262,7 +262,7 @@ class RosBag(Recording):
         return Lens(camera) if rectified else Lens.of(camera, self._model_of(image, info), tuple(map(float, D)))
 
     def _without(self) -> str:
-        """Part of a sentence on the camera_info that holds no intrinsics."""
+        """Text on the camera_info that holds no intrinsics."""
         found = " and ".join(dict.fromkeys(self._uncalibrated))
         return f" with a focal length (K in {found} is all zeros: that camera is not calibrated)" if found else ""
 
@@ -287,7 +287,7 @@ class RosBag(Recording):
 
 
 def _equal(one: Lens, other: Lens) -> bool:
-    """Whether two lenses project alike, to the accuracy with which drivers write intrinsics."""
+    """Whether two lenses project alike, within the accuracy of drivers' intrinsics."""
     a, b = one.camera, other.camera
     numbers = [(c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)) for c in (a, b)]
     alike = len(numbers[0]) == len(numbers[1]) and np.allclose(*numbers, rtol=0, atol=1e-3)
@@ -297,14 +297,14 @@ def _equal(one: Lens, other: Lens) -> bool:
 TOPICS = b"/device_0/sensor_"
 """Start of the topics of the first camera's streams."""
 HEAD = 1 << 18
-"""Bytes at the start of a file among which the topics are looked for."""
+"""Bytes at the start of a file that are searched for the topics."""
 
 
 class RealSenseRecording(RosBag):
     """Recording of a RealSense camera; depth is registered by the factory calibration in the file.
 
-    The frames' times are those of the camera: in the metadata of every frame (``.db3``, whose headers hold the times of
-    recording) or in the headers (``.bag``). The depth unit is the camera's option of that name.
+    Frame times are the camera's: from the metadata of every frame (``.db3``, whose headers hold recording times) or
+    from the headers (``.bag``). The depth unit is the camera's option of that name.
     """
 
     format = "RealSense recording"
@@ -334,18 +334,18 @@ class RealSenseRecording(RosBag):
         return MessageTimes(recorded, np.array([stamps[int(time)] for time in recorded]), True)
 
     def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
-        """The file gives accelerations in the axes of the depth camera."""
+        """Identity, because the file gives accelerations in the axes of the depth camera."""
         return np.eye(3)
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
-        """Motion through the reference of both streams, whose points the file takes to either stream."""
+        """Motion through the common reference frame of both streams."""
         motions = [self._motion(connection) for connection in (self._topics.color, self._topics.depth)]
         if motions[0] is None or motions[1] is None:
             return None
         return motions[0] @ se3.inverse(motions[1])
 
     def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
-        """The camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
+        """Model in the text topic of the stream, because the camera_info of .db3 files calls every model plumb_bob."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
         found = re.search(r"model=([^;]+)", self._bag.first(text).data) if text else None
         return found[1] if found else info.distortion_model
@@ -365,7 +365,7 @@ class RealSenseRecording(RosBag):
         return None if found is None else _motion(self._bag.first(found))
 
     def _beside(self, image: "Connection", name: str, msgtype: str) -> "Connection | None":
-        """First topic of the same stream whose name goes on with ``name``."""
+        """First topic of the same stream whose name continues with ``name``."""
         stream = re.match(r"/device_\d+/sensor_\d+/\w+", image.topic)
         prefix = f"{stream[0] if stream else image.topic}/{name}"
         for connection in self._bag.connections:

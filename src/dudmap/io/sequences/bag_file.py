@@ -1,8 +1,8 @@
-"""A bag by the package rosbags: its topics, times of messages from its index, and single messages.
+"""Read a bag with the package rosbags: topics, message times from the index, and single messages.
 
-rosbags trusts what it reads. Here decompression is limited, an SQLite file must be nothing but tables, and messages are
-decoded by the definitions that ROS publishes for their types: of those in a bag rosbags would make Python code. Topics
-of all other types are listed and not read.
+rosbags trusts its input. This module limits decompression and accepts SQLite files with plain tables only. It decodes
+messages by the published ROS definitions of their types, because rosbags would turn definitions in a bag into Python
+code. Topics of all other types are listed and not read.
 """
 
 import os
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 LARGEST_METADATA = 2**19
-"""Largest metadata.yaml, bytes; one with 100 topics has 60 kB, and its parser takes 20 seconds for a megabyte."""
+"""Largest metadata.yaml, bytes. With 100 topics it has 60 kB; its parser takes 20 seconds per megabyte."""
 SAMPLES = 30
-"""Number of first messages from which the delay of recording is estimated where stamps cannot be read cheaply."""
+"""First messages that estimate the recording delay, if stamps cannot be read cheaply."""
 CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 """Encapsulation, seconds and nanoseconds at the start of a ROS 2 message with a header, by byte order."""
 ROS1_STAMP = struct.Struct("<4xII")
 """Sequence number, seconds and nanoseconds at the start of a ROS 1 message with a header."""
 HEAD = 12
-"""Bytes of either."""
+"""Bytes of either header start."""
 MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
-"""Bytes before the content of an MCAP record, before the entries in that of a message index, before the data of a
-message, and before those of an uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
+"""Bytes before four kinds of MCAP content: of a record, of the entries in a message index, of a message, of an
+uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
 """Name of the same type before tf2."""
@@ -52,8 +52,8 @@ class MessageTimes(NamedTuple):
     Attributes:
         recorded: (N,) int64 strictly increasing times of recording, nanoseconds; they identify a message.
         stamps: (N,) float64 times in the headers of the messages, seconds.
-        exact: Whether ``stamps`` were read from the headers; otherwise they are the times of recording less the median
-            delay of the first messages.
+        exact: Whether ``stamps`` come from the headers; else they are recording times minus the median delay of the
+            first messages.
     """
 
     recorded: NDArray[np.int64]
@@ -87,7 +87,7 @@ class BagFile:
             with without_definitions():
                 make: Any = (rosbag1 if self._ros1 else rosbag2).Reader
                 self._reader, self.unclosed = _opened(make, path)
-        except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
+        except Exception as error:  # errors of rosbags and its decompressors for damaged data have no common base
             raise DatasetError(f"cannot open the bag {path}: {error}") from error
         self.connections: list[Connection] = self._reader.connections
         self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
@@ -115,11 +115,11 @@ class BagFile:
         return None
 
     def times(self, connection: "Connection") -> MessageTimes:
-        """Times of the messages of a topic whose type has a header.
+        """Times of the messages of a topic whose type has a header, without reading its images.
 
-        They come from the index of the bag, and the stamps from the first bytes of each message, so that images are not
-        read. In compressed bags that would mean to decompress everything, so the stamps are estimated. Only an MCAP
-        file without chunks is read through once.
+        They come from the index of the bag, and stamps from the first bytes of each message. Stamps of compressed bags
+        are estimated, because reading them would decompress everything. Only an MCAP file without chunks is read
+        through once.
         """
         rows = list(self._ros1_entries(connection) if self._ros1 else self._ros2_entries(connection))
         recorded, first = np.unique(np.array([time for time, _ in rows], dtype=np.int64), return_index=True)
@@ -140,7 +140,7 @@ class BagFile:
         return [self._decoded(data, connection) for data, (connection, _) in zip(raw, wanted, strict=True)]
 
     def _passing(self, topics: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
-        """All messages of some topics from a time of recording on."""
+        """All messages of some topics, starting at a time of recording."""
         chosen = [connection for connection in self.connections if connection.topic in topics]
         with closing(self._reader.messages(chosen, start=start)) as messages:
             yield from ((connection.topic, time, bytes(data)) for connection, time, data in messages)
@@ -155,7 +155,7 @@ class BagFile:
         return seconds + 1e-9 * nanoseconds
 
     def _ros1_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
-        """Time of recording and first bytes of every message; None for bytes that would have to be decompressed."""
+        """Time of recording and first bytes of every message; None for compressed bytes."""
         from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_uint32
 
         with _open(self._reader.path) as file:
@@ -171,7 +171,7 @@ class BagFile:
                 yield entry.time, file.read(HEAD)
 
     def _ros2_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
-        """The same of all files of a bag of ROS 2."""
+        """Time of recording and first bytes of every message in all files of a ROS 2 bag."""
         storage = self._reader.storage
         packed = storage.metadata.compression_mode == "message"
         for part in getattr(storage, "storages", [storage]):  # a folder with metadata.yaml has one or several files
@@ -227,9 +227,9 @@ def _open(path: Any) -> IO[bytes]:  # noqa: ANN401 - a path, or a file that stan
 
 
 def _check(path: Path) -> None:
-    """Check that a bag has plain files only, and that an SQLite file is nothing but tables.
+    """Check that a bag has plain files only, and that an SQLite file has plain tables only.
 
-    A view in the place of a table would be a program that runs when the bag is read.
+    A view in place of a table would be a program that runs when the bag is read.
     """
     if path.is_dir():
         read_text(path / "metadata.yaml", LARGEST_METADATA)
@@ -245,12 +245,12 @@ def _check(path: Path) -> None:
 
 
 def _sqlite_uri(path: Path) -> str:
-    """Address under which SQLite opens a file for reading, whatever characters its name has."""
+    """SQLite address of a file for reading, with special characters quoted."""
     return f"file:{quote(str(path))}?mode=ro&immutable=1"
 
 
 def limit_rosbags() -> None:
-    """Make rosbags give up where something unpacks to too much."""
+    """Limit the unpacked sizes in rosbags."""
     import lz4.frame
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import reader as rosbag2
@@ -265,8 +265,10 @@ def limit_rosbags() -> None:
 
 @contextmanager
 def without_definitions() -> Generator[None]:
-    """Have rosbags ignore the definitions of messages in MCAP files meanwhile: it would refuse a file for one
-    definition in a language that it does not know. Other users of rosbags in this process keep them."""
+    """Make rosbags ignore message definitions in MCAP files during the block; other users of rosbags keep them.
+
+    It would refuse a file for one definition in an unknown language.
+    """
     from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
     from rosbags.rosbag2 import storage_mcap
 
@@ -279,7 +281,7 @@ def without_definitions() -> Generator[None]:
 
 
 def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    """Decompression with a decompressor of the standard library's interface, of ``LARGEST_CHUNK`` bytes or less."""
+    """Limit a decompressor with the interface of the standard library to ``LARGEST_CHUNK`` bytes."""
 
     def decompress(data: bytes) -> bytes:
         out = make().decompress(bytes(data), LARGEST_CHUNK + 1)
@@ -291,7 +293,7 @@ def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
 
 
 class _BoundedZstd:
-    """Stands for the module zstd in the reader of bags whose messages or files are compressed one by one."""
+    """Replaces the module zstd in the reader of bags whose messages or files are compressed one by one."""
 
     def __init__(self, zstd: Any, decompress: Callable[[bytes], bytes]) -> None:  # noqa: ANN401
         self._zstd, self.decompress = zstd, decompress
@@ -304,7 +306,7 @@ class _BoundedZstd:
 
 
 class _BoundedFile:
-    """A file that is unpacked while it is read, of so many bytes or less."""
+    """A file that is unpacked while it is read, up to a number of bytes."""
 
     def __init__(self, file: IO[bytes], left: int) -> None:
         self._file, self._left = file, left
@@ -318,21 +320,21 @@ class _BoundedFile:
 
 
 JUMP = 2_000_000_000
-"""A message that lies further ahead than this, nanoseconds, is searched for; a nearer one is waited for in the stream,
-which costs less than opening a new one."""
+"""Smallest distance ahead, nanoseconds, at which a message is searched; nearer ones are reached by streaming, which
+costs less than a new stream."""
 
 
 class MessageStream:
     """Access to messages by topic and time of recording in nanoseconds.
 
-    Messages that are asked for in order are streamed through one pass over the file, in which those of the other topics
-    that are not asked for yet are kept until they lie behind; a jump opens a new pass at the wanted time.
+    Requests in order are served by one pass over the file. Messages of other topics are kept until the pass is beyond
+    them. A jump opens a new pass at the wanted time.
 
     Args:
-        start: Opens a pass over the messages of some topics from a time on: topic, time and content of each.
+        start: Opens a pass over the messages of some topics from a given time: topic, time and content of each.
 
     Attributes:
-        lock: Held while the file is read, which may be by a thread of its own.
+        lock: Held while the file is read, possibly in another thread.
     """
 
     def __init__(self, start: Callable[[list[str], int], Generator[tuple[str, int, bytes]]]) -> None:
@@ -343,7 +345,7 @@ class MessageStream:
         self._position = -1
 
     def read(self, wanted: list[tuple[str, int]]) -> list[bytes]:
-        """Messages of these topics, which are the same in every call, at these times.
+        """Messages of the same topics as in every call, at these times.
 
         Raises:
             KeyError: There is no such message.

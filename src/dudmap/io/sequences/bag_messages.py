@@ -1,7 +1,7 @@
-"""What the messages of a bag mean: its topics by type and name, the tree of frames of /tf, and images.
+"""Interpret the messages of a bag: topics by type and name, the frame tree of /tf, and images.
 
-Topics that are missing or not to be told apart are a ``DatasetError``, whose sentence lists those that are there. An
-encoding that is not known, and data that are damaged or too short, are a ``FrameError``.
+Missing or ambiguous topics raise a ``DatasetError`` that lists the topics of the bag. Unknown encodings, and damaged or
+short data, raise a ``FrameError``.
 """
 
 import re
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
 KEYS = ("color", "depth", "color_info", "depth_info", "world")
-"""What ``--topics`` can name: the topics of the images, those of their camera_info, and the world frame of /tf."""
+"""Keys of ``--topics``: topics of the images and of their camera_info, and the world frame of /tf."""
 TRANSPORTS = ("compressed", "compressedDepth")
 """Last parts of the topics that image_transport adds for its encodings."""
 DEPTH_NAME = re.compile(r"depth")
@@ -33,7 +33,7 @@ REGISTERED_NAME = re.compile(r"aligned|depth_registered|depth_to_(rgb|color)|hw_
 
 
 class Topics(NamedTuple):
-    """Connections of the two images and of their camera_info, if any; and the world frame of /tf.
+    """Connections of both images and of their camera_info, if any; and the world frame of /tf.
 
     Without colour both images are the depth image.
     """
@@ -46,12 +46,12 @@ class Topics(NamedTuple):
 
     @property
     def registered(self) -> bool:
-        """Whether the name of the depth topic says that it is registered to colour."""
+        """Whether the name of the depth topic indicates registration to colour."""
         return bool(REGISTERED_NAME.search(self.depth.topic))
 
 
 def chosen_topics(text: str | None) -> dict[str, str]:
-    """The chosen topics ``color=/a,depth=/b`` by key."""
+    """Chosen topics of ``color=/a,depth=/b`` by key."""
     chosen = {}
     for part in (text or "").split(","):
         key, found, value = (piece.strip() for piece in part.partition("="))
@@ -68,7 +68,7 @@ def chosen_topics(text: str | None) -> dict[str, str]:
 def find_topics(
     connections: "Sequence[Connection]", chosen: dict[str, str], bag: str, first: "Callable[[Connection], Any]"
 ) -> Topics:
-    """The chosen topics; the other ones are recognised by their names, else by their encodings.
+    """Chosen topics; other topics are recognised by their names, else by their encodings.
 
     ``first`` gives the first message of a topic.
     """
@@ -104,7 +104,7 @@ def find_topics(
 
 
 def base(topic: str) -> str:
-    """Topic without the part that names the transport."""
+    """Topic without the name of the transport."""
     head, _, last = topic.rpartition("/")
     return head if last in TRANSPORTS else topic
 
@@ -112,7 +112,7 @@ def base(topic: str) -> str:
 def _best(
     pairs: "list[tuple[Connection, Connection]]", images: "Sequence[Connection]", bag: str
 ) -> "tuple[Connection, Connection]":
-    """The pair of one camera, rather registered than not, rectified than raw, and raw data than compressed."""
+    """The pair of one camera; registered is preferred to unregistered, rectified to raw, and raw data to compressed."""
 
     def score(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair
@@ -131,7 +131,7 @@ def _best(
 
     ranked = sorted(pairs, key=score, reverse=True)
     if not ranked:
-        raise DatasetError(f"{bag} holds depth but no colour images beside them: {_listed(images)}")
+        raise DatasetError(f"{bag} holds depth but no matching colour images: {_listed(images)}")
     if len(ranked) > 1 and score(ranked[0]) == score(ranked[1]):
         raise DatasetError(
             f"several topics of {bag} fit equally: {_listed(images)}; choose with --topics color=/...,depth=/..."
@@ -140,7 +140,7 @@ def _best(
 
 
 def _info_of(image: "Connection", infos: "Sequence[Connection]") -> "Connection | None":
-    """The camera_info beside an image, as image_transport places it; RealSense's old files have it in ``info``."""
+    """The camera_info of an image, as placed by image_transport, or in ``info`` (old RealSense files)."""
     parent = base(image.topic).rpartition("/")[0]
     names = (f"{parent}/camera_info", f"{parent.removesuffix('/image')}/info/camera_info")
     return next((info for name in names for info in infos if info.topic == name), None)
@@ -157,7 +157,7 @@ def _is_color(connection: "Connection") -> bool:
 
 
 def _kind(image: Any) -> str:  # noqa: ANN401 - the type is made from the bag
-    """Whether an Image or CompressedImage is "depth" or "colour" by its encoding; empty if that may be either."""
+    """ "depth" or "colour" by the encoding of an Image or CompressedImage; empty if it may be either."""
     if hasattr(image, "format"):
         form = image.format.lower()
         return "depth" if "compresseddepth" in form else "colour" if re.match(r"(rgb|bgr)a?8|jpe?g", form) else ""
@@ -180,13 +180,13 @@ def _listed(connections: "Iterable[Connection]") -> str:
 
 STATIC_TOPIC, TOPIC = "/tf_static", "/tf"
 LARGEST_GAP = 0.2
-"""Poses are not interpolated across gaps longer than this, seconds: a motion capture at 10 Hz may miss one."""
+"""Longest gap across which poses are interpolated, seconds: a motion capture at 10 Hz may miss one."""
 
 
 class TransformTree:
-    """Motions between named frames: each frame has one parent, and its motions by time, of which a static one has one.
+    """Motions between named frames: each frame has one parent, and motions by time; a static frame has one motion.
 
-    Names count without the leading slash that tf wrote and tf2 does not.
+    Names are compared without the leading slash, which tf wrote and tf2 does not.
     """
 
     def __init__(self) -> None:
@@ -203,9 +203,9 @@ class TransformTree:
             self._motions[child] = motions
 
     def between(self, target: str, source: str) -> NDArray[np.float64] | None:
-        """Motion (4, 4) of points of ``source`` into ``target`` along frames that do not move, None if there is none.
+        """Motion (4, 4) of points of ``source`` into ``target`` along static frames, None if there is none.
 
-        A frame that /tf repeats without change does not move.
+        A frame that /tf repeats without change is static.
         """
         up, down = self._path(source), self._path(target)
         common = next((frame for frame in up if frame in down), None)
@@ -217,11 +217,11 @@ class TransformTree:
         return se3.inverse(T_common_target) @ T_common_source
 
     def reaches(self, world: str, frame: str) -> bool:
-        """Whether ``frame`` hangs below ``world``."""
+        """Whether ``frame`` is a descendant of ``world``."""
         return world.lstrip("/") in self._path(frame)[1:]
 
     def trajectory(self, world: str, frame: str, stamps: NDArray[np.float64]) -> Trajectory | None:
-        """Poses of ``frame`` in ``world`` at those of the times (N,) that all motions on the way cover.
+        """Poses of ``frame`` in ``world`` at the times (N,) that all motions between the two cover.
 
         Motions are interpolated on the screw between their neighbours in time.
         """
@@ -252,7 +252,7 @@ class TransformTree:
         return path
 
     def _fixed(self, children: list[str]) -> NDArray[np.float64] | None:
-        """Motion of points of the first of the frames into the parent of the last one; None if it changes."""
+        """Motion of points of the first frame into the parent of the last one; None if it changes."""
         T = np.eye(4)
         for child in children:
             link, *others = self._motions[child].values()
@@ -293,8 +293,7 @@ COLOR_ENCODINGS = {
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encoding to type: 16-bit values in millimetres, or metres as floats (ROS REP 118)."""
 COMPRESSED_DEPTH_HEADER = struct.Struct("<i2f")
-"""Number of the format and the two parameters of the quantisation, before the PNG (ROS package
-compressed_depth_image_transport)."""
+"""Format number and two quantisation parameters before the PNG (ROS package compressed_depth_image_transport)."""
 
 
 def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - the type is made from the bag
@@ -341,7 +340,7 @@ def _pixels(message: Any, kind: np.dtype, channels: int, name: str) -> NDArray[A
 
 
 def _compressed_depth(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth of a PNG with or without the header of compressed_depth_image_transport, or of its RVL.
+    """Depth of a PNG or RVL image, with or without the header of compressed_depth_image_transport.
 
     Floats are stored as 16-bit values q of inverse depth, z = a / (q - b), with the parameters a and b in the header.
     """

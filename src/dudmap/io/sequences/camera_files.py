@@ -1,6 +1,7 @@
-"""Intrinsics in files: where they lie; JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr, ORB-SLAM.
+"""Find intrinsics in files of known names: JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr,
+ORB-SLAM.
 
-A file that cannot be read or understood, or that tells of too many cameras, is a ``DatasetError``.
+A file that cannot be read or understood, or that holds too many cameras, raises a ``DatasetError``.
 """
 
 import math
@@ -33,35 +34,35 @@ FILES = (
     "intrinsics.txt", "intrinsics.K.txt", "K.txt", "cam_K.txt", "camera-intrinsics.txt", "camera_intrinsics.txt",
     "intrinsic.txt", "camera-intrinsics.npy", "intrinsics.npy", "cam_K.npy", "K.npy",
 )  # fmt: skip
-"""Files of one camera: text that ``from_file`` understands, or a matrix as an array. The first that is there counts."""
+"""Files of one camera: text for ``from_file``, or a matrix as an array. The first existing file is used."""
 TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intrinsic.json", "intrinsic.json")
-"""Files of one or two cameras; in the folder itself any JSON or YAML file that is named like one (``NAMED``)."""
+"""Files of one or two cameras. In the folder itself, also any JSON or YAML file with such a name (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
 SETTINGS = "Camera.", "Camera1."
-"""What keys of cameras begin with in settings files of ORB-SLAM, which have any name: they hold "Camera.fx: "."""
+"""Prefixes of camera keys in settings files of ORB-SLAM. These have any name and hold "Camera.fx: "."""
 LARGEST_SETTINGS = 1 << 16
-"""Characters in which they are looked for."""
+"""Characters of such a file that are searched for them."""
 LARGEST_LIST = 5
-"""Kinds of files that a message lists."""
+"""Most kinds of files listed in a message."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".webp")
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
     "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"),
     "height": ("height", "h", "image_height"), **{key: (key,) for key in DISTORTION_KEYS},
 }  # fmt: skip
-"""Our key and the names it has in JSON and YAML files."""
+"""dudmap's keys and their names in JSON and YAML files."""
 SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor", "DepthMapFactor", "RGBD.DepthMapFactor")
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs",
           "dist_coeff", "dist", "D", "d")  # fmt: skip
-"""Names of the intrinsic matrix and of the coefficients of the lens: a list, or a ``data`` list as OpenCV writes it."""
+"""Names of the intrinsic matrix and of the lens coefficients: a list, or OpenCV's ``data`` list."""
 OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
 MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
-"""Names of a 4x4 matrix that takes points of the depth camera to the colour camera."""
+"""Names of a 4x4 matrix that maps points of the depth camera to the colour camera."""
 
 
 def find(folder: Path) -> Intrinsics | None:
-    """Intrinsics that lie in a folder or in the one above it; None without a file of a known name."""
+    """Intrinsics in a folder or its parent; None without a file of a known name."""
     for place in (folder, folder.resolve().parent):
         for file in (place / name for name in FILES):
             if file.is_file() and file.suffix == ".npy":
@@ -86,7 +87,7 @@ class UnclearFilesError(DatasetError):
 
 
 def _of_file(file: Path) -> Intrinsics:
-    """Intrinsics of a text file: as ``from_file`` expects them, else the only camera in it."""
+    """Intrinsics of a text file: in the form of ``from_file``, else the only camera in it."""
     from dudmap.io.sequences.camera_content import cameras_in
 
     try:
@@ -99,16 +100,16 @@ def _of_file(file: Path) -> Intrinsics:
 
 
 def unknown(folder: Path, why: str = "") -> DatasetError:
-    """Error on a recording without intrinsics, which names what is there and how to give them."""
+    """Error on a recording without intrinsics; names the existing files and the remedy."""
     return DatasetError(
-        f"the camera of {folder} is not known{why}: neither {', '.join(FILES[:4])} nor another file of intrinsics that "
-        f"is read (docs/formats.md) lies there or one folder up, only {seen(folder)}; give --camera "
+        f"the camera of {folder} is not known{why}: neither {', '.join(FILES[:4])} nor another known file of "
+        f"intrinsics (docs/formats.md) is in it or its parent, only {seen(folder)}; give --camera "
         "fx,fy,cx,cy[,w,h[,depth_scale]]"
     )
 
 
 def seen(folder: Path) -> str:
-    """What lies in a folder: names with their numbers replaced by N, and how many there are of each."""
+    """Content of a folder: names with numbers replaced by N, and the count of each."""
     kinds = Counter(re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
     shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:LARGEST_LIST]]
     return ", ".join(shown) + (" ..." if len(kinds) > LARGEST_LIST else "") if shown else "nothing"
@@ -117,8 +118,8 @@ def seen(folder: Path) -> str:
 def load(paths: Iterable[Path]) -> Intrinsics:
     """Intrinsics of JSON and YAML files: of one camera, or of a depth and a colour camera.
 
-    Every object that holds focal lengths and a principal point is a camera; it is a depth camera where a name on the
-    way to it, the file's included, contains "depth". A depth scale below 1 is metres per unit.
+    Every object with focal lengths and a principal point is a camera. It is a depth camera if the file name or a parent
+    key contains "depth". A depth scale below 1 is metres per unit.
 
     Args:
         paths: The files.
@@ -152,7 +153,7 @@ def load(paths: Iterable[Path]) -> Intrinsics:
 
 
 def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
-    """Numbers by our keys of one JSON object; None if it is no camera.
+    """Numbers by dudmap's keys of one JSON object; None if it is no camera.
 
     A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
     """
@@ -188,7 +189,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Nested dictionaries and lists of a YAML file; OpenCV's header and type names are left out."""
+    """Nested dictionaries and lists of a YAML file, without OpenCV's header and type names."""
     try:
         text = re.sub(r"^%YAML.*\n|!!opencv-\w+", "", read_text(path, LARGEST_TREE))
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
@@ -241,7 +242,7 @@ def depth_scale(tree: Any) -> float | None:  # noqa: ANN401
 
 
 def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Value of the first of some names, of a matrix in OpenCV's form its data."""
+    """Value of the first existing name; the data of a matrix in OpenCV's form."""
     value = next((tree[name] for name in names if name in tree), None)
     return value.get("data") if isinstance(value, dict) else value
 
@@ -251,7 +252,7 @@ def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON
 
 
 def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Numbers (count,) of a list or of a list of rows; None if it is something else."""
+    """Numbers (count,) of a list or of a list of rows; None for other values."""
     if not isinstance(value, list):
         return None
     flat = [number for row in value for number in (row if isinstance(row, list) else [row])]

@@ -1,6 +1,6 @@
 """Depth in OpenEXR images (https://openexr.com/en/latest/OpenEXRFileLayout.html), as Record3D and Blender write it.
 
-Read are files of one part, in lines, uncompressed or deflated by zlib; OpenCV's own decoder is not in its wheels.
+Supported are files of one part, in lines, uncompressed or deflated by zlib; OpenCV's wheels lack its decoder.
 """
 
 import struct
@@ -22,7 +22,7 @@ LINES = {0: 1, 2: 1, 3: 16}
 KINDS = ("<u4", "<f2", "<f4")
 """Types of the values of a channel, by their number."""
 DEPTH_CHANNELS = "RYVZ"
-"""Last letter of the names of the channels that hold depth; the later ones more surely than the earlier ones."""
+"""Last letter of depth channel names, by increasing certainty."""
 
 
 def decode(data: bytes, name: str) -> NDArray[np.float32]:
@@ -60,7 +60,7 @@ def _header(data: bytes) -> tuple[dict[str, bytes], int]:
 
 
 def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
-    """Name and type of the channels in the order of the file; those with fewer pixels than the image are not read."""
+    """Names and types of the channels in file order; channels with fewer pixels than the image are refused."""
     at = 0
     while listed[at]:
         end = listed.index(b"\0", at)
@@ -72,7 +72,7 @@ def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _inflated(block: bytes, size: int) -> bytes:
-    """Bytes of a block: as they are where they did not become fewer, else the differences of two halves, deflated."""
+    """Bytes of a block: stored as they are, or deflated differences of two halves if that is smaller."""
     if len(block) == size:
         return block
     packed = np.frombuffer(zlib.decompressobj().decompress(block, size + 1), np.uint8)

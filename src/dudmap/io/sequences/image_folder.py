@@ -20,19 +20,19 @@ from dudmap.io.sequences.pose_matrices import read_matrices, read_matrix, rigid_
 from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
-"""Number of evenly spread frames that are tried until one is valid and gives the image size."""
+"""Evenly spread frames that are tried until one is valid and gives the image size."""
 OFF_CENTER = 0.08
-"""Distance of the principal point from the middle, as a share of the image, from which intrinsics seem to be those of
-other images."""
+"""Distance of the principal point from the image centre, as a share of the image, beyond which intrinsics seem to
+belong to other images."""
 FRAME_RATE = 30.0
-"""Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
+"""Assumed frames per second of recordings with frame numbers only: the rate of most depth cameras."""
 
 
 class ImageFolder(Recording):
     """Base class of recordings whose frames are a colour file and a depth file each, or, without colour, a depth file.
 
-    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``). Optionally
-    it defines cameras for recordings without a file of intrinsics (``published``), the ground truth
+    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``).
+    Optionally it defines cameras for recordings without a file of intrinsics (``published``), the ground truth
     (``_find_ground_truth``) and the storage of an image (``_read_depth``).
 
     Args:
@@ -46,15 +46,15 @@ class ImageFolder(Recording):
 
     options: tuple[str, ...] = ("fps", "depth_unit")
     depth_scale = 1000.0
-    """Depth units per metre where neither the recording nor the user says otherwise."""
+    """Default depth units per metre."""
     color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
     depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
     pose_files: tuple[str, str] | None = None
-    """Folder, and pattern of the names of its numbered files: images, and true poses, a matrix camera to world each."""
+    """Folder and name pattern of numbered files: images, and camera-to-world matrices."""
     pose_list = ""
-    """File of true poses with a matrix camera to world per frame."""
+    """File of true poses with a camera-to-world matrix per frame."""
     published: tuple[str, dict[str, float]] | None = None
-    """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
+    """Name and published camera of the data set, for formats of one data set."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -89,7 +89,7 @@ class ImageFolder(Recording):
         self._unit_remark = "" if given and self.rotated is Rotated.YES else self.rotated.value
 
     def set_depth_unit(self, unit: float) -> None:
-        """As for ``Recording``; values that are rotated by three bits stay so if the unit is 0.125 mm."""
+        """As for ``Recording``; rotated values stay rotated if the unit is 0.125 mm."""
         super().set_depth_unit(unit)
         self._look_for_rotation(given=True)
         self.rotated, self._unit_remark = self.rotated if self.rotated is Rotated.YES else Rotated.NO, ""
@@ -101,7 +101,7 @@ class ImageFolder(Recording):
         return f"the recording{taken}"
 
     def _take_truth(self) -> None:
-        """Set the ground truth, which no run needs: one that cannot be read is left out, and ``remarks`` say so."""
+        """Set the ground truth. If it cannot be read it is omitted, with a remark, because no run needs it."""
         try:
             self.ground_truth = self._find_ground_truth()
             said = self.ground_truth.remarks if self.ground_truth is not None else ()
@@ -140,10 +140,10 @@ class ImageFolder(Recording):
         )
 
     def set_rate(self, fps: float) -> None:
-        """Replace the assumed rate of numbered frames: as many of the usual steps of their numbers make a second.
+        """Replace the assumed rate of numbered frames, in usual steps of their numbers per second.
 
         Raises:
-            DatasetError: The recording has times of its own.
+            DatasetError: The recording has its own times.
         """
         if self.timed:
             raise DatasetError(
@@ -170,7 +170,7 @@ class ImageFolder(Recording):
         return camera_search.known(self.path, self._published(), self._sizes)
 
     def _sizes(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
-        """Width and height of the depth and the colour images, of the first pair that can be read."""
+        """Width and height of the depth and the colour images, from the first readable pair."""
         for color, depth in self._pairs[:PROBES]:
             try:
                 height, width = self._read_depth(depth.path, 1.0).shape
@@ -181,14 +181,14 @@ class ImageFolder(Recording):
         return None
 
     def _published(self) -> intrinsics.Intrinsics | None:
-        """Intrinsics of the data set, where the layout or a name tells which one it is."""
+        """Intrinsics of the data set, if layout or name identify it."""
         return None if self.published is None else intrinsics.by_name(*self.published)
 
     def _one_view(self, cameras: list[dict[str, float]], source: str) -> intrinsics.Intrinsics:
         """Intrinsics of depth images that show the view of the colour images, in the same or another size.
 
         Args:
-            cameras: Numbers by key of each colour image; their median is taken.
+            cameras: Numbers by key of each colour image; their median is used.
             source: Origin of the numbers.
         """
         color, depth = (self._read_color(self._pairs[0][0].path), self._read_depth(self._pairs[0][1].path, 1.0))
@@ -214,15 +214,16 @@ class ImageFolder(Recording):
         return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(read_matrices(file)))
 
     def _stamped_poses(self) -> Trajectory | None:
-        """Poses of groundtruth.txt as they stand there, None if there is no such file."""
+        """Poses of groundtruth.txt without conversion, None if there is no such file."""
         file = self.path / "groundtruth.txt"
         return Trajectory.load(file, optional=True) if file.is_file() else None
 
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
     ) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``, or, where the
-        numbers only count the frames, over ``FRAME_RATE``.
+        """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``.
+
+        With None, the numbers only count the frames, and the rate is ``FRAME_RATE``.
         """
         numbers = sorted(colors.keys() & depths.keys())
         if not numbers:
@@ -236,7 +237,7 @@ class ImageFolder(Recording):
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
     def _alone(self, depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
-        """Pairs of depth files, which have no colour, with themselves."""
+        """Pair depth files of a recording without colour with themselves."""
         self.has_color, self._pairing = False, f"{len(depths)} depth images without colour"
         return [(depth, depth) for depth in depths]
 
@@ -262,11 +263,11 @@ class ImageFolder(Recording):
         return images.read_color(path)
 
     def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
-        """The given intrinsics; with the colour camera of the recording where colour has another size than depth."""
+        """The given intrinsics, with the recording's colour camera if colour has another size than depth."""
         given = intrinsics.given(camera)
         try:
             own = self._find_intrinsics()
-        except DatasetError:  # the recording does not give them, which is why the user does
+        except DatasetError:  # the user gives intrinsics because the recording lacks them
             return given
         shape = own.color and self._read_depth(self._pairs[0][1].path, 1.0).shape
         if not own.color or (own.color["height"], own.color["width"]) == shape:
@@ -292,8 +293,10 @@ class ImageFolder(Recording):
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame; an unknown colour camera of another size is taken to have its
-        field of view."""
+        """Camera with the size of the first valid frame.
+
+        A missing colour camera of another size is assumed to have the depth camera's field of view.
+        """
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -304,7 +307,7 @@ class ImageFolder(Recording):
             if frame.depth.any():
                 camera = known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
                 if self.calibration is None and frame.rgb.shape[:2] != camera.shape:
-                    if not _is_centered(camera):  # then the intrinsics may be those of the colour images
+                    if not _is_centered(camera):  # the intrinsics may belong to the colour images
                         problem = problem or self._unequal(int(index), frame)
                         continue
                     self.calibration = Calibration(_same_view(camera, *frame.rgb.shape[:2]))
@@ -315,7 +318,7 @@ class ImageFolder(Recording):
 
 
 def _is_centered(camera: Camera) -> bool:
-    """Whether the principal point is near to the middle of the image."""
+    """Whether the principal point is near the image centre."""
     middle, size = np.array([camera.cx, camera.cy]) + 0.5, np.array([camera.width, camera.height])
     return bool(np.all(np.abs(middle / size - 0.5) < OFF_CENTER))
 
@@ -336,6 +339,6 @@ def size(image: NDArray) -> str:
 
 
 def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
-    """Files by the number that the first group of a pattern of the whole file name holds; others are left out."""
+    """Files by the number in the first group of a pattern of the whole file name; other files are skipped."""
     matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
     return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}

@@ -1,5 +1,5 @@
-"""Files that hold frame after frame: ScanNet's ``.sens`` (Dai et al. 2017), ElasticFusion's ``.klg``, and the ``.r3d``
-of the iPhone application Record3D, a ZIP archive of JPEG colour and LZFSE depth."""
+"""Files with one frame after another: ScanNet's ``.sens`` (Dai et al. 2017), ElasticFusion's ``.klg`` and Record3D's
+``.r3d``. The latter is a ZIP archive of JPEG colour and LZFSE depth."""
 
 import struct
 import zipfile
@@ -28,11 +28,11 @@ SENS_FRAME = struct.Struct("<16f4Q")
 KLG_FRAME = struct.Struct("<qii")
 """Time in microseconds, bytes of the depth image and bytes of the colour image."""
 PERIOD = 1 / 30
-"""Seconds between frames that have no usable times: the rate of ScanNet's Structure Sensor."""
+"""Seconds between frames without usable times: the rate of ScanNet's Structure Sensor."""
 
 
 class FrameEntry(NamedTuple):
-    """Place of a frame in the file, bytes of its two images in the order of the file, and time in microseconds."""
+    """Offset of a frame in the file, bytes of its two images in file order, and times in microseconds."""
 
     offset: int
     sizes: tuple[int, int]
@@ -41,7 +41,7 @@ class FrameEntry(NamedTuple):
 
 
 class _FrameLog(Recording):
-    """Base of the formats that hold two images after each header; opening walks over the headers."""
+    """Base of the formats that hold two images after each header; opening reads only the headers."""
 
     options: tuple[str, ...] = ("depth_unit",)
     _entries: list[FrameEntry]
@@ -71,8 +71,8 @@ class _FrameLog(Recording):
 class SensRecording(_FrameLog):
     """Recording in a ``.sens`` file.
 
-    The colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
-    holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
+    ScanNet's colour images are larger than the depth images and come from another camera, which ``calibration`` holds.
+    Frames whose times are all zero or do not increase are assumed to be 1/30 s apart.
     """
 
     format = "ScanNet .sens"
@@ -98,7 +98,7 @@ class SensRecording(_FrameLog):
         self.ground_truth = truth if valid.any() else None
 
     def _read_header(self, file: IO[bytes], camera: Camera | str | None) -> int:
-        """Set the cameras, and give the number of frames."""
+        """Set the cameras, and return the number of frames."""
         (version,) = _unpack(file, "<I")
         if version != SENS_VERSION:
             raise DatasetError(
@@ -149,9 +149,8 @@ class SensRecording(_FrameLog):
 class KlgRecording(_FrameLog):
     """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
-    Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
-    the image size: the intrinsics must be given, and the size comes from them, else from the first JPEG image, else it
-    is 640x480, which the logger always wrote.
+    Depth is in millimetres (raw or zlib), colour raw or JPEG. The file gives no intrinsics, so they must be given. The
+    image size comes from them, else from the first JPEG image, else it is the logger's 640x480.
     """
 
     format = "ElasticFusion .klg"
@@ -196,7 +195,7 @@ class KlgRecording(_FrameLog):
         return 640, 480
 
     def _read_index(self) -> list[FrameEntry]:
-        """Places of the frames, without reading the images."""
+        """Offsets of the frames, without reading the images."""
         entries, end = [], self.path.stat().st_size
         with open_plain(self.path) as file:
             head = file.read(4)
@@ -222,15 +221,15 @@ def _unpack(file: IO[bytes], form: str) -> tuple:
 
 
 LARGEST_COMMAND = 315 + 2359
-"""Bytes that one command of an LZFSE block can write."""
+"""Most bytes that one command of an LZFSE block can write."""
 
 
 class Record3DRecording(Recording):
     """Recording in a ``.r3d`` file.
 
-    The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same
-    place, so that the depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Readings
-    of confidence 0 are left out. The poses in the file are estimates of ARKit and therefore no ground truth.
+    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place. The
+    depth camera is therefore the colour camera resized, and ``calibration`` holds the colour camera. Depth of
+    confidence 0 is omitted. Poses in the file are ARKit's estimates and no ground truth.
     """
 
     format = "Record3D .r3d"
@@ -276,7 +275,7 @@ class Record3DRecording(Recording):
         try:
             data = self._lzfse.decompress(packed)
         except (self._lzfse.error, MemoryError) as error:
-            # where a block ends too early, the decoder asks for more and more memory, which it does not use
+            # if a block ends too early, the decoder allocates more and more memory
             raise FrameError(f"{name} cannot be decompressed: {error or 'a block ends too early'}") from error
         if len(data) != np.dtype(kind).itemsize * width * height:
             raise FrameError(f"{name} has {len(data)} bytes; expected {width}x{height} pixels of {kind}")
@@ -303,10 +302,10 @@ class Record3DRecording(Recording):
 
 
 def largest_unpacked(packed: bytes) -> int:
-    """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks alone.
+    """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks.
 
-    A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (reference implementation of
-    Apple, lzfse_internal.h, whose decoder does not stop at the size that the block declares); other blocks declare it.
+    A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (Apple's reference
+    implementation, lzfse_internal.h). Its decoder does not stop at the declared size. Other blocks declare their size.
 
     Raises:
         ValueError: A block is cut off or of another kind.

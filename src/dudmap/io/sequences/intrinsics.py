@@ -1,6 +1,6 @@
-"""Intrinsics of a recording: from text, from its own file, or the published ones of its data set; lenses.
+"""Intrinsics of a recording: from text, from its own file, or published for its data set; lenses.
 
-Numbers that are missing, invalid or for images of another size are a ``DatasetError``.
+Numbers that are missing, invalid or for images of another size raise a ``DatasetError``.
 """
 
 import math
@@ -21,16 +21,16 @@ from dudmap.input_files import read_text
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 DEPTH_SCALE = 5000.0
-"""Depth units per metre in the TUM layout, where nothing else is given."""
+"""Default depth units per metre in the TUM layout."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
 COLOR_PREFIX = "color_"
-"""Prefix of the keys of a second camera for the colour images, with fx, fy, cx, cy, width and height, which are
-required, and the coefficients of its distortion."""
+"""Prefix of the keys of a separate colour camera: fx, fy, cx, cy, width and height (required), and its distortion
+coefficients."""
 COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 SAME_SHAPE = 0.01
-"""Relative difference of the sides' ratio up to which images of two sizes may show the same view."""
+"""Largest relative difference of aspect ratios at which images of two sizes may show the same view."""
 MOTION_KEY = "T_depth_color"
-"""Key of the 12 or 16 numbers, row by row, of the motion that takes points of the colour camera to the depth camera."""
+"""Key of the motion from the colour camera to the depth camera: 12 or 16 numbers, row by row."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Intrinsics:
     """Intrinsics before the image size is known.
 
     Attributes:
-        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present, the others where they are known.
+        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present, others optional.
         source: Origin of the numbers, for error messages.
-        color: Numbers by key of the camera of the colour images, empty if it is the same.
+        color: Numbers of the colour images' camera by key, empty if it is the same.
         T_depth_color: (4, 4) points of the colour camera to the depth camera.
     """
 
@@ -60,7 +60,7 @@ class Intrinsics:
 
         Args:
             width, height: Size of the depth images.
-            depth_scale: Units per metre where they are not known.
+            depth_scale: Default units per metre.
         """
         values = {"depth_scale": depth_scale, "width": width, "height": height} | self.values
         camera = _camera(values, values["depth_scale"])
@@ -198,12 +198,12 @@ def _is_number(text: str) -> bool:
 
 
 BROWN, RATIONAL, FISHEYE = "plumb_bob", "rational_polynomial", "equidistant"
-"""Models of distortion by their names in ROS: Brown-Conrady, its rational extension (both Brown 1971, as OpenCV
-implements them), and the angle polynomial of Kannala and Brandt (2006)."""
+"""Distortion models by their names in ROS. Brown-Conrady and its rational extension (Brown 1971) are as in OpenCV; the
+angle polynomial is by Kannala and Brandt (2006)."""
 INVERSE = "inverse_brown_conrady"
 """Brown's polynomial from distorted to undistorted coordinates, which RealSense uses for colour."""
 OTHER_NAMES = {"brown_conrady": BROWN, "modified_brown_conrady": BROWN, "kannala_brandt4": FISHEYE, "": BROWN}
-"""Names that librealsense gives to the same models."""
+"""Names of the same models in librealsense."""
 GRID = 24
 """Points across and down the image to which an inverse model is fitted."""
 
@@ -224,7 +224,7 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera, model: str, coefficients: "tuple[float, ...]") -> "Lens":
-        """Lens with up to five Brown coefficients in the camera itself, or others that are removed at reading.
+        """Lens with up to five Brown coefficients in the camera itself; others are removed when images are read.
 
         Raises:
             DatasetError: The model is not known.
@@ -245,7 +245,7 @@ class Lens:
         )
 
     def rectify(self, image: NDArray[Any], *, depth: bool) -> NDArray[Any]:
-        """Image (H, W[, C]) without distortion, with the same intrinsics; depth is not interpolated."""
+        """Undistorted image (H, W[, C]) with the same intrinsics; depth is not interpolated."""
         import cv2
 
         if not self.model:
@@ -256,7 +256,7 @@ class Lens:
 
     @cached_property
     def _pixels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Recorded pixel coordinates (H, W) of every pixel without distortion."""
+        """Recorded pixel coordinates (H, W) of every undistorted pixel."""
         import cv2
 
         size, D = (self.camera.width, self.camera.height), np.array(self.coefficients)
@@ -269,10 +269,10 @@ class Lens:
 
 
 def brown_of_inverse(camera: Camera, inverse: "tuple[float, ...]") -> tuple[float, ...]:
-    """Coefficients k1 k2 p1 p2 k3 of the lens whose inverse is Brown's polynomial with the given coefficients.
+    """Coefficients k1 k2 p1 p2 k3 of a lens whose inverse is Brown's polynomial with the given coefficients.
 
-    With distorted coordinates d and undistorted ones u = d + B(d; inverse), they solve u + B(u; c) = d in the least
-    squares over the image; B is linear in its coefficients.
+    Let d be distorted coordinates and u = d + B(d; inverse) undistorted ones. The coefficients c solve u + B(u; c) = d
+    by least squares over the image; B is linear in c.
     """
     us, vs = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
     d = np.stack([(us.ravel() - camera.cx) / camera.fx, (vs.ravel() - camera.cy) / camera.fy])

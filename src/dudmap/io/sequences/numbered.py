@@ -108,7 +108,7 @@ def _timed(files: dict[float, Path]) -> list[TimedFile]:
 
 BOP_FILE = "scene_camera.json"
 LARGEST_CHANGE = 0.5
-"""Largest difference of the intrinsics of two images, pixels: below what shifts an edge by a pixel."""
+"""Largest difference of the intrinsics of two images, pixels: no image edge shifts by a pixel."""
 
 
 class BopSequence(NumberedSequence):

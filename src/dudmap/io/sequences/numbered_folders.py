@@ -22,8 +22,8 @@ from dudmap.io.sequences.pose_matrices import read_log, read_matrix, rigid_traje
 class EpflSequence(ImageFolder):
     """Folder of the EPFL RGB-D Pedestrian data set (Bagautdinov et al. 2015) with the images of a Kinect v2 at rest.
 
-    It is called such as ``epfl_lab/20140804_160621_00`` and holds ``rgb000033.png`` and ``depth000033.png`` (mm). Both
-    rooms have one published camera, colour is mapped to depth.
+    A folder such as ``epfl_lab/20140804_160621_00`` holds ``rgb000033.png`` and ``depth000033.png`` (mm). Both rooms
+    have one published camera; colour is mapped to depth.
     """
 
     format = "EPFL RGB-D Pedestrian"
@@ -36,8 +36,8 @@ class EpflSequence(ImageFolder):
 class ReplicaSequence(ImageFolder):
     """Folder of Replica as rendered for NICE-SLAM (Zhu et al. 2022): ``results/frame000000.jpg``, ``depth000000.png``.
 
-    ``traj.txt`` has one pose per line, 16 numbers, camera to world, x right, y down. cam_params.json lies in the folder
-    or, as downloaded, in the one above that holds all rooms; without it the camera is that of these renders.
+    ``traj.txt`` has one pose per line, 16 numbers, camera to world, x right, y down. cam_params.json is in the folder
+    or its parent; without it the camera of these renderings is used.
     """
 
     format = "Replica (NICE-SLAM)"
@@ -51,9 +51,9 @@ class ReplicaSequence(ImageFolder):
 class ScanNetSequence(ImageFolder):
     """Folder of ScanNet (Dai et al. 2017) as its SensReader exports it: color, depth (mm), pose and intrinsic.
 
-    Colour and depth have their own intrinsics (4x4 matrices) and, where exported, extrinsics E that take the points of
-    a camera to a common frame: ``T_color_depth = E_color^-1 E_depth``. Frames whose pose is infinite were lost by the
-    data set's own system and have no truth.
+    Colour and depth have separate intrinsics (4x4 matrices). Exported extrinsics E map the points of a camera to a
+    common frame: ``T_color_depth = E_color^-1 E_depth``. Frames with an infinite pose were lost by the data set's own
+    system and have no ground truth.
     """
 
     format = "ScanNet export"
@@ -86,15 +86,15 @@ class ScanNetSequence(ImageFolder):
 
 
 def _parameter(path: Path, name: str) -> Path | None:
-    """File of the folder ``intrinsic``, or beside the images under the name of the 25k subset."""
+    """File of the folder ``intrinsic``, or next to the images under the name of the 25k subset."""
     places = (path / "intrinsic" / name, path / name, path / name.replace("intrinsic_", "intrinsics_"))
     return next((place for place in places if place.is_file()), None)
 
 
 SEVEN_SCENES_DEPTH = camera_values(585, 585, 320, 240, 640, 480)
-"""Depth camera that the 7-Scenes page gives."""
+"""Depth camera given on the 7-Scenes page."""
 SEVEN_SCENES_COLOR = camera_values(525, 525, 320, 240, 640, 480)
-"""Colour camera that work on 7-Scenes uses (DSAC*, Brachmann and Rother 2021); the page gives none."""
+"""Colour camera used for 7-Scenes (DSAC*, Brachmann and Rother 2021); the page gives none."""
 KINECT_COLOR_DEPTH = np.array(
     [
         [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
@@ -103,16 +103,16 @@ KINECT_COLOR_DEPTH = np.array(
         [0, 0, 0, 1],
     ]
 )
-"""Points of the depth camera of one Kinect into its colour camera (LIRIS), which DSAC* takes for 7-Scenes. ``dudmap
-calibrate`` on 200 frames of a recording finds no better place, focal length or principal point than these."""
+"""Motion of points of a Kinect's depth camera into its colour camera (LIRIS), used by DSAC* for 7-Scenes. ``dudmap
+calibrate`` on 200 frames confirms position, focal length and principal point."""
 SEVEN_SCENES = r"(7|seven)[-_ ]?scenes|/(chess|fire|heads|office|pumpkin|red_?kitchen|stairs)/seq-\d+$"
 """Path of a recording of 7-Scenes: the name of the set, or of one of its scenes above ``seq-01``."""
 LOST = 65535
-"""Value of a pixel without reading in 7-Scenes."""
+"""Value of a missing depth pixel in 7-Scenes."""
 
 
 class FrameFiles(ImageFolder):
-    """Base of the formats whose files are named ``frame-000000``; poses are camera to world, one file per frame."""
+    """Base of the formats with files named ``frame-000000``; poses are camera to world, one file per frame."""
 
     color_files = "", r"frame-(\d+)\.(?:color|rgb)\.(?:png|jpe?g)"
     depth_files, pose_files = ("", r"frame-(\d+)\.depth\.(?:png|pgm)"), ("", r"frame-(\d+)\.pose\.txt")
@@ -121,9 +121,9 @@ class FrameFiles(ImageFolder):
 class SharedFrameFiles(FrameFiles):
     """Folder of such images with pose files: 7-Scenes (Shotton et al. 2013), 3DMatch, tsdf-fusion and others.
 
-    The intrinsics lie in the folder or the one above, and colour is registered to depth. Where the path names 7-Scenes,
-    the cameras are those of that data set, whose depth is not registered to colour, and camera-intrinsics.txt is its
-    depth camera; depth that somebody has registered needs an intrinsics.txt. 65535 means no reading.
+    Intrinsics are in the folder or its parent, and colour is registered to depth. 65535 means missing depth. A path
+    that names 7-Scenes has the cameras of that data set: depth is not registered to colour, and camera-intrinsics.txt
+    is the depth camera. Registered copies of 7-Scenes need an intrinsics.txt.
     """
 
     format = "7-Scenes, 3DMatch or tsdf-fusion"
@@ -155,9 +155,8 @@ class SharedFrameFiles(FrameFiles):
 class VolumeDeformSequence(FrameFiles):
     """Folder of VolumeDeform (Innmann et al. 2016): images with colorIntrinsics.txt and depthIntrinsics.txt.
 
-    The folder is the one of the images (``data``) or the one above, in which poses.txt may hold a 4x4 matrix per frame.
-    The images are registered where both matrices are equal, as in that data set; otherwise the cameras are taken to be
-    in one place, as the files do not say more.
+    The folder is the folder of the images (``data``) or its parent, in which poses.txt may hold a 4x4 matrix per frame.
+    Equal matrices mean registered images, as in that data set. Otherwise both cameras are assumed to be in one place.
     """
 
     format = "VolumeDeform"
@@ -191,19 +190,19 @@ class VolumeDeformSequence(FrameFiles):
 
 
 REDWOOD_NAMES = r"redwood|/(burghers|cactusgarden|copyroom|lounge|readingroom|stonewall|totempole)(_png)?$"
-"""Path of a recording of these data sets; object scans are known by the names of their files."""
+"""Path of a recording of these data sets; object scans are recognised by their file names."""
 COLORS = ("color", "rgb", "image", "image_2d")
-"""Names of the colour folder that Open3D's reconstruction system takes."""
+"""Names of the colour folder in Open3D's reconstruction system."""
 OBJECT_SCAN = r"(\d{7})-\d{12}\.(?:jpe?g|png)"
 """File names of the Redwood object scans: frame number and microseconds."""
 
 
 class RedwoodSequence(ImageFolder):
-    """Folder with ``color`` (or rgb, image) and ``depth`` (mm) and a ``*.log`` in it or beside it, or an object scan.
+    """Folder with ``color`` (or rgb, image), ``depth`` (mm) and a ``*.log`` inside or next to it, or an object scan.
 
-    A ``.log`` holds camera-to-world matrices by frame number, counted from the first image; ``scene/trajectory.log`` is
-    Open3D's own estimate and no truth. Intrinsics come from a JSON file of Open3D in the folder; of these data sets
-    they are known.
+    A ``.log`` holds camera-to-world matrices by frame number, counted from the first image. ``scene/trajectory.log`` is
+    Open3D's own estimate and no ground truth. Intrinsics come from a JSON file of Open3D in the folder; for these data
+    sets they are known.
     """
 
     format = "Redwood or Open3D"
@@ -248,17 +247,17 @@ def _color_folder(path: Path) -> Path | None:
 
 
 def _logs(path: Path) -> list[Path]:
-    """Trajectories in a folder, by name or else any, or beside it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
+    """Trajectories in a folder, by name, else any, or next to it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
     name = path.resolve().name.removesuffix("_png")
     inside = sorted(path.glob("*traj*.log")) or sorted(path.glob("*.log"))
     return inside or sorted(path.resolve().parent.glob(f"{name}[_-]traj*.log"))
 
 
 ICL_NUIM = camera_values(481.2, 480, 319.5, 239.5, 640, 480, 5000)
-"""The published camera of ICL-NUIM. Its fy is -480 because the renderer's y axis points up; the images are
-not upside down."""
+"""Published camera of ICL-NUIM. Its fy is -480 because the renderer's y axis points up; the images are not upside down.
+"""
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
-"""Between the renderer's left-handed axes (y up) and ours (y down), for the world and the camera alike."""
+"""Motion between the renderer's left-handed axes (y up) and dudmap's (y down), for world and camera alike."""
 NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 """A number in the renderer's text files."""
 SCENE_FILE = r"scene_\d+_(\d+)"
@@ -267,9 +266,9 @@ SCENE_FILE = r"scene_\d+_(\d+)"
 class IclNuimSequence(ImageFolder):
     """Folder of ICL-NUIM (Handa et al. 2014) with ``rgb/N.png``, ``depth/N.png`` and perhaps a ``*.gt.freiburg``.
 
-    Frames are numbered, not timed, and 30 a second. The published poses T are those of the renderer's left-handed axes;
-    with the mirror M = diag(1, -1, 1) at both ends, ``M T M``, they fit the images with a positive fy. The first frames
-    have no pose. Noisy depth (``traj2n``) has the same layout.
+    Frames are numbered, without times, at 30 Hz. Published poses T use the renderer's left-handed axes. With the mirror
+    M = diag(1, -1, 1), ``M T M`` fits the images with a positive fy. The first frames have no pose. Noisy depth
+    (``traj2n``) has the same layout.
     """
 
     format = "ICL-NUIM"
@@ -281,7 +280,7 @@ class IclNuimSequence(ImageFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a folder has this layout: the images, and the name of the data set on it or on its truth."""
+        """Whether a folder has this layout: the images, and the name of the data set on it or on its ground truth."""
         if not super().recognises(path) or not numbered_files((path / "depth").iterdir(), r"(\d+)\.png"):
             return False
         named = re.search(r"(living|office)_?room|traj\d+n?_(frei|loop)", path.resolve().name, re.IGNORECASE)
@@ -326,9 +325,9 @@ class IclNuimLoopSequence(ImageFolder):
 
 
 def _freiburg(folder: Path) -> Trajectory | None:
-    """Poses of groundtruth.txt, else of the only ``*.gt.freiburg``, in our axes and in seconds.
+    """Poses of groundtruth.txt, else of the only ``*.gt.freiburg``, in dudmap's axes and in seconds.
 
-    The lines are ``number tx ty tz qx qy qz qw``. A file of real times must not be read as one of frame numbers.
+    The lines are ``number tx ty tz qx qy qz qw``. A file of real times must not be read as frame numbers.
     """
     found = [folder / "groundtruth.txt"]
     found = found if found[0].is_file() else list(folder.glob("*.gt.freiburg"))

@@ -37,7 +37,7 @@ def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
 
 
 class ArkitFolder(ImageFolder):
-    """Base of the formats; ``confidence`` lies beside the folder of the depth images and has their file names."""
+    """Base of the formats; ``confidence`` is next to the folder of depth images and has their file names."""
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         depth = images.read_depth(path, depth_scale)
@@ -156,11 +156,10 @@ class ArkitScenesSequence(ArkitFolder):
 class PolycamSequence(ArkitFolder):
     """Raw data of the application Polycam: keyframes with a time in microseconds as name.
 
-    Layout: https://github.com/PolyCam/polyform#polycams-data-format. In ``keyframes`` lie ``images/TIME.jpg``,
-    ``cameras/TIME.json``, ``depth/TIME.png`` (mm) and ``confidence/TIME.png``; ``corrected_images`` and
-    ``corrected_cameras`` are taken instead of images and cameras where there are any. The corrected cameras are
-    optimised over all images and taken as truth; the others are estimates of ARKit and are not. Intrinsics per image
-    are replaced by their median.
+    Layout: https://github.com/PolyCam/polyform#polycams-data-format. ``keyframes`` holds ``images/TIME.jpg``,
+    ``cameras/TIME.json``, ``depth/TIME.png`` (mm) and ``confidence/TIME.png``. ``corrected_images`` and
+    ``corrected_cameras`` replace images and cameras if they exist. Corrected cameras are optimised over all images and
+    are the ground truth; the others are ARKit's estimates. Intrinsics are the median over all images.
     """
 
     format = "Polycam"
@@ -223,8 +222,8 @@ class PolycamSequence(ArkitFolder):
 class Record3DFolder(ImageFolder):
     """Export of the application Record3D in images: ``rgb/N.jpg``, ``depth/N.exr`` (float metres) and metadata.json.
 
-    The metadata hold K of the colour images, column by column, and the times of the frames; their poses are estimates
-    of ARKit and no truth. Depth shows the view of the colour images and is smaller.
+    The metadata hold K of the colour images, column by column, and the times of the frames. Their poses are ARKit's
+    estimates and no ground truth. Depth shows the view of the colour images and is smaller.
     """
 
     format = "Record3D images"
@@ -268,10 +267,10 @@ class NerfstudioSequence(ImageFolder):
 
     The frames of transforms.json name ``file_path``, ``depth_file_path`` and ``transform_matrix``.
 
-    Frames are in the order of their images' names and 30 a second, unless each has a ``timestamp``. Depth is 16 bit,
-    ``depth_unit_scale_factor`` (default 0.001) metres a unit, or float metres in a .npy file; it shows the same view as
-    the colour image, often smaller. Intrinsics per frame are replaced by their median. Matrices are camera to world
-    with OpenGL axes; poses of a structure-from-motion program have no metric scale, which makes them useless as truth.
+    Frames are ordered by image name, at 30 Hz, unless each has a ``timestamp``. Depth has 16 bits,
+    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file. It shows the view of
+    the colour image, often smaller. Intrinsics are the median over all frames. Matrices are camera to world with OpenGL
+    axes. Poses of structure from motion are no ground truth, because they lack metric scale.
     """
 
     format = "nerfstudio"

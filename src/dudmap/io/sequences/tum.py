@@ -1,4 +1,4 @@
-"""Folders with lists of stamped images: the TUM RGB-D benchmark (Sturm et al. 2012) and data sets of a like layout."""
+"""Folders with lists of stamped images: the TUM RGB-D benchmark (Sturm et al. 2012) and similar data sets."""
 
 import re
 from dataclasses import replace
@@ -26,16 +26,16 @@ class TumSequence(ImageFolder):
 
     Without rgb.txt, and without a folder rgb/, it is a recording of depth alone.
 
-    associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
+    associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images. Without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is the timestamp of its depth
     image.
 
     Intrinsics come from ``camera``, else from a file, else from a name with freiburg1-3. This is the name of the
-    folder, or of the bag in the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``), which survives a
-    renamed folder. The published distortion of freiburg1 and 2 is deliberately left out. It describes the colour lens,
-    but the driver reprojected the depth for a lens without distortion. Undistorting both images would distort correct
-    depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
+    folder, or of the bag in the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``). Coefficients in
     intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
+
+    The published distortion of freiburg1 and 2 is not used. It describes the colour lens, but the driver reprojected
+    the depth for a lens without distortion, so that undistorting both would distort correct depth.
     """
 
     format = "TUM RGB-D"
@@ -45,7 +45,7 @@ class TumSequence(ImageFolder):
         (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", camera_values(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
         (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", camera_values(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
     )
-    """Pattern of the folder's or bag's name, name and published intrinsics of each camera."""
+    """Name pattern of the folder or bag, name, and published intrinsics of each camera."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path, camera)
@@ -106,7 +106,7 @@ class TumSequence(ImageFolder):
 
 
 def _bag_name(path: Path) -> str:
-    """Name of the bag that the header of a list of images tells; empty if it tells none."""
+    """Name of the bag in the header of a list of images; empty if there is none."""
     if not path.is_file():
         return ""
     for line in read_text(path).splitlines():
@@ -117,7 +117,7 @@ def _bag_name(path: Path) -> str:
 
 
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Axes of Bonn's motion capture system against those of the cloud; its own inverse. From the data set's page."""
+"""Axes of Bonn's motion capture system relative to the point cloud; its own inverse. From the data set's page."""
 T_MARKER_CAMERA = np.array(
     [
         [1.0157, 0.1828, -0.2389, 0.0113],
@@ -175,7 +175,8 @@ class BonnSequence(TumSequence):
 class CorbsSequence(TumSequence):
     """Folder ``D1_pre_registereddata`` of CoRBS (Wasenmueller et al. 2016), whose lists may have backslashes.
 
-    The truth is groundtruth.txt in the folder, or in the folder or archive ``D1_Trajectory`` beside it, as downloaded.
+    The ground truth is groundtruth.txt in the folder, or in the downloaded folder or archive ``D1_Trajectory`` next to
+    it.
     """
 
     format = "CoRBS"
@@ -215,8 +216,8 @@ CAMERA_FRAME, BODY_FRAME = "d400_color_optical_frame", "base_link"
 class OpenLorisSequence(ImageFolder):
     """Folder of OpenLORIS-Scene (Shi et al. 2020) in the "package" form: a RealSense D435i on a robot.
 
-    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds poses of the robot
-    (``base_link``); those of the camera follow from the tree of motions in trans_matrix.yaml.
+    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds robot poses (``base_link``);
+    camera poses follow from the transform tree in trans_matrix.yaml.
     """
 
     format = "OpenLORIS-Scene"
@@ -253,7 +254,7 @@ def _matrix(node: Any, key: str) -> NDArray[np.float64] | None:  # noqa: ANN401 
 
 
 def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
-    """T_parent_child (4, 4) along the tree of the file, whose matrices take points of a child to its parent."""
+    """T_parent_child (4, 4) along the tree of the file, whose matrices map points of a child to its parent."""
     entries = read_yaml(path).get("trans_matrix")
     edges: dict[str, dict[str, NDArray[np.float64]]] = {}
     for index, node in enumerate(entries if isinstance(entries, list) else []):
