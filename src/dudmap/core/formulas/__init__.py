@@ -1,1 +1,1 @@
-"""Scalar mathematics of pixels, voxels and residuals, which every back end compiles."""
+"""Scalar formulas of pixels, voxels and residuals, compiled by every back end."""

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps of a rigid motion (Marquardt 1963): step, acceleration, new pose, and acceptance."""
+"""Levenberg-Marquardt steps of a rigid motion (Marquardt 1963): damped step, acceleration, pose update, acceptance."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from dudmap.core.backends.threads import scalar
 from dudmap.core.geometry.se3 import rodrigues
 
 FLOOR = 1e-9
-"""Share of the largest diagonal element that is always added, so that a direction without information stays still."""
+"""Share of the largest diagonal element that is always added, so that unobservable directions get a zero step."""
 FACTOR, LEAST = 5.0, 1e-6
-"""The damping grows and shrinks by this factor, down to the least one."""
+"""Factor by which the damping grows and shrinks, and its lower bound."""
 LONGEST, SHORTEST = 3.0, 0.5
-"""Limits of an accelerated step, in steps that are not."""
+"""Largest and smallest length of an accelerated step, as multiples of the plain step."""
 SHORT_STEP = 4.0
 """A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes."""
 
@@ -19,9 +19,9 @@ _rotation = scalar(rodrigues)
 
 @scalar
 def damped_step(H, b, basis, damping):
-    """Solution (6,) of ``(H + damping diag(H)) step = -b`` along the directions of a basis (6, m).
+    """Solution (6,) of ``(H + damping diag(H)) step = -b``, restricted to the directions of a basis (6, m).
 
-    H is symmetric and positive semidefinite; directions in which nothing is known keep a step of 0.
+    H is symmetric and positive semidefinite. Unobservable directions get a zero step.
     """
     n, m = basis.shape
     largest = np.float64(0)
@@ -62,12 +62,13 @@ def damped_step(H, b, basis, damping):
 def accelerated(step, last, taken):
     """Step (6,) of Anderson's acceleration with a memory of one step (Walker and Ni 2011).
 
-    Where robust weights decide, each step is shorter than the one before by much the same factor: their sum is taken at
-    once.
+    With robust weights, each step is shorter than the previous one by about the same factor. The acceleration takes the
+    sum of these steps at once.
 
     Args:
-        step: From this pose.
-        last, taken: From the pose before, and what was taken from there to this one; zeros if there is none.
+        step: Plain step from this pose.
+        last: Plain step from the previous pose; zeros if there is none.
+        taken: Step taken from the previous pose to this one; zeros if there is none.
     """
     along, squared = np.float64(0), np.float64(0)
     for i in range(6):
@@ -96,13 +97,13 @@ def moved(T_world_camera, step):
 
 @scalar
 def judged(change, cost, length, damping, rules):
-    """Whether a trial step is accepted, the next damping, and whether it is the last step.
+    """Judge a trial step: whether it is accepted, the next damping, and whether it is the last step.
 
     Args:
-        change: Of the cost by the step.
-        cost: Before the step.
+        change: Change of the cost by the step.
+        cost: Cost before the step.
         length: Norm of the step, metres and radians.
-        damping: Of this step.
+        damping: Damping of this step.
         rules: DescentRules.
     """
     settled = length < SHORT_STEP * rules.stop and abs(change) < rules.stop_gain * cost

@@ -1,7 +1,7 @@
-"""Scalar mathematics of a pixel: rays, rigid motions, projection, the noise of a reading and its truncation band.
+"""Scalar formulas of a pixel: rays, rigid motions, projection, depth noise and truncation band.
 
-Each function is plain arithmetic on float32 numbers, so that other compilers than Numba can take the same text.
-A rigid motion (3, 4) is passed as its twelve elements, row by row (``elements``).
+Each function is plain arithmetic on float32 numbers, so that compilers other than Numba accept the same source. A rigid
+motion (3, 4) is passed as its twelve elements, row by row (``elements``).
 """
 
 import numpy as np
@@ -11,17 +11,17 @@ from dudmap.core.backends.threads import scalar, written_out
 
 f32, sqrt = np.float32, np.sqrt
 STEEPEST = f32(7.9)
-"""Tangent of the angle, 83 degrees, between the image plane and the steepest surface whose normal is taken from the
-readings beside a pixel; steeper ones are depth edges. Sensors give no reading beyond 84 degrees."""
+"""Tangent of 83 degrees, the largest angle between surface and image plane at which neighbours define the normal.
+Steeper surfaces are depth edges. Sensors return no measurement beyond 84 degrees."""
 UNKNOWN_COSINE = f32(0.3)
-"""Cosine of the angle of incidence that is assumed at depth edges, where it is not known."""
+"""Cosine of the angle of incidence assumed at depth edges."""
 
 _sigma = scalar(reading_sigma)
 
 
 @scalar
 def elements(T):
-    """Elements of a motion (3, 4), row by row, as a tuple: held in registers, they need no loads in inner loops."""
+    """Elements of a motion (3, 4), row by row, as a tuple: registers need no loads in inner loops."""
     return (
         T[0, 0], T[0, 1], T[0, 2], T[0, 3],
         T[1, 0], T[1, 1], T[1, 2], T[1, 3],
@@ -31,13 +31,13 @@ def elements(T):
 
 @scalar
 def rotate(t, x, y, z):
-    """Linear part of a motion, applied to a vector."""
+    """Apply the linear part of a motion to a vector."""
     return t[0] * x + t[1] * y + t[2] * z, t[4] * x + t[5] * y + t[6] * z, t[8] * x + t[9] * y + t[10] * z
 
 
 @scalar
 def transform(t, x, y, z):
-    """Motion, applied to a point."""
+    """Apply a motion to a point."""
     return (
         t[0] * x + t[1] * y + t[2] * z + t[3],
         t[4] * x + t[5] * y + t[6] * z + t[7],
@@ -59,29 +59,32 @@ def project(x, by_z, f, c):
 
 @scalar
 def sigma(z, noise):
-    """Standard deviation of a reading at depth ``z``, metres."""
+    """Standard deviation of a depth measurement at depth ``z``, metres."""
     return _sigma(z, noise.base, noise.scale)
 
 
 @scalar
 def band_front(z, band):
-    """Width of the truncation band in front of a reading at depth ``z``, metres: at least ``band.sigmas`` sigma(z)."""
+    """Width of the truncation band in front of a measurement at depth ``z``, metres: at least ``band.sigmas``
+    sigma(z).
+    """
     return max(band.front, band.sigmas * sigma(z, band.noise))
 
 
 @scalar
 def band_behind(z, band):
-    """Width of the truncation band behind a reading at depth ``z``, metres."""
+    """Width of the truncation band behind a measurement at depth ``z``, metres."""
     return max(band.behind, band.sigmas * sigma(z, band.noise))
 
 
 @written_out
 def free_depth(z, near, band):
-    """Depth up to which a pixel certainly sees free space: the nearest reading around it less the band there, metres.
+    """Depth up to which a pixel certainly sees free space, metres: the nearest depth around it minus its truncation
+    band.
 
     Args:
-        z: Its reading, 0 = none.
-        near: Nearest reading of its neighbourhood.
+        z: Depth at the pixel, 0 = none.
+        near: Nearest depth of its neighbourhood.
         band: TruncationBand.
     """
     free = near - min(band_front(near, band), band.limit)
@@ -90,21 +93,20 @@ def free_depth(z, near, band):
 
 @written_out
 def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
-    """Weight of a reading, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20), ``best`` for a frontal one at
-    the reference depth.
+    """Weight of a depth measurement, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20).
 
     Args:
-        z: The reading, metres.
-        left, right, up, down: Those beside it.
+        z: Depth, metres.
+        left, right, up, down: Depths of the neighbouring pixels.
         x, y: Coordinates of its ray at depth 1.
         fx: Focal length, pixels.
         by_rows: Focal length in rows over the rows between ``up`` and ``down``.
-        best: Weight of a frontal reading at the reference depth.
+        best: Weight at normal incidence and the reference depth.
         noise: SensorNoise, whose sigma(z) is err(z).
     """
     zero, half, one = f32(0), f32(0.5), f32(1)
-    # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and
-    # its product with the ray (x, y, 1) is -z
+    # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and its
+    # product with the ray (x, y, 1) is -z
     gu, gv = half * fx * (right - left), by_rows * (down - up)
     nz = z + x * gu + y * gv
     cosine = z / sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))

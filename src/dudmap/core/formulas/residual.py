@@ -1,6 +1,6 @@
-"""Mathematics of a residual: trilinear interpolation, robust costs and weights, terms of normal equations.
+"""Formulas of a residual: trilinear interpolation, robust costs and weights, terms of the normal equations.
 
-``weigh`` is the only text of the weight of a residual; who needs it for a whole image asks ``residual_weights``.
+``weigh`` is the only implementation of the residual weight; ``residual_weights`` applies it to an image.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from dudmap.core.formulas.pixel import band_front, sigma
 
 f32 = np.float32
 GATE = f32(0.95)
-"""Share of the truncation band beyond which a reading is not on the map."""
+"""Share of the truncation band beyond which a pixel is not on the map."""
 WORST_COLOR = f32(0.3)
-"""Intensity residual whose cost a reading off the map pays."""
+"""Intensity residual whose cost is charged to a pixel off the map."""
 
 
 @scalar
@@ -35,8 +35,10 @@ def trilinear(v0, v1, v2, v3, v4, v5, v6, v7, ax, ay, az):
 
 @scalar
 def within_range(shade, kx, ky, kz, intensity, p):
-    """Intensity difference between map and image, cut to the range that both can show, and its gradient: beyond that
-    range one of them is saturated and tells nothing."""
+    """Intensity difference between map and image, clipped to their common unsaturated range, and its gradient.
+
+    The gradient is 0 outside the range.
+    """
     inside = (shade > p.darkest) & (shade < p.brightest)
     part = f32(1) if inside else f32(0)
     difference = min(max(shade, p.darkest), p.brightest) - min(max(intensity, p.darkest), p.brightest)
@@ -57,20 +59,20 @@ def huber_cost(a, k):
 
 @scalar
 def tukey_inlier(a, by_k):
-    """1 - (a / k)^2 of Tukey's biweight, 0 beyond k (thesis eq. 4.45): its square is the weight."""
+    """1 - (a / k)^2 of Tukey's biweight, 0 beyond k (thesis eq. 4.45); the weight is its square."""
     capped = min(a * by_k, f32(1))
     return f32(1) - capped * capped
 
 
 @scalar
 def tukey_cost(inlier, limit):
-    """Tukey cost of ``tukey_inlier``; ``limit`` = k^2 / 6 is that of an outlier."""
+    """Tukey cost of ``tukey_inlier``; ``limit`` = k^2 / 6 is the cost of an outlier."""
     return limit * (f32(1) - inlier * inlier * inlier)
 
 
 @written_out
 def noise_scale(z, p):
-    """sigma(reference depth) / sigma(z), at most 1, where residuals are weighted by the noise of the sensor, else 1."""
+    """sigma(reference depth) / sigma(z), at most 1, if residuals are weighted by sensor noise, else 1."""
     scaled = min(p.sigma_at_reference / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
     return p.noise_weighting * scaled + (f32(1) - p.noise_weighting)
 
@@ -81,14 +83,18 @@ def weigh(r, rc, z, static, known, p):
 
     Args:
         r, rc: Signed distance, metres, and intensity difference.
-        z: Depth of the reading, metres, 0 = none.
+        z: Depth, metres, 0 = none.
         static: Static weight of the pixel.
         known: Whether the map has a distance and an intensity there.
         p: RegistrationParameters.
 
     Returns:
-        Whether the reading is on the map; its static weight if so, else 0; its cost; the constant cost of a reading off
-        the map; its weighted squared distance at one metre; weights of the distance and of the intensity.
+        - Whether the pixel is on the map.
+        - Its static weight if it is on the map, else 0.
+        - Its cost.
+        - The constant cost of a pixel off the map.
+        - Its weighted squared distance at one metre.
+        - The weight of the distance and the weight of the intensity.
     """
     zero, one = f32(0), f32(1)
     use_tukey = p.tukey > zero
@@ -133,17 +139,17 @@ def _weigh_image(depth, distances, differences, static, parameters, out):
 def residual_weights(
     depth: NDArray[np.float32], residuals: ImageStack, static: NDArray[np.float32], parameters: RegistrationParameters
 ) -> NDArray[np.float32]:
-    """Weights of the residuals of an image in the registration.
+    """Registration weights of the residuals of an image.
 
     Args:
         depth: (h, w) metres, 0 = none.
         residuals: (2, h, w) of a linearisation, NaN off the map.
         static: (h, w) static weights.
-        parameters: Those of the linearisation.
+        parameters: Parameters of the linearisation.
 
     Returns:
-        (3, h, w) weights of the distances and of the intensities, and the weighted squared distances at one metre; 0
-        off the map.
+        (3, h, w) weights of distances, weights of intensities, and weighted squared distances at one metre; 0 off the
+        map.
     """
     out = np.zeros((3, *depth.shape), np.float32)
     images = (np.ascontiguousarray(image, np.float32) for image in (depth, residuals[0], residuals[1], static))
@@ -153,7 +159,7 @@ def residual_weights(
 
 @written_out
 def normal_terms(wg, wc, gx, gy, gz, kx, ky, kz, r, rc, x, y, z):
-    """What a pixel adds to the normal equations (thesis eq. 4.47).
+    """Contribution of a pixel to the normal equations (thesis eq. 4.47).
 
     With J = [g, p x g] and A = w g g', the blocks of J' w J are A, M = A hat(p)' and N = hat(p) M.
 

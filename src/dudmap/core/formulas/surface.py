@@ -1,30 +1,30 @@
-"""Scalar mathematics of a vertex on an edge of the lattice: its place, its colour and its normal."""
+"""Scalar formulas of a mesh vertex on a lattice edge: position, colour and normal."""
 
 import numpy as np
 
 from dudmap.core.backends.threads import written_out
 
 MIN_OFFSET = np.float32(1e-3)
-"""Smallest distance of a vertex from a voxel, as a share of the edge: where sdf is 0 at a voxel, the vertices of the
-edges around it stay distinct, and no triangle degenerates."""
+"""Smallest distance of a vertex from a voxel, as a share of the edge. Vertices of different edges stay distinct at a
+voxel with sdf 0, so that no triangle degenerates."""
 
 
 @written_out
 def crossing(a, b):
-    """Where the distance vanishes on an edge with the distances ``a`` and ``b`` of opposite signs, as a share of it."""
+    """Zero crossing on an edge with distances ``a`` and ``b`` of opposite signs, as a share of the edge."""
     return min(max(a / (a - b), MIN_OFFSET), np.float32(1) - MIN_OFFSET)
 
 
 @written_out
 def mixed_channel(low, high, t):
-    """Channel of a colour at ``t`` between two voxels whose channels are in quarters of a grey level, rounded when it
-    is cut to an integer."""
+    """Colour channel at ``t`` between two voxels with channels in quarters of a grey level; rounds when it is
+    truncated to an integer."""
     return min((low + (high - low) * t) * np.float32(0.25) + np.float32(0.5), np.float32(255))
 
 
 @written_out
 def slope(here, above, below):
-    """Derivative of sdf at a voxel between two others: central difference, one-sided beside unseen voxels."""
+    """Derivative of sdf at a voxel between two others: central difference, one-sided next to unobserved voxels."""
     has_above, has_below = (above & 0xFF00) != 0, (below & 0xFF00) != 0
     high = above >> 16 if has_above else here >> 16
     low = below >> 16 if has_below else here >> 16

@@ -1,8 +1,13 @@
-"""Scalar mathematics of a voxel: its packed words and the fusion of one reading (thesis eq. 4.18-4.23).
+"""Scalar formulas of a voxel: its packed words and the fusion of one measurement (thesis eq. 4.18-4.23).
 
-A voxel is two int32 words. Geometry: sdf int16 (steps) << 16 | weight uint8 << 8 | intensity uint8. Colour: red << 20 |
-green << 10 | blue, quarters of a grey level each. A pixel is two words as well: reading << 16 | depth up to which the
-pixel certainly sees free space, both uint16 in steps of ``depth_unit``; red << 24 | green << 16 | blue << 8 | weight.
+A voxel is two int32 words:
+- geometry: sdf int16 (steps) << 16 | weight uint8 << 8 | intensity uint8;
+- colour: red << 20 | green << 10 | blue, each in quarters of a grey level.
+
+A pixel is two int32 words:
+- depth << 16 | free depth, both uint16 in steps of ``depth_unit``; the free depth is the depth up to which the pixel
+  certainly sees free space;
+- red << 24 | green << 16 | blue << 8 | weight.
 """
 
 import numpy as np
@@ -15,7 +20,7 @@ f32, i32, floor = np.float32, np.int32, np.floor
 SURFACE_SHARE = f32(0.9)
 """Share of the truncation band within which a voxel counts as near a surface."""
 YOUNG = f32(8)
-"""Weight below which a voxel takes a colour also from a reading away from the surface."""
+"""Weight below which a voxel without colour takes the colour of any measurement in its truncation band."""
 
 
 @scalar
@@ -32,27 +37,27 @@ def weight_of(word):
 
 @scalar
 def intensity_of(word):
-    """Intensity of a voxel, 1..255, float32; 0 = never seen near a surface."""
+    """Intensity of a voxel, 1..255, float32; 0 = never observed near a surface."""
     return bits(word, 0, 0xFF)
 
 
 @scalar
 def pack_voxel(steps, weight, intensity):
-    """Geometry word of a voxel; distance and intensity are rounded to the nearest step, the weight is cut."""
+    """Geometry word of a voxel; distance and intensity are rounded, the weight is truncated."""
     half = f32(0.5)
     return (i32(floor(steps + half)) << i32(16)) | (i32(weight) << i32(8)) | i32(intensity + half)
 
 
 @scalar
 def pack_color(red, green, blue):
-    """Colour word of a voxel of channels in quarters of a grey level, rounded."""
+    """Colour word of a voxel from channels in quarters of a grey level, rounded."""
     half = f32(0.5)
     return (i32(red + half) << i32(20)) | (i32(green + half) << i32(10)) | i32(blue + half)
 
 
 @scalar
 def pack_reading(depth, free_depth, by_unit):
-    """First word of a pixel: a reading, and the depth up to which it sees free space, in steps of 1 / ``by_unit``."""
+    """First word of a pixel: depth and free depth in steps of 1 / ``by_unit``."""
     return (i32(depth * by_unit + f32(0.5)) << i32(16)) | i32(free_depth * by_unit)
 
 
@@ -71,22 +76,23 @@ def luma(color):
 
 @scalar
 def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
-    """Fuse the reading of the pixel that a voxel projects to.
+    """Fuse the pixel that a voxel projects to.
 
-    A reading within the truncation band averages its distance, weight and intensity into the voxel. One that passes the
-    voxel by more than the band is an observation of emptiness, which counts ``carve_rate`` times in a voxel that holds
-    a surface, and changes no intensity. A black pixel tells no colour: it may be dark for want of light.
+    - Within the truncation band, distance, weight and intensity are averaged into the voxel.
+    - In free space in front of the band, the pixel observes emptiness. It counts ``carve_rate`` times in a voxel that
+      holds a surface, and changes no intensity.
+    - A black pixel changes no colour, because the scene may be unlit.
 
     Args:
         word: Geometry word of the voxel.
         reading, color: Words of the pixel.
         z: Depth of the voxel in the camera frame, metres.
-        repeats: Number of frames that this one stands for.
+        repeats: Number of frames that this frame stands for.
         by_sdf_unit: 1 / ``p.sdf_unit``.
         p: FusionParameters.
 
     Returns:
-        New geometry word; share in which the voxel takes on the pixel's colour, -1 = only if it has none yet.
+        New geometry word; share of the pixel's colour in the voxel's new colour, -1 = only if the voxel has none yet.
     """
     zero, one = f32(0), f32(1)
     d = bits(reading, 16, 0xFFFF) * p.depth_unit
@@ -105,7 +111,7 @@ def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     cap = max(old_weight, min(p.max_weight, p.max_readings * bits(color, 0, 0xFF)))
     sdf = old_sdf + (min(s, tau) - old_sdf) * share
     lit = bits(color, 8, 0xFFFFFF) > zero
-    # intensity and colour belong to the surface: neither emptiness nor darkness repaints it
+    # intensity and colour belong to the surface: neither emptiness nor darkness changes them
     share = share if banded & lit else zero
     unlit = (old_intensity == zero) | (lit & (old_intensity == one))
     intensity_share = one if banded & unlit else share
@@ -124,8 +130,10 @@ def is_occupied(word, p):
 
 @scalar
 def fuse_color(old, color, share):
-    """Colour word of a voxel that takes on a pixel's colour in the share that ``fuse_voxel`` returned; 0 = no colour
-    yet, which takes all of it."""
+    """Colour word of a voxel after taking a pixel's colour with the share of ``fuse_voxel``.
+
+    A voxel without colour (0) takes all of it.
+    """
     share = max(share, f32(0)) if old != 0 else min(abs(share) * f32(1e6), f32(1))
     r0, g0, b0 = bits(old, 20, 0x3FF), bits(old, 10, 0x3FF), bits(old, 0, 0x3FF)
     r1, g1, b1 = bits(color, 22, 0x3FC), bits(color, 14, 0x3FC), bits(color, 6, 0x3FC)

@@ -1,6 +1,6 @@
 """Parts of packed 32-bit words, in 32-bit arithmetic.
 
-Numba widens every integer expression to 64 bits, which halves what a vector instruction does.
+Numba widens every integer expression to 64 bits, which halves the throughput of vector instructions.
 """
 
 from llvmlite import ir

@@ -1,8 +1,8 @@
-"""The map with smaller voxels where they matter (thesis section 7.1).
+"""Map with several voxel sizes (thesis section 7.1).
 
-The blocks of ``TsdfVolume`` cover everything that is seen, as without refinement: free space, carving and the band far
-from the surface are theirs. Blocks of half, and within them of a quarter of the voxel size lie over them where the
-surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
+The blocks of ``TsdfVolume`` cover everything observed. They alone hold free space, carving and the band far from the
+surface. Finer blocks, with a half and a quarter of the voxel size, refine them near surfaces with detail
+(``refinement.py``). An observed finer voxel replaces the coarser one.
 """
 
 import numpy as np
@@ -30,18 +30,18 @@ def make_volume(
     backend: Backend | None = None,
     max_blocks: int | MemoryLimit | None = None,
 ) -> TsdfVolume:
-    """An empty map with one voxel size or, with ``volume.adaptive``, several; arguments as of ``TsdfVolume``."""
+    """An empty map with one voxel size, or several with ``volume.adaptive``; arguments as of ``TsdfVolume``."""
     kind = AdaptiveVolume if config.adaptive else TsdfVolume
     return kind(camera, config, sensor, depth_max, backend, max_blocks)
 
 
 class AdaptiveVolume(TsdfVolume):
-    """A map whose voxels are halved where the surface is curved or finely coloured and the sensor resolves it.
+    """A map with smaller voxels where the surface has detail (curvature or texture) that the sensor resolves.
 
-    Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
-    mesh and views read the finest. See ``docs/adaptive.md``.
+    Registration and labels read the coarsest level, so that poses and masks equal those of a map with one voxel size.
+    Mesh and views read the finest level. See ``docs/adaptive.md``.
 
-    ``levels`` are the finer levels, that with the larger voxels first.
+    ``levels`` are the finer levels, larger voxels first.
     """
 
     def _empty(self) -> None:
@@ -53,7 +53,7 @@ class AdaptiveVolume(TsdfVolume):
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: that of the coarsest level, as without refinement, and that of the others."""
+        """Memory of the map: coarsest level and finer levels."""
         finer = 0
         for parents, level in zip(self._coarser, self.levels, strict=True):
             links = parents.num_slots * 8 * 4 + level.blocks.num_slots * (4 + 1)  # children; parent and calm
@@ -66,7 +66,7 @@ class AdaptiveVolume(TsdfVolume):
         return self.all_blocks.parents
 
     def _parameters_of(self, n: int) -> FusionParameters:
-        """Parameters of the fusion into a level, 0 is the coarsest; all store distances in its steps."""
+        """Fusion parameters of a level, 0 = coarsest. All levels store distances in the steps of the coarsest one."""
         if n == 0:
             return self.parameters
         finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
@@ -97,7 +97,8 @@ class AdaptiveVolume(TsdfVolume):
     def _average_finer(
         self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
-        """Average an image into blocks of a finer level and drop those seen to be empty; slots (m,) of all these."""
+        """Fuse an image into candidate blocks of a finer level and drop the empty ones; returns the slots (m,) of
+        all of them."""
         if len(candidates) == 0:
             return candidates
         level, number = self.levels[n], self._frame_number
@@ -114,14 +115,17 @@ class AdaptiveVolume(TsdfVolume):
         return slots
 
     def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
-        """Note that blocks of a level, 0 is the coarsest, and so those that they lie in, are not as they were."""
+        """Mark blocks of a level (0 = coarsest) and the coarser blocks around them as changed in this frame."""
         for level in self.levels[:n][::-1]:
             level.blocks.written[slots] = self._frame_number
             slots = level.parents[slots]
         self.blocks.written[slots] = self._frame_number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
-        """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
+        """See ``PagedMap``.
+
+        Blocks that the other map does not refine take interpolated colours of its coarser level.
+        """
         assert isinstance(other, AdaptiveVolume)
         if level == 0:
             super()._take_level_colors(level, slots, other, number)
@@ -138,5 +142,5 @@ class AdaptiveVolume(TsdfVolume):
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
     ) -> list[Mesh]:
-        """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
+        """See ``TsdfVolume.extract_chunks``; ``slots`` are slots of the coarsest level."""
         return level_meshes(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))

@@ -1,6 +1,6 @@
-"""Blocks far from the view, which leave the memory for a store on disk and come back before the view reaches them.
+"""Paging: moves blocks far from the view to a store on disk and back before they are in view.
 
-The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Niessner et al. 2013, section 5.
+Blocks move in regions, cubes of 16x16x16 blocks (Niessner et al. 2013, section 5).
 """
 
 from collections.abc import Callable
@@ -20,19 +20,19 @@ from dudmap.errors import MapError
 
 REGION_BITS = 4
 REGION = 1 << REGION_BITS
-"""Number of blocks along the edge of a region, and its logarithm to base 2."""
+"""Blocks along the edge of a region, and its base-2 logarithm."""
 MARGIN = 4
-"""Blocks beside the view that are in memory with it, so that all blocks that touch a changed piece of the mesh are."""
+"""Blocks around the view that stay in memory, so that all neighbours of a changed mesh chunk are present."""
 ROOM = 0.85
-"""Share of the allowed blocks to which the memory is emptied, so that the index is not rebuilt with every region."""
+"""Share of the allowed blocks that remain after paging out, so that the index is not rebuilt for every region."""
 RETRY_AFTER = 100
-"""Moves of the window before a store that could not be written is tried again."""
+"""Window moves before a failed store is tried again."""
 Region = tuple[int, int, int]
 
 
 class Away(NamedTuple):
-    """A region in the store: a number that is another for each content, and the numbers of its blocks, of those among
-    them that own voxels, and of the finer blocks inside these."""
+    """A region in the store: serial number of its content, and numbers of its blocks, of blocks with voxels, and of
+    finer blocks."""
 
     serial: int
     blocks: int
@@ -41,14 +41,16 @@ class Away(NamedTuple):
 
 
 class BlockPager(Stateful):
-    """Moves regions of a map between memory and a store.
+    """Moves regions of a map between memory and a store on disk.
 
-    A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are. A
-    region on a surface takes some milliseconds to write, and as long to read.
+    A region is either in memory or in the store, so that the content of the map does not depend on paging. Writing or
+    reading a region with surfaces takes a few milliseconds.
 
-    ``max_blocks`` is the largest number of blocks with voxels in memory, of all levels, or a limit that is asked each
-    time; blocks within the view stay, even if they are more. ``failure`` says why the store could not be written the
-    last time it was tried (empty if it could): the regions then stay in memory, and nothing is lost.
+    Attributes:
+        max_blocks: Largest number of blocks with voxels in memory, of all levels, or a limit that is evaluated each
+            time. Blocks in view stay in memory even beyond it.
+        failure: Why the last write to the store failed; empty on success. After a failure the regions stay in memory,
+            and no data is lost.
     """
 
     failure: Remembered[str] = ""
@@ -67,7 +69,7 @@ class BlockPager(Stateful):
             self._store.close()
         self._store = None
         self._away = {}
-        self._returned: dict[Region, tuple[int, int]] = {}  # frame number and serial of what the store also holds
+        self._returned: dict[Region, tuple[int, int]] = {}  # frame number and serial of regions with a valid copy
         self._archived: set[Region] = set()
         self._archive: Callable[[Region], BlockRecords] | None = None
         self._retry_in = 0
@@ -101,17 +103,17 @@ class BlockPager(Stateful):
         return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
 
     def continue_from(self, archive: Callable[[Region], BlockRecords]) -> None:
-        """Take the regions that are away from an archive, which has them until they have come back into memory."""
+        """Read the regions that are away from an archive until they return to memory."""
         self._archived, self._archive = set(self._away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
-        """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
+        """Mark the region that begins at a block (3,) as changed by something other than a frame."""
         self._returned.pop(_key(first >> REGION_BITS), None)
 
     def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
-        """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
+        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` blocks around it.
 
-        Regions farther away leave if there are too many blocks. Entries of the blocks in memory are numbered anew.
+        If memory holds too many blocks, the farthest regions leave. The entries in memory are then renumbered.
         """
         first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
         last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
@@ -134,12 +136,12 @@ class BlockPager(Stateful):
             self._returned[region] = frame_number, self._away[region].serial
         del self._away[region]
         self._archived.discard(region)
-        tree.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
+        tree.insert(records, frame_number + 1)  # stamped as the next frame, so that copies of the map pick them up
 
     def _make_room(
         self, tree: BlockTree, first: NDArray[np.integer], last: NDArray[np.integer], number: int, coming: list[Region]
     ) -> None:
-        """Move the regions farthest from the box to the store while there are too many blocks with those that come."""
+        """Move the regions farthest from the box to the store until the blocks, with the incoming ones, fit."""
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(tree)
         needed = tree.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
@@ -159,8 +161,10 @@ class BlockPager(Stateful):
             tree.remove(np.flatnonzero(leaving[region_of]), number + 1)
 
     def page_out(self, tree: BlockTree, frame_number: int) -> bool:
-        """Move all regions to the store; returns whether that worked: empty blocks must then take the place of those
-        of ``tree``."""
+        """Move all regions to the store and return whether that succeeded.
+
+        The caller then replaces the blocks of ``tree`` by empty ones.
+        """
         keys, region_of = _regions_of_entries(tree)
         return self._send_away(tree, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
 
@@ -172,8 +176,10 @@ class BlockPager(Stateful):
         leaving: NDArray[np.bool_],
         frame_number: int,
     ) -> bool:
-        """Write the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry, which the caller
-        removes. Returns whether all could be written; else none has left."""
+        """Write the leaving regions (r, 3) and return whether all writes succeeded; after a failure none has left.
+
+        ``region_of`` (n,) is the region of each entry. The caller removes the entries.
+        """
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))
@@ -183,7 +189,7 @@ class BlockPager(Stateful):
             for n in np.flatnonzero(leaving):
                 region, entries = _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]]
                 returned_in, serial = self._returned.get(region, (-1, 0))
-                if returned_in != frame_number:  # the store does not hold it as it is
+                if returned_in != frame_number:  # no valid copy in the store
                     serial = self._next_serial = self._next_serial + 1
                     levels = blobs_of(tree.records(entries))
                     self._stored.write(str(region), [blob for level in levels for blob in level])
@@ -205,7 +211,7 @@ class BlockPager(Stateful):
 
 
 def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:
-    """All regions of a map, in Morton order, so that neighbours follow each other."""
+    """All regions of a map in Morton order, so that consecutive regions are close."""
     near, _ = _regions_of_entries(tree)
     stored = np.array(list(() if pager is None else pager.away()), np.int64).reshape(-1, 3)
     regions = np.unique(np.concatenate([near, stored]), axis=0)

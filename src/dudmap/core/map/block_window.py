@@ -1,4 +1,4 @@
-"""The blocks around the view as a dense array, in which inner loops find a voxel with one load."""
+"""Dense array of the blocks around the view, in which inner loops find a voxel with one load."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +11,23 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.errors import MapError
 
 MARGIN = 3
-"""Blocks that the view may move before the window follows; the window is larger by as many on each side."""
+"""Blocks that the view may move before the window follows; the window has this margin on each side."""
 
 LOCAL_GRID = 4096
-"""Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
-where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
+"""Spacing of the local origins, blocks. With blocks of 8 cm a camera is at most 164 m from a local origin along each
+axis. There the spacing of float32 numbers is 15 micrometres."""
 
 
 class BlockWindow(Stateful):
-    """Dense copy of the hash table, which stays the authoritative index, around the view.
+    """Dense copy of the hash table around the view; the hash table stays the authoritative index.
 
     Attributes:
         block_size: Edge of a block, metres.
-        shape: (3,) int64, blocks along each axis, at least the ``cells`` asked for.
+        shape: (3,) int64, blocks along each axis, at least the requested ``cells``.
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
         mirror: ``cells`` for back ends, which may hold a copy on a device.
-        stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
-        near: (n,) int32, the slots inside.
+        stamps: Shape of ``cells``, number of the last frame whose truncation band touched the block.
+        near: (n,) int32, slots inside the window.
         origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
     """
 
@@ -44,9 +44,11 @@ class BlockWindow(Stateful):
         self.near = np.empty(0, dtype=np.int32)
 
     def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
-        """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
-        away, so that the window can stay. An empty window that replaces one which was ``left`` (3,) goes back there
-        then."""
+        """Origin (3,) of a window centred on a point (3,), metres; None if the window can stay.
+
+        It stays while the centre moves by at most ``MARGIN`` blocks. A window emptied by paging returns to its old
+        origin ``left`` (3,) in that case.
+        """
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         last = self.origin if left is None else left
         if last is None:
@@ -58,7 +60,7 @@ class BlockWindow(Stateful):
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""
         self.origin = origin
-        self.cells.fill(-1)  # the stamps may stay: no frame has the number of an earlier one
+        self.cells.fill(-1)  # stamps may stay: frame numbers never repeat
         cells = self.cells.reshape(tuple(self.shape))
         inside = np.empty(blocks.num_entries, dtype=np.int32)
         count = hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
@@ -66,7 +68,7 @@ class BlockWindow(Stateful):
         self.mirror.wrote()
 
     def refill(self, blocks: VoxelBlocks) -> None:
-        """Place a window that was stored where it was; the order of its slots, in which they are fused, is kept.
+        """Place a stored window at its old origin, and keep the order of its slots, in which they are fused.
 
         Raises:
             ValueError: It was not a window of these blocks.
@@ -81,7 +83,7 @@ class BlockWindow(Stateful):
 
     @property
     def local_origin(self) -> NDArray[np.int64]:
-        """Blocks (3,) from the origin of the map to the local origin that is nearest to the window."""
+        """Blocks (3,) from the origin of the map to the local origin nearest to the window."""
         assert self.origin is not None
         return LOCAL_GRID * np.rint((self.origin + self.shape // 2) / LOCAL_GRID).astype(np.int64)
 
@@ -91,13 +93,13 @@ class BlockWindow(Stateful):
         return to_lattice(T_world_camera, self.block_size / BLOCK, self.origin)
 
     def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
-        """Allocate voxels for cells (n,) that have none."""
+        """Allocate voxels for cells (n,) without voxels."""
         slots = blocks.allocate(self.entries_of(cells, blocks), frame_number)
         self._set(cells, slots)
         self.near = np.concatenate([self.near, slots])
 
     def release(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
-        """Release slots (n,); their blocks get so many observations of emptiness."""
+        """Release slots (n,); their blocks get ``free_count`` observations of emptiness."""
         if len(slots) == 0:
             return
         assert self.origin is not None
@@ -108,7 +110,7 @@ class BlockWindow(Stateful):
         self.near = hashing.in_use(self.near, blocks.entry_of)
 
     def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
-        """Make entries for unknown cells (n,) with so many observations of emptiness."""
+        """Make entries for unknown cells (n,) with ``free_count`` observations of emptiness."""
         if len(cells) == 0:
             return
         entries = self.entries_of(cells, blocks)
@@ -120,10 +122,10 @@ class BlockWindow(Stateful):
         self.mirror.wrote(cells)
 
     def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
-        """Entries (n,) of cells (n,); new ones where there is none.
+        """Entries (n,) of cells (n,), new ones for cells without an entry.
 
         Raises:
-            MapError: A cell lies too far from where the map began.
+            MapError: A cell lies too far from the origin of the map.
         """
         assert self.origin is not None
         coords, (_, size_y, size_z) = np.empty((len(cells), 3), np.int64), self.shape

@@ -1,4 +1,4 @@
-"""Blocks of half the voxel size inside the blocks of a coarser level of the map, and all levels together."""
+"""Blocks with half the voxel size inside blocks of the next coarser level, and the tree of all levels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,13 +15,13 @@ from dudmap.core.state import Remembered, Stateful
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
-"""Arrays in place of a level that a map does not have."""
+"""Arrays that replace a level that the map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
-"""Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
+"""Offset (8, 3) of each child in its parent, in units of the child's size; number 4 dx + 2 dy + dz."""
 
 
 class FineBlocks(Stateful):
-    """One level of refinement. A block covers one octant of its parent, a block of the next coarser level.
+    """One level of refinement. A block covers one octant of its parent in the next coarser level.
 
     Attributes:
         voxel_size: Edge of a voxel of this level, metres.
@@ -29,7 +29,7 @@ class FineBlocks(Stateful):
         children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
         parents: (slots,) int32 slot of the parent of each block.
         calm: (slots,) uint8 successive evaluations in which a block was not needed.
-        voxels: Geometry and colours of the blocks as they are stored, as a whole: they are few.
+        voxels: Geometry and colours of all blocks, stored whole because they are few.
     """
 
     blocks: Remembered[VoxelBlocks]
@@ -44,12 +44,12 @@ class FineBlocks(Stateful):
         self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
 
     def state(self) -> dict[str, Any]:
-        """The level without spare room."""
+        """The level without spare capacity."""
         m, blocks = self.blocks.num_slots, self.blocks
         return {"blocks": blocks, "calm": self.calm[:m], "voxels": (blocks.geometry[:m], blocks.colors[:m])}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take over a stored level, which is to be linked (``link``)."""
+        """Restore a stored level; the caller then links it (``link``)."""
         blocks, (geometry, colors) = self.blocks, state["voxels"]
         if not len(state["calm"]) == len(geometry) == len(colors) == blocks.num_slots:
             raise ValueError("blocks with smaller voxels lack some of them")
@@ -57,7 +57,7 @@ class FineBlocks(Stateful):
         self.calm = grown(state["calm"], len(blocks.entry_of), 0)
 
     def make_room(self, parents: VoxelBlocks) -> None:
-        """Have room for the links of all slots of the parents and of this level."""
+        """Grow the link arrays to the slots of the parents and of this level."""
         if len(self.children) < len(parents.entry_of):
             self.children = grown(self.children, len(parents.entry_of), -1)
         if len(self.parents) < len(self.blocks.entry_of):
@@ -67,7 +67,8 @@ class FineBlocks(Stateful):
     def open(
         self, parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64], frame_number: int
     ) -> NDArray[np.int32]:
-        """New, empty blocks in octants (n,) of parents in slots (n,) that have none there; their slots (n,) int32."""
+        """Create empty blocks in octants (n,) of parents in slots (n,) without a child there; returns their slots
+        (n,) int32."""
         coords = (2 * parents.slot_coords[slots] + OCTANTS[octants]).astype(np.int32)
         entries = self.blocks.entries_at(coords, len(coords))
         new = self.blocks.allocate(entries, frame_number)
@@ -77,7 +78,7 @@ class FineBlocks(Stateful):
         return new
 
     def drop(self, slots: NDArray[np.int32]) -> None:
-        """Remove blocks (n,), with those inside them."""
+        """Remove blocks (n,) and all finer blocks inside them."""
         if len(slots) == 0:
             return
         if self._finer is not None:
@@ -88,21 +89,21 @@ class FineBlocks(Stateful):
         self.parents[slots] = -1
 
     def records(self, slots: NDArray[np.int32]) -> BlockRecords:
-        """Copies of blocks (n,), all of which own voxels; ``calm`` stands in place of the observations of emptiness."""
+        """Copies of blocks (n,); field ``free_count`` holds ``calm``."""
         owners = np.arange(len(slots), dtype=np.int32)
         voxels = self.blocks.geometry[slots], self.blocks.colors[slots], self.blocks.fused[slots]
         return BlockRecords(self.blocks.slot_coords[slots], self.calm[slots], owners, *voxels)
 
     def remove(self, slots: NDArray[np.int32], frame_number: int) -> None:
-        """Forget blocks (n,), whose parents are forgotten next."""
+        """Remove blocks (n,) whose parents the caller removes next."""
         blocks = self.blocks
         self.children[self.parents[slots], self.octants_of(slots)] = -1
         self.parents[slots] = -1
-        dropped = np.flatnonzero(blocks.slot_of[: blocks.num_entries] < 0)  # earlier; nothing is known of them
+        dropped = np.flatnonzero(blocks.slot_of[: blocks.num_entries] < 0)  # entries without slots
         blocks.remove(np.concatenate([blocks.entry_of[slots], dropped]), frame_number)
 
     def insert(self, parents: VoxelBlocks, records: BlockRecords, frame_number: int) -> None:
-        """Add blocks, none of which is known, after their parents."""
+        """Add unknown blocks whose parents are already inserted."""
         slots = self.blocks.insert(replace(records, free_count=np.zeros_like(records.free_count)), frame_number)
         self.make_room(parents)
         self.calm[slots], self.parents[slots] = records.free_count, parents.slots_at(records.coords >> 1)
@@ -111,10 +112,10 @@ class FineBlocks(Stateful):
     def take_colors(
         self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
     ) -> None:
-        """Give blocks (n,) the colours and intensities that they have in this level of another map.
+        """Give blocks (n,) the colours and intensities of this level of another map.
 
-        Where that is not refined, or has no colour, the ``interpolated`` voxels and colours (n, 512) of the coarser
-        level count.
+        Voxels that the other map does not refine or colour take the ``interpolated`` voxels and colours (n, 512) of its
+        coarser level.
         """
         blocks, (voxels, colors) = self.blocks, interpolated
         there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
@@ -129,12 +130,14 @@ class FineBlocks(Stateful):
         return 4 * low[:, 0] + 2 * low[:, 1] + low[:, 2]
 
     def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all children of the parents in slots (m,), in their order."""
-        found = self.children[slots[slots < len(self.children)]].ravel()  # there is room once a block has been opened
+        """Slots (n,) int32 of all children of the parents in slots (m,), in the parents' order."""
+        found = self.children[slots[slots < len(self.children)]].ravel()  # slots beyond the array have no children yet
         return found[found >= 0]
 
     def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
-        """Find the parents of all blocks anew, by coordinates; whether each of the active slots (n,) has one."""
+        """Rebuild the parent links of all blocks from coordinates; returns whether each active slot (n,) has a
+        parent.
+        """
         self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = grown(self.calm[: len(self.parents)], len(self.parents), 0)
@@ -146,7 +149,7 @@ class FineBlocks(Stateful):
         return known
 
     def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
-        """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""
+        """The voxels for ``Backend.fuse``, with coordinates relative to ``origin`` (3,), in blocks of this level."""
         coords = self.blocks.slot_coords
         coords = coords if not origin.any() else (coords - origin).astype(coords.dtype)
         nothing = np.empty(0, dtype=np.int32)
@@ -157,9 +160,9 @@ class FineBlocks(Stateful):
 
 
 class BlockTree:
-    """Blocks of the coarsest level together with the finer ones that lie in them, for ``BlockPager``.
+    """Blocks of the coarsest level with all finer blocks inside them, for ``BlockPager``.
 
-    Entries are those of the coarsest level; slots and memory count for all levels, that with the larger voxels first.
+    Entries are entries of the coarsest level; slots and memory count all levels, larger voxels first.
     """
 
     def __init__(self, blocks: VoxelBlocks, levels: Sequence[FineBlocks]) -> None:
@@ -177,7 +180,7 @@ class BlockTree:
 
     @property
     def num_voxel_blocks(self) -> int:
-        """Blocks of all levels that own voxels."""
+        """Blocks with voxels, of all levels."""
         return self.blocks.num_voxel_blocks + sum(level.blocks.num_voxel_blocks for level in self.levels)
 
     def owned_slots(self) -> NDArray[np.int64]:
@@ -200,7 +203,7 @@ class BlockTree:
         return replace(out, finer=tuple(finer))
 
     def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
-        """Forget entries (n,), their voxels and all blocks inside them; see ``VoxelBlocks.remove``."""
+        """Remove entries (n,), their voxels and all blocks inside them; see ``VoxelBlocks.remove``."""
         slots = self.blocks.slot_of[entries]
         slots, leaving = slots[slots >= 0], []
         for level in self.levels:
@@ -211,7 +214,7 @@ class BlockTree:
         self.blocks.remove(entries, frame_number)
 
     def insert(self, records: BlockRecords, frame_number: int) -> None:
-        """Add blocks, none of which is known, and those inside them."""
+        """Add unknown blocks and the blocks inside them."""
         self.blocks.insert(records, frame_number)
         for level, parents, part in zip(self.levels, self.parents, records.finer, strict=False):
             level.insert(parents, part, frame_number)
@@ -220,7 +223,7 @@ class BlockTree:
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
-    """The finer levels of a map, at most two, as views read them."""
+    """The finer levels of a map (at most two) in the form that ray casting reads."""
     if not levels:
         return FinerLevels()
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))

@@ -1,4 +1,4 @@
-"""Copy of a growing map that another thread may read, and its mesh, of which only changed parts are extracted again."""
+"""Copy of a growing map that another thread may read, and a mesh whose changed parts alone are extracted again."""
 
 import copy
 
@@ -11,13 +11,13 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks, grown
 
 GROWTH = 4
-"""Capacity in units of the volume's: growing copies all blocks at once, spare capacity is only address space."""
+"""Capacity as a multiple of the volume's: growing copies all blocks, while spare capacity is only address space."""
 
 
 class VolumeMirror:
-    """Copy of a volume, brought up to date by copying only the blocks that were written since they were copied.
+    """Copy of a volume, updated by copying only the blocks written since the last copy.
 
-    ``update`` runs in the thread that changes the volume; between two updates any thread may read its copy ``volume``
+    ``update`` runs in the thread that changes the volume. Between two updates any thread may read the copy ``volume``
     (``extract_mesh``, ``IncrementalMesh``), whose frames count the updates.
     """
 
@@ -34,8 +34,11 @@ class VolumeMirror:
         self._copied = [np.zeros(0, dtype=np.int32) for _ in range(levels)]  # frame up to which each slot was copied
 
     def update(self, limit: int | None = None) -> None:
-        """Take over what was integrated since the last update; at most ``limit`` blocks of the coarsest level, those
-        copied longest ago first: the others keep an earlier state. None copies all."""
+        """Copy the blocks written since the last update.
+
+        ``limit`` is the largest number of blocks of the coarsest level. The least recently copied blocks come first;
+        the others keep their earlier state. None copies all.
+        """
         if self._source.map_id != self.volume.map_id:  # the map was cleared
             self._start()
         source, target = self._source.blocks, self.volume.blocks
@@ -54,7 +57,7 @@ class VolumeMirror:
         target.written[slots] = self.volume._frame_number
 
     def _copy(self, level: int, source: VoxelBlocks, target: VoxelBlocks, limit: int | None) -> NDArray[np.int64]:
-        """Copy the voxels that were written since they were copied; their slots (n,)."""
+        """Copy the voxels written since their last copy; returns their slots (n,)."""
         if len(self._copied[level]) < len(source.geometry):
             for name in ("geometry", "colors", "written"):
                 setattr(target, name, grown(getattr(target, name), GROWTH * len(source.geometry), 0))
@@ -75,15 +78,15 @@ Chunk = tuple[int, int, int]
 
 
 class IncrementalMesh:
-    """Mesh of a volume that is kept up to date while the map grows, for a live view.
+    """Mesh of a volume, kept up to date for a live view while the map grows.
 
-    The map is cut into chunks of 4x4x4 blocks. An update extracts the chunks that hold or touch a block written since
-    the last update; its time is proportional to the view, not to the map. All chunks together are the surface of
-    ``TsdfVolume.extract_mesh``, with duplicate vertices where chunks meet.
-    Updates and ``integrate`` must not run at the same time.
+    The map is divided into chunks of 4x4x4 blocks. An update extracts the chunks that contain or touch a block written
+    since the last update. Its time is proportional to the view, not to the map. All chunks together are the surface of
+    ``TsdfVolume.extract_mesh``, with duplicate vertices between chunks. Updates and ``integrate`` must not run at the
+    same time.
 
-    ``chunks`` are the meshes by the coordinates of their chunk, of those that have a surface: chunk (i, j, k) begins at
-    ``4 i``, ``4 j``, ``4 k`` blocks.
+    ``chunks`` are the meshes of all chunks with a surface, by chunk coordinates. Chunk (i, j, k) begins at block (4 i,
+    4 j, 4 k).
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
@@ -92,16 +95,16 @@ class IncrementalMesh:
         self._map_id = volume.map_id
         self._seen = -1
         self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
-        # a vertex beside a chunk, in a block around it, depends on the voxel sizes in all blocks that touch that one
+        # with several voxel sizes, a vertex depends on the voxel sizes in all neighbours of its block
         self._reach = 2 if volume.levels else 1
 
     def update(self) -> list[Chunk]:
-        """Extract what changed since the last update, and return the chunks that may have changed.
+        """Extract the chunks changed since the last update, and return the coordinates of all that may have changed.
 
         A returned chunk that is not in ``chunks`` has no surface any more.
         """
         removed: list[Chunk] = []
-        if self._volume.map_id != self._map_id:  # the map was cleared: its frames count from zero again
+        if self._volume.map_id != self._map_id:  # the map was cleared: its frame numbers restart
             removed = list(self.chunks)
             self.chunks.clear()
             self._map_id, self._seen, self._coords_of = self._volume.map_id, -1, self._coords_of[:0]
@@ -115,7 +118,7 @@ class IncrementalMesh:
             self._coords_of = more
         self._coords_of[slots] = coords
         stale = _touched(changed, self._reach)
-        if self._volume.pager is not None:  # a block that waits on disk has left its slot, not the map
+        if self._volume.pager is not None:  # a block that was paged out left its slot, but not the map
             corners = _corners(-self._reach, EDGE - 1 + self._reach)
             away = self._volume.pager.is_away((stale[:, None] * EDGE + corners).reshape(-1, 3))
             stale = stale[~np.any(away.reshape(-1, 8), axis=1)]
@@ -143,7 +146,7 @@ class IncrementalMesh:
         chunk_of = np.where(inner, np.arange(len(stale))[:, None], -1)
         exists = slots >= 0
         chosen, groups = slots[exists], chunk_of[exists]
-        # a block beside two chunks is listed for both and for its own chunk: keep one of them, its own chunk first
+        # a block next to two chunks is listed for both and for its own chunk: keep one, its own chunk first
         order = np.lexsort((-groups, chosen))
         chosen, groups = chosen[order], groups[order]
         once = np.ones(len(chosen), dtype=bool)
@@ -158,7 +161,7 @@ def _corners(low: int, high: int) -> NDArray[np.int32]:
 
 
 def _touched(blocks: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
-    """Chunks (m, 3) that hold a voxel within so many blocks of these blocks (n, 3), each once."""
+    """Unique chunks (m, 3) that hold a voxel within ``reach`` blocks of these blocks (n, 3)."""
     chunks = ((blocks[:, None] + _corners(-reach, reach)) // EDGE).reshape(-1, 3).astype(np.int64)
     packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
     unique = np.unique(packed)

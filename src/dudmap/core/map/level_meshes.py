@@ -1,8 +1,8 @@
-"""Surface of a map with several voxel sizes: marching cubes level by level, over one field that all levels see.
+"""Mesh of a map with several voxel sizes: marching cubes level by level, on one field shared by all levels.
 
-A point of the lattice of a level has the value of the smallest voxel that was observed there. Where a level ends, its
-voxels take the linear interpolation of the next coarser one, so that the surfaces of both meet: they run through the
-same points of the edges of the larger cells, and inside of their faces differ by the bend of the field alone.
+A lattice point of a level has the value of the smallest voxel observed there. At the border of a level, its voxels take
+the linear interpolation of the next coarser level, so that both surfaces meet. They share their points on the edges of
+the larger cells. Inside the faces of these cells they differ by the curvature of the field.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def level_meshes(
     groups: NDArray[np.integer],
     parameters: MeshParameters,
 ) -> list[Mesh]:
-    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are those of the coarsest level."""
+    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are for the coarsest level."""
     least = max(int(parameters.min_weight), 1)
     contents, links = [_trusted(blocks, slots, least)], []
     for level in levels:
@@ -65,7 +65,7 @@ def level_meshes(
 
 
 def _trusted(blocks: VoxelBlocks, slots: NDArray[np.int32], least: int) -> BlockRecords:
-    """Copies of blocks (n,), 0 where a voxel was observed fewer than ``least`` times."""
+    """Copies of blocks (n,); voxels observed fewer than ``least`` times are 0."""
     words = blocks.geometry[slots]
     words[(words >> 8) & 0xFF < least] = 0
     return _records(blocks.slot_coords[slots], words, blocks.colors[slots])
@@ -78,14 +78,16 @@ def _records(coords: NDArray[np.int32], geometry: NDArray[np.int32], colors: NDA
 
 
 def _of_level(blocks: VoxelBlocks, content: BlockRecords) -> VoxelBlocks:
-    """Blocks of one level; their slots are their numbers among the records."""
+    """Fill empty blocks with one level; the slots are the row numbers of the records."""
     blocks.insert(content, 0)
     return blocks
 
 
 def _take_over(coarse: BlockRecords, fine: BlockRecords, rows: NDArray[np.intp], octants: NDArray[np.intp]) -> None:
-    """Give coarse voxels the values of the finer ones at their places; ``rows`` and ``octants`` (n,) are those that the
-    fine blocks lie in."""
+    """Give coarse voxels the values of the finer voxels at the same points.
+
+    The fine blocks lie in ``octants`` (n,) of the coarse blocks ``rows`` (n,).
+    """
     for octant, (x, y, z) in enumerate(4 * OCTANTS):
         own = octants == octant
         place = rows[own], slice(x, x + 4), slice(y, y + 4), slice(z, z + 4)
@@ -95,8 +97,10 @@ def _take_over(coarse: BlockRecords, fine: BlockRecords, rows: NDArray[np.intp],
 
 
 def _filled(fine: VoxelBlocks, coarse: VoxelBlocks) -> VoxelBlocks:
-    """Blocks of a level, and those around them, filled by the coarser level where nothing was observed and on their
-    sides towards blocks that are not there."""
+    """Blocks of a level and their neighbours, filled from the coarser level.
+
+    Filled are unobserved voxels and the sides towards missing blocks.
+    """
     count = fine.num_slots
     coords = fine.slot_coords[:count]
     observed = (fine.geometry[:count] != 0).reshape(SHAPE)

@@ -1,4 +1,4 @@
-"""The map as a file: a NumPy archive that is written in parts, so that the map need not be in memory at once."""
+"""Map file: a NumPy archive written in parts, so that the map need not be in memory as a whole."""
 
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -22,11 +22,13 @@ FORMAT = "dudmap map 1"
 VOXELS = "geometry", "colors"
 """Arrays of the voxels (n, 512) of a level."""
 LARGEST_DEPTH = 1000.0
-"""Largest range of depth of a map file, metres; the steps of a raycast grow with it. Depth cameras reach 100 m."""
+"""Largest depth range of a map file, metres, because the steps of a ray cast grow with it. Depth cameras reach 100
+m.
+"""
 
 
 def write_map(path: str | Path, volume: "TsdfVolume") -> None:
-    """Write a map, replacing an older file at the end.
+    """Write a map; an older file is replaced when the new one is complete.
 
     Raises:
         MapError: The file cannot be written.
@@ -41,7 +43,7 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
         free_count.append(part.free_count)
         entries.append(part.owners + np.int32(first))
         first += len(part.coords)
-        del part  # it holds a copy of the voxels, of which those that are written next make another one
+        del part  # free this copy of the voxels before the next one is made
     small = {
         "format": FORMAT,
         "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
@@ -75,7 +77,7 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
 def _write_array(
     archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: tuple[int, ...], parts: Iterator[NDArray]
 ) -> None:
-    """Add an array that comes in parts along its first axis, as ``numpy.savez_compressed`` does."""
+    """Add an array that comes in parts along its first axis, in the form of ``numpy.savez_compressed``."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(member, header)
@@ -108,7 +110,7 @@ def read_map(path: str | Path) -> "TsdfVolume":
         )
     for number, level in enumerate(volume.levels[: len(finer)]):
         level.blocks = finer[number]
-        if not np.all(level.link(volume.all_blocks.parents[number])):  # which are those that were just read
+        if not np.all(level.link(volume.all_blocks.parents[number])):  # the parents were just read
             raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
     for level, parents in zip(volume.levels, volume.all_blocks.parents, strict=True):
         level.make_room(parents)
@@ -120,7 +122,7 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Came
 
     Raises:
         MapError: The file is a map of another version.
-        ValueError: The values are not those of a map.
+        ValueError: The values do not describe a map.
     """
     if str(data["format"]) != FORMAT:
         raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
@@ -134,10 +136,10 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Came
 
 
 def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:
-    """The blocks with smaller voxels, level by level.
+    """Blocks with smaller voxels, level by level.
 
     Raises:
-        ValueError: Their arrays do not belong together.
+        ValueError: Their arrays do not fit each other.
     """
     levels, names = [], set(data)
     while f"slot_coords{len(levels) + 1}" in names:

@@ -1,4 +1,4 @@
-"""How many blocks of a map fit into the memory that the process may use."""
+"""Number of map blocks that fit into the memory limit of the process."""
 
 import ctypes
 import sys
@@ -9,7 +9,7 @@ from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.errors import ConfigError
 
 SAFE_SHARE = 0.75
-"""Share of the limit that is used: what is needed for a moment, such as the mesh of a region, fits into the rest."""
+"""Share of the limit that maps may use; temporary data, such as the mesh of a region, fits into the rest."""
 LEAST = 400_000_000
 """Memory to leave for the kernels, the frames and the part of the map in view, bytes."""
 _STATM = Path("/proc/self/statm")
@@ -19,9 +19,8 @@ _STATM = Path("/proc/self/statm")
 class MemoryLimit:
     """Memory limit of the process, shared by all its maps.
 
-    What the program needs besides the voxels differs between cameras, configurations and platforms, so that it is
-    measured each time: the maps may have what is left of ``limit`` bytes of resident memory. Which blocks are in memory
-    changes no result.
+    The maps may use the rest of ``limit`` bytes of resident memory. The memory of the rest of the program is measured
+    each time, because it depends on camera, configuration and platform. Paging changes no result.
 
     Raises:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.
@@ -42,12 +41,12 @@ class MemoryLimit:
         spare = SAFE_SHARE * self.limit - resident_bytes()
         if spare < 0 and _return_freed():
             spare = SAFE_SHARE * self.limit - resident_bytes()
-        # released slots are resident too; a finer block has no more than its links besides, one in a hundred
+        # released slots are resident too; the links of a finer block are one percent and neglected
         return tree.num_slots + int(spare / tree.blocks.slot_bytes)
 
 
 def resident_bytes() -> int:
-    """Resident memory of the process; where only its maximum is known, that.
+    """Resident memory of the process, bytes; its maximum on platforms that report only this.
 
     Raises:
         ConfigError: It cannot be read on this platform.
@@ -63,7 +62,7 @@ def resident_bytes() -> int:
 
 
 def _return_freed() -> bool:
-    """Have the C library give freed memory back to the system, which it keeps for itself in pieces between others."""
+    """Make the C library return freed memory to the system, which it otherwise keeps in fragments."""
     if sys.platform != "linux":
         return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc only

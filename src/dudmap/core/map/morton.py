@@ -1,7 +1,7 @@
 """Morton codes of blocks (Morton 1966): the bits of the three coordinates interleaved.
 
-Blocks with neighbouring codes are near each other, and all blocks of a cube of ``2^k`` blocks that begins at a multiple
-of ``2^k`` have one run of codes, those with the same ``code >> 3 k``.
+Blocks with neighbouring codes are close. An aligned cube of ``2^k`` blocks per edge has one contiguous range of codes,
+with equal ``code >> 3 k``.
 """
 
 import numpy as np
@@ -16,8 +16,10 @@ _MASKS = (
 
 
 def encode(coords: NDArray[np.integer], bits: int = BITS) -> NDArray[np.int64]:
-    """Codes (...,) of block coordinates (..., 3) that have at most so many bits, the sign included; x has the highest
-    bit of each triple. The coordinates are shifted to be positive."""
+    """Codes (...,) of block coordinates (..., 3) with at most ``bits`` bits including the sign.
+
+    The coordinates are shifted to be positive; x has the highest bit of each triple.
+    """
     x, y, z = (_spread(coords[..., axis].astype(np.int64) + (1 << (bits - 1))) for axis in range(3))
     return (x << 2) | (y << 1) | z
 
@@ -29,14 +31,14 @@ def decode(codes: NDArray[np.int64], bits: int = BITS) -> NDArray[np.int32]:
 
 
 def _spread(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers of 21 bits with two zeros between every two bits."""
+    """Insert two zeros between the bits of 21-bit numbers."""
     for shift, mask in _MASKS:
         values = (values | (values << shift)) & mask
     return values
 
 
 def _gathered(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Inverse of ``_spread``; other bits between are ignored."""
+    """Inverse of ``_spread``; the bits between are ignored."""
     values = values & _MASKS[-1][1]
     for (shift, _), (_, mask) in zip(reversed(_MASKS), [*reversed(_MASKS[:-1]), (0, 0x1FFFFF)], strict=True):
         values = (values | (values >> shift)) & mask

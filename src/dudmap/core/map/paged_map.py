@@ -1,4 +1,4 @@
-"""The blocks of a map, of which those far from the view may wait on disk: which are in memory, and reading them all."""
+"""Blocks of a map in memory and on disk, and iteration over all of them."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from dudmap.core.state import Remembered, Stateful
 
 
 class PagedMap(Stateful):
-    """What ``TsdfVolume`` does with its blocks as a whole, wherever they are; its attributes are described there."""
+    """Block management of ``TsdfVolume``, which documents the attributes."""
 
     config: VolumeConfig
     block_size: float
@@ -27,10 +27,10 @@ class PagedMap(Stateful):
     pager: Remembered[BlockPager | None]
     _frame_number: Remembered[int]
     num_frames: Remembered[int] = 0
-    _left: Remembered[NDArray[np.int64] | None]  # where the window was when all blocks left the memory
+    _left: Remembered[NDArray[np.int64] | None]  # origin of the window when all blocks left the memory
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take over the blocks of a stored map, but for the voxels of the coarsest level.
+        """Restore a stored map except the voxels of the coarsest level.
 
         Raises:
             ValueError: Its parts do not fit each other.
@@ -45,27 +45,29 @@ class PagedMap(Stateful):
 
     @property
     def all_blocks(self) -> BlockTree:
-        """The blocks in memory with all finer ones."""
+        """The blocks in memory with all finer blocks."""
         return BlockTree(self.blocks, self.levels)
 
     @property
     def num_blocks(self) -> int:
-        """Blocks that own voxels, also those that are not in memory."""
+        """Blocks with voxels, in memory and on disk."""
         return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing has been integrated yet."""
+        """Whether no frame has been integrated yet."""
         return self.num_blocks == 0
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map as of ``VoxelBlocks.num_bytes``; the size of the window depends on the view alone."""
+        """Memory of the map as of ``VoxelBlocks.num_bytes``, without the window, whose size depends on the view
+        alone.
+        """
         return self.blocks.num_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        """Slots (n,) int32 of all blocks with voxels, ascending."""
         return self.blocks.active_slots
 
     @property
@@ -78,17 +80,20 @@ class PagedMap(Stateful):
         return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
-        """Empty blocks; below a memory limit with room for all that fit, so that growing does not copy them."""
+        """Empty blocks.
+
+        Under a memory limit they reserve address space for all blocks that fit, so that growing copies nothing.
+        """
         blocks, limit = VoxelBlocks(), None if self.pager is None else self.pager.max_blocks
         return VoxelBlocks(limit.limit // blocks.slot_bytes) if isinstance(limit, MemoryLimit) else blocks
 
     def _empty(self) -> None:
-        """Have no blocks and no window in memory."""
+        """Reset blocks and window to empty."""
         self.levels = []
         self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
 
     def page_out(self) -> None:
-        """Have all blocks wait on disk, where the map may do so, until they are needed again."""
+        """Move all blocks to disk, if paging is enabled, until they are needed again."""
         if self.pager is None or self.blocks.num_entries == 0:
             return
         if self.pager.page_out(self.all_blocks, self._frame_number):
@@ -100,12 +105,15 @@ class PagedMap(Stateful):
         self.window.fill(origin, self.blocks)
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
-        """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
+        """Load the blocks from ``low`` up to ``high`` (3,) and all blocks that touch them."""
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)
 
     def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
-        """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
+        """First block (3,) of each region.
+
+        Until the next iteration the region and all blocks that touch it are in memory.
+        """
         for region in regions_of(self.all_blocks, self.pager):
             first = np.array(region, dtype=np.int32) * REGION
             self._bring(first, first + REGION)
@@ -114,17 +122,18 @@ class PagedMap(Stateful):
             self._place_window(self.window.origin)
 
     def records(self) -> Iterator[BlockRecords]:
-        """Copies of all blocks, in parts: everything at once if it is in memory, else region by region."""
+        """Copies of all blocks, in parts: one part if all are in memory, else one per region."""
         if self.pager is None:
-            yield self.all_blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # as in the mesh
+            yield self.all_blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # in the order of the mesh
             return
         for first in self._visited_regions():
             yield self.all_blocks.records(self.blocks.entries_in(first, first + REGION))
 
     def take_colors(self, other: "PagedMap") -> None:
-        """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
+        """Replace colours and intensities by those of another map of the same world; distances and weights stay.
 
-        A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
+        A voxel without colour in the other map loses its colour, and takes the colour of the next measurement near the
+        surface.
         """
         assert other.config == self.config
         number = self._frame_number + 1
@@ -140,24 +149,25 @@ class PagedMap(Stateful):
         self._frame_number = number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
-        """Replace the colours of a level (0 = coarsest) within blocks (n,) of the coarsest one, as frame ``number``."""
+        """Replace the colours of a level (0 = coarsest) within blocks (n,) of the coarsest level; frame ``number``
+        wrote them."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)
 
     @property
     def num_integrated(self) -> int:
-        """Frames that were integrated."""
+        """Number of integrated frames."""
         return self._frame_number
 
     def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
+        """Slots (n,) int32 written after frame ``num_integrated``, and the coordinates (n, 3) int32 of their blocks.
 
-        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
+        A released slot is included, with the coordinates of its last block or of its new one.
         """
         blocks = self.blocks
         slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
         return slots, blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 = no voxels."""
         return self.blocks.slots_at(coords)

@@ -1,4 +1,4 @@
-"""Where the map needs smaller voxels: where the surface bends or is finely coloured and the sensor resolves it."""
+"""Selection of blocks that need smaller voxels: curved or finely coloured surface that the sensor resolves."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,20 +10,20 @@ from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
 FIRST = 3
-"""Frames after which a block is examined for the first time."""
+"""Number of fused frames at which a block is examined first."""
 PERIOD = 16
-"""Frames from one examination of a block to the next."""
+"""Frames between two examinations of a block."""
 HYSTERESIS = 0.5
 """Share of the thresholds below which a block with smaller voxels no longer needs them."""
 MAX_CALM = 3
-"""Successive examinations of that result after which its smaller voxels are dropped."""
+"""Successive examinations below this share after which the smaller voxels are dropped."""
 FILTERED = 0.5
-"""Standard deviation of a filtered reading relative to that of a raw one: assumed, since part of the noise of a sensor
-is the same over the window of the filter."""
+"""Standard deviation of filtered depth relative to raw depth: assumed, because part of the sensor noise is constant
+over the filter window."""
 BEND_NOISE = np.sqrt(6) / 4
 """Standard deviation of the bend along one axis for distances with the standard deviation 1."""
 SIGNIFICANT = 2.0
-"""Standard deviations of the bend of noise that a bend must exceed in addition to the threshold."""
+"""Number of standard deviations of bend noise that a bend must exceed in addition to the threshold."""
 
 
 def refine(
@@ -36,10 +36,20 @@ def refine(
     sensor: SensorConfig,
     coarser: FusionParameters,
 ) -> NDArray[np.int32]:
-    """Open and drop the blocks of a level in those of the coarser level (slots (n,)) that a frame was fused into.
+    """Create and drop finer blocks in the blocks (slots (n,)) of the coarser level that a frame was fused into.
 
-    ``depths`` (n,) are those of the centres of these blocks in the view, metres, ``coarser`` the parameters of their
-    level. Returns the slots (m,) of the blocks whose children changed.
+    Args:
+        level: The finer level.
+        parents: Blocks of the coarser level.
+        slots: (n,) of the coarser level.
+        depths: (n,) depths of the block centres in the view, metres.
+        number: Number of the frame.
+        config: Thresholds of bend and texture.
+        sensor: Noise of the depth camera.
+        coarser: Fusion parameters of the coarser level.
+
+    Returns:
+        Slots (m,) of the blocks whose children changed.
     """
     unit, saturated = coarser.sdf_unit / coarser.voxel_size, float(SATURATED * coarser.band.front / coarser.voxel_size)
     sigma = sensor.sigma(depths)
@@ -69,7 +79,7 @@ def refine(
 def _drop_calm(
     level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Drop children (n, 8) that are not needed any more; whether a parent (n,) lost one."""
+    """Drop children (n, 8) that are no longer needed; returns whether a parent (n,) lost one."""
     rows, octants = np.nonzero(children >= 0)
     slots = children[rows, octants]
     calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
@@ -92,6 +102,9 @@ def prolonged(
 
 
 def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers (n,) that spread the examinations of blocks over the frames, by their place alone, so that it does not
-    matter when they came into memory. Along each axis all remainders by ``PERIOD`` follow each other."""
+    """Numbers (n,) that distribute the examinations of blocks over the frames.
+
+    They depend on the block coordinates alone, so that paging changes no result. Along each axis they cycle through all
+    remainders by ``PERIOD``.
+    """
     return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])
