@@ -1,1 +1,1 @@
-"""Moving objects with identity, velocity and, where they are rigid, a map of their own."""
+"""Moving objects with identity and velocity; rigid objects also have a map."""

@@ -1,4 +1,4 @@
-"""Moving objects of a recording: identity and velocity of all, shape and trajectory of the rigid ones."""
+"""Moving objects of a recording: identity and velocity of all, shape and trajectory of rigid objects."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -18,12 +18,12 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MOST_WAITING = 30
-"""Frames whose moving objects nobody has asked for yet: 0.2 MB each."""
+"""Largest number of frames whose moving objects wait to be computed: 0.2 MB each."""
 
 
 @dataclass(eq=False)
 class _Frame:
-    """A tracked frame: arguments of ``ObjectTracker.update``, and the objects once they were found."""
+    """A tracked frame: arguments of ``ObjectTracker.update``, and its objects once computed."""
 
     timestamp: float
     dynamic: NDArray[np.bool_]
@@ -33,7 +33,7 @@ class _Frame:
 
 
 class MovingObjects(Stateful):
-    """Tracks the objects that the labels show to move; nothing here influences the camera's pose or the map.
+    """Tracks the objects that are labelled as moving, without influence on the camera pose or the map.
 
     ``movers`` of the configuration switches tracking and fusion on and off.
     """
@@ -49,11 +49,11 @@ class MovingObjects(Stateful):
         self._finding = Lock()
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
-        """Take note of a tracked frame; the function that is returned finds its moving objects, by id.
+        """Record a tracked frame; the returned function computes its moving objects, sorted by id.
 
-        They are found when somebody, in any thread, asks for them or for those of a later frame, or at once where their
-        shapes are fused. Of what nobody asks for, the last ``MOST_WAITING`` frames are kept: who asks for the first
-        time gets objects that were followed since then.
+        The function may be called from any thread. It also computes the objects of all earlier frames. Without calls,
+        only the last ``MOST_WAITING`` frames are kept, and identities begin at the first of them. With fusion, objects
+        are computed at once.
         """
         if self.tracker is None or estimate.labels is None:
             return tuple
@@ -73,7 +73,7 @@ class MovingObjects(Stateful):
         return partial(self._movers, frame)
 
     def _movers(self, frame: "_Frame") -> tuple[Mover, ...]:
-        """The moving objects of a frame, after those of the frames before it."""
+        """The moving objects of a frame, computed after all earlier frames."""
         assert self.tracker is not None
         with self._finding:
             while frame.movers is None:

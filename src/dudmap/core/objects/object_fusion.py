@@ -1,9 +1,8 @@
-"""Rigid fusion: a map and a trajectory of its own for every moving object that proves to be rigid.
+"""Rigid fusion: a map and a trajectory for every moving object that proves to be rigid.
 
-An object is registered to its own map as the camera is to the map of the static world (thesis section 4.4), and fused
-there: Ruenz and Agapito, Co-Fusion (2017). No classifier tells which objects are rigid: the fused surface of a rigid
-object is observed again wherever it is not occluded, that of a person's leg is soon seen through. The objects never
-influence the camera's pose or the map.
+An object is registered to its own map and fused there (thesis section 4.4; Ruenz and Agapito, Co-Fusion, 2017).
+Rigidity is measured, not classified: later frames observe the unoccluded surface of a rigid object again, but see
+through the old surface of a leg. The objects never influence the camera pose or the static map.
 """
 
 from collections.abc import Sequence
@@ -24,38 +23,44 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
 MAX_OBJECTS = 4
-"""Most objects that are registered in one frame; each costs a few milliseconds and some megabytes."""
+"""Largest number of objects registered in one frame; each costs a few milliseconds and some megabytes."""
 MAX_MESHES = 50
-"""Most meshes that are kept of objects no longer tracked."""
+"""Largest number of meshes of objects that are no longer tracked."""
 MAX_SEEN_THROUGH = 0.08
-"""Largest share of a rigid object's surface that a frame may see through: edges of the mask, errors of the pose."""
+"""Largest share of a rigid object's surface that a frame may see through, because of mask edges and pose errors."""
 MAX_OFF_SURFACE = 0.25
-"""Largest share of a rigid object's readings that may contradict its map."""
+"""Largest share of a rigid object's depth measurements that may contradict its map."""
 YOUNG_FRAMES = 10
-"""Frames that a map must hold before a misfit is evidence against a rigid object. Until then the map is restarted, also
-where much more of the object comes into view: a map started on a narrow strip is distorted."""
+"""Number of fused frames after which a misfit counts against rigidity. Younger maps restart
+instead. They also restart if much more of the object comes into view: maps started on a narrow strip are distorted."""
 GROWN = 1.5
-"""Visible surface, relative to that at the start of the map, that restarts a young map."""
+"""Visible surface, relative to the start of the map, that restarts a young map."""
 MAX_RESTARTS = 20
-"""Most restarts of a map."""
+"""Largest number of restarts of a map."""
 COLOR_SHARE = 0.3
-"""Weight of intensity residuals relative to the camera's registration: shading changes on a rotating object."""
+"""Weight of intensity residuals relative to camera registration; low, because shading changes on a rotating object."""
 MAX_POINTS = 2000
-"""Most surface points of an object that the check for being seen through uses."""
+"""Number of surface points of an object in the check for being seen through."""
 MIN_PIXELS = 60
-"""Fewest readings of an object that is registered: ten per degree of freedom of its pose."""
+"""Smallest number of pixels of a registered object: ten per degree of freedom of its pose."""
 MAX_PIXELS = 16000
-"""Most pixels of an object that are registered and fused; a larger view is halved."""
+"""Largest number of pixels of an object in registration and fusion; a larger view is halved."""
 MIN_SIZE = 16 << 3
-"""Smallest width and height of the crop, pixels: at most three halvings of it leave an image of at least 16 pixels."""
+"""Smallest width and height of the crop, pixels: three halvings leave at least 16 pixels."""
 RIM = 0.05
-"""Width of the border of the mask that is left out, as a share of its size: readings at grazing angles are noisy."""
+"""Width of the excluded mask border, as a share of the mask's size, because measurements at grazing angles are
+noisy."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """Object in a frame: the pyramid of the crop around it, coarse to fine; per level (h, w) float32, 1 where a pixel
-    shows the object, else 0; and the colours (h, w, 3) of the finest level."""
+    """Object in a frame: image pyramid of the crop around it.
+
+    Attributes:
+        levels: Pyramid, coarse to fine.
+        weights: Per level (h, w) float32, 1 at pixels of the object, else 0.
+        color: (h, w, 3) colours of the finest level.
+    """
 
     levels: list[Level]
     weights: list[NDArray[np.float32]]
@@ -76,8 +81,10 @@ class ObjectView:
 def crop_object(
     observation: Observation, mover: Mover, level: Level, exposure: tuple[float, float]
 ) -> ObjectView | None:
-    """Crop of a frame around an object, halved until at most MAX_PIXELS show it; None if the object is too small. The
-    mask of the object belongs to ``level``; gain and offset are applied to the frame's intensities."""
+    """Crop of a frame around an object, halved until at most MAX_PIXELS show it; None if the object is too small.
+
+    The mask of the object belongs to ``level``. ``exposure``: gain and offset for the frame's intensities.
+    """
     import cv2
 
     if np.count_nonzero(mover.mask) < MIN_PIXELS:
@@ -120,7 +127,7 @@ def crop_object(
 
 
 def _padded_range(indices: NDArray[np.int64], shortest: int, size: int) -> slice:
-    """Range within 0 to ``size`` of at least ``shortest`` that holds sorted indices and one more at each end."""
+    """Range within 0 to ``size`` around sorted indices, padded by 1 at each end and at least ``shortest`` long."""
     start, stop = int(indices[0]) - 1, int(indices[-1]) + 2
     missing = max(0, shortest - (stop - start))
     start, stop = start - missing // 2, stop + (missing + 1) // 2
@@ -159,7 +166,7 @@ class ObjectFusion(Stateful):
         self._results = []
 
     def objects(self, poses: dict[float, NDArray[np.float64]]) -> list[RigidObject]:
-        """All objects so far, by number; their trajectories follow from camera poses (4, 4) by time."""
+        """All objects so far, by number, with trajectories from the camera poses (4, 4) by time."""
         out = []
         for result, Ts in self._results + [track.result() for track in self._tracks.values()]:
             if result.mesh is not None:
@@ -178,8 +185,8 @@ class ObjectFusion(Stateful):
     ) -> list[Mover]:
         """Register and fuse the objects of a tracked frame, whose masks belong to ``level``.
 
-        Those with a map have the velocity of its centre then. That differs from the velocity of the visible surface: of
-        a rolling ball only the upper half may be in view, which is faster than the ball.
+        Returns the objects; an established object gets the velocity of the centre of its map. The velocity of the
+        visible surface differs: the visible upper half of a rolling ball is faster than the ball.
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):
@@ -205,7 +212,7 @@ class ObjectFusion(Stateful):
         return [self._with_velocity(mover, now) for mover in movers]
 
     def _with_velocity(self, mover: Mover, now: float) -> Mover:
-        """Object with the slope of a line through the recent positions of the centre of its map as its velocity."""
+        """Object with the velocity of its map's centre: the slope of a line through the recent positions."""
         track = self._tracks.get(mover.id)
         if track is None or len(track.Ts_camera_object) < YOUNG_FRAMES:
             return mover
@@ -218,7 +225,7 @@ class ObjectFusion(Stateful):
         return replace(mover, velocity=times @ positions / np.sum(times**2))
 
     def _close(self, id: int) -> None:
-        """End the tracking of an object for good; its mesh is kept if it is rigid."""
+        """End the tracking of an object permanently; its mesh is kept if it is rigid."""
         result, Ts = self._tracks.pop(id).result()
         self._closed.add(id)
         if result.rigid and sum(other.rigid for other, _ in self._results) >= MAX_MESHES:
@@ -287,10 +294,10 @@ class ObjectFusion(Stateful):
             self._fuse(track, view, T_object_camera, now)
 
     def _align(self, volume: ObjectVolume, view: ObjectView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
-        """Pose T_object_camera by registration, started from the guess of the lowest cost.
+        """Pose T_object_camera by registration from the guess with the lowest cost.
 
-        A reading that is off the map at that guess shows a side of the object not seen before and gets weight 0. In the
-        camera's registration such a reading has a cost, which here would pull the object back towards its known side.
+        A measurement off the map at that guess shows a new side of the object and gets weight 0. Its cost, as in camera
+        registration, would pull the object back to the known side.
         """
         volume.look_at(guesses[0])
         systems = [self.tracker.linearize(volume, view.levels[0], T, view.weights[0]) for T in guesses]
@@ -302,7 +309,7 @@ class ObjectFusion(Stateful):
         return self.tracker.align(volume, view.levels, T, weights, first_level=3 - len(view.levels))
 
     def _fuse(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64], now: float) -> None:
-        """Integrate a frame into the object's map, and update the sample of its surface and its displacement."""
+        """Integrate a frame into the object's map; update the surface sample and the displacement."""
         level, mask = view.levels[-1], view.mask
         track.volume.camera = level.camera
         track.volume.integrate(Frame(now, level.depth, view.color), T_object_camera, mask)
@@ -313,7 +320,7 @@ class ObjectFusion(Stateful):
         points = level.camera.points(u, v, level.depth.reshape(-1)[flat])
         points = (points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32)
         kept = track.points
-        if len(kept) + len(points) > MAX_POINTS:  # a random sample of everything fused so far
+        if len(kept) + len(points) > MAX_POINTS:  # a random sample of all fused points
             kept = kept[self._rng.permutation(len(kept))[: MAX_POINTS - len(points)]]
         track.points = np.concatenate([kept, points])
         sample = track.points[:: max(1, len(track.points) // 50)].astype(np.float64)
@@ -324,7 +331,7 @@ class ObjectFusion(Stateful):
     def _seen_through_share(
         self, track: ObjectTrack, observation: Observation, T_object_camera: NDArray[np.float64]
     ) -> float:
-        """Share of the object's fused surface, where it is not occluded, that the readings lie behind."""
+        """Share of the object's unoccluded fused surface that lies in front of the depth measurements."""
         T, camera = se3.inverse(T_object_camera), observation.camera
         points = track.points @ T[:3, :3].T + T[:3, 3]
         pixels, z = np.rint(camera.project(points)), points[:, 2]
@@ -341,7 +348,7 @@ class ObjectFusion(Stateful):
         return float(np.count_nonzero(seen_through) / max(np.count_nonzero(seen_through | seen), 1))
 
     def _off_surface_share(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64]) -> float:
-        """Share of the object's readings within the band of its map that lie off its surface."""
+        """Share of the object's measurements within the truncation band of its map that lie off its surface."""
         level = view.levels[-1]
         sample = track.volume.sample(level.depth, level.intensity, level.camera, T_object_camera)
         known = view.mask & np.isfinite(sample.distance)
@@ -353,7 +360,7 @@ class ObjectFusion(Stateful):
 def _predicted(
     T_world_object: NDArray[np.float64], velocity: NDArray[np.float64], duration: float
 ) -> NDArray[np.float64]:
-    """Pose after some seconds at a velocity (6,) of the origin and of the rotation, world axes."""
+    """Pose after ``duration`` seconds at a velocity (6,) of the origin and of the rotation, world axes."""
     T = T_world_object.copy()
     T[:3, 3] += velocity[:3] * duration
     T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), velocity[3:] * duration]))[:3, :3] @ T[:3, :3]

@@ -1,4 +1,4 @@
-"""Map and poses of one moving object while it is tracked, and the test whether they prove it rigid."""
+"""Map and poses of one moving object while it is tracked, and the test of its rigidity."""
 
 from dataclasses import dataclass, field, replace
 
@@ -12,31 +12,31 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
 EXTENT = 1.0
-"""Depth that the window of an object's map covers, reference depths: a cube of about 2.5 m in a room."""
+"""Depth range of the window of an object's map, reference depths: a cube of about 2.5 m in a room."""
 MIN_FRAMES = 10
-"""Fewest registered frames that prove an object rigid."""
+"""Smallest number of registered frames that prove rigidity."""
 MIN_DURATION = 0.5
-"""Shortest time that proves an object rigid, seconds."""
+"""Shortest time that proves rigidity, seconds."""
 MAX_MISFITS = 0.3
 """Largest share of registered frames that may contradict the map of a rigid object."""
 MIN_DISPLACEMENT = 0.03
 """Smallest displacement of a moving object, reference depths."""
 MIN_COMPONENT = 0.05
-"""Connected components of a mesh with a smaller share of the largest one's vertices than this are removed."""
+"""Smallest kept component of a mesh, as a share of the vertices of the largest component."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidObject:
-    """Outcome of fusing a moving object: its model if it is rigid, else the reason why there is none.
+    """Result of fusing a moving object: its model, or the reason why there is none.
 
     Attributes:
         id: Number of the object.
         rigid: Whether it is one rigid object that has moved.
-        reason: Why it is not, empty if it is.
-        frames: Frames that were fused.
-        mesh: Its shape, metres, object frame: the origin is the centre of the mesh's box, the axes are the world's at
-            first sight. None if it is not rigid.
-        trajectory: Its poses T_world_object, given the current estimate of the camera's poses; None if it is not rigid.
+        reason: Reason against rigidity, empty if rigid.
+        frames: Number of fused frames.
+        mesh: Its shape, metres, object frame, or None. The origin is the centre of the mesh's box; the axes are the
+            world's at first sight.
+        trajectory: Its poses T_world_object by the current camera poses, or None.
     """
 
     id: int
@@ -48,7 +48,7 @@ class RigidObject:
 
 
 class ObjectVolume(TsdfVolume):
-    """Map of an object: its window stays around the object's origin wherever the camera is; it is not carved."""
+    """Map of an object: its window stays at the object's origin, and it is not carved."""
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
         extent, still = EXTENT * sensor.reference_depth, config.model_copy(update={"carving": False})
@@ -57,30 +57,30 @@ class ObjectVolume(TsdfVolume):
         self._T_object_window[2, 3] = -self._reach
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
-        """Place the window around the origin; the camera's pose has no influence."""
+        """Place the window around the origin, independent of the camera pose."""
         del T_world_camera
         super().look_at(self._T_object_window)
 
 
 @dataclass(eq=False)
 class ObjectTrack:
-    """State of an object that is being registered and fused.
+    """State of an object that is registered and fused.
 
     Attributes:
         id: Number of the object.
         volume: Its map.
-        area: Visible surface when the map was started, square metres.
-        T_world_object: (4, 4) its current pose.
-        T_first: (4, 4) its pose when the map was started.
+        area: Visible surface at the start of the map, square metres.
+        T_world_object: (4, 4) current pose.
+        T_first: (4, 4) pose at the start of the map.
         first_seen, last_seen: Seconds.
         velocity: (6,) of the origin and of the rotation, m/s and rad/s, world axes.
-        Ts_camera_object: Poses (4, 4) of the frames that were fused, by time.
+        Ts_camera_object: Poses (4, 4) of the fused frames, by time.
         points: (n, 3) float32, a sample of the fused surface, object frame, metres.
-        misfits: Reason for each frame that contradicted the map.
-        registrations: Number of frames that were to be registered.
-        max_displacement: Largest displacement of its surface since the map was started, metres.
+        misfits: Reason of each frame that contradicted the map.
+        registrations: Number of attempted registrations.
+        max_displacement: Largest displacement of its surface since the start of the map, metres.
         recent_poses: Times and poses T_world_object of the last ``velocity_window`` seconds.
-        restarts: For each restart of the map the misfit that caused it; empty if a larger view did.
+        restarts: Misfit that caused each restart of the map; empty for a larger view.
     """
 
     id: int
@@ -100,8 +100,7 @@ class ObjectTrack:
     restarts: tuple[str, ...] = ()
 
     def rejection_reason(self, *, final: bool = True) -> str:
-        """Why the object is not proven to be rigid, empty if it is; before the end (not ``final``) only evidence
-        against a rigid object is a reason."""
+        """Reason against rigidity, empty if the object is rigid; missing evidence is a reason only if ``final``."""
         frames, contradicting = self.registrations, len(self.misfits)
         if frames >= MIN_FRAMES and contradicting > MAX_MISFITS * frames:
             return f"not rigid: {contradicting} of {frames} frames do not fit, the last: {self.misfits[-1]}"
@@ -118,7 +117,7 @@ class ObjectTrack:
         return ""
 
     def result(self) -> tuple[RigidObject, dict[float, NDArray[np.float64]]]:
-        """Outcome for the object, and its poses T_camera_object by time; no poses if it is not rigid."""
+        """Result for the object, and its poses T_camera_object by time; no poses if it is not rigid."""
         reason, frames = self.rejection_reason(), len(self.Ts_camera_object)
         if reason:
             return RigidObject(self.id, False, reason, frames), {}
@@ -131,7 +130,7 @@ class ObjectTrack:
 
 
 def _main_components(mesh: Mesh) -> Mesh:
-    """Mesh without connected components much smaller than the largest, which stem from readings beside the object."""
+    """Mesh without small components, which are measurements next to the object."""
     component = component_of_vertices(mesh)
     counts = np.bincount(component)
     return with_faces(mesh, (counts >= MIN_COMPONENT * counts.max())[component[mesh.faces[:, 0]]])

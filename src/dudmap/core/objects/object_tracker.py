@@ -1,7 +1,7 @@
 """Moving objects with a lasting identity, position, extent and velocity (thesis section 7.1).
 
-There is no classifier: an object is a set of pixels labelled as moving that is connected in space. Its estimates never
-influence the camera's pose or the map.
+An object is a spatially connected set of pixels that are labelled as moving, without a classifier. Its estimates never
+influence the camera pose or the map.
 """
 
 from dataclasses import dataclass, field
@@ -27,10 +27,10 @@ from dudmap.core.objects.scene_flow import InstanceFrame, displacements
 from dudmap.core.state import Remembered, Stateful
 
 OUTLIER_SPEED = 0.7
-"""A displacement whose velocity differs from the median of its neighbours by more than this is a change of the mask,
-reference depths per second."""
+"""Largest deviation of a displacement's velocity from the median, reference depths per second; a larger one is a change
+of the mask."""
 ESTABLISHED = 0.5
-"""Objects that were separate for this long stay separate when they touch, seconds."""
+"""Age after which separate objects stay separate when they touch, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,12 @@ class Mover:
     """One moving object in one frame.
 
     Attributes:
-        id: Number from 1 on, the same for as long as the object is tracked.
+        id: Number, at least 1, constant while the object is tracked.
         mask: (h, w) bool, at the resolution of the labels.
-        points: (N, 3) float32, metres, world frame, of the pixels in the mask that have a reading.
+        points: (N, 3) float32, metres, world frame, of the mask pixels with depth.
         centroid: (3,) metres, world frame, mean of the points: of the visible side, not of the object.
         box: (2, 3) metres, world frame, smallest and largest coordinates, without the outermost 1 % of the points.
-        velocity: (3,) m/s, world frame; 0 until the object has been seen twice.
+        velocity: (3,) m/s, world frame; 0 in the first frame.
         age: Seconds since it was first seen.
     """
 
@@ -63,8 +63,11 @@ class Mover:
 
 @dataclass(frozen=True, eq=False)
 class _Measurement:
-    """Motion of an object in one frame, and the seconds since it was last seen: displacement (3,) since then by optical
-    flow (None if unknown), positions (2, 3) of its centroid and of the centre of its box, metres."""
+    """Motion of an object in one frame.
+
+    ``duration``: seconds since it was last seen. ``displacement``: (3,) m since then by optical flow, None if unknown.
+    ``positions``: (2, 3) m, of its centroid and of the centre of its box.
+    """
 
     time: float
     duration: float
@@ -75,7 +78,7 @@ class _Measurement:
 
 @dataclass(eq=False)
 class _Track:
-    """State of an object over time; times in seconds, centroid and box (m) as last seen, area in square metres."""
+    """State of an object over time: times in seconds, last centroid and box (m), area in square metres."""
 
     id: int
     first_seen: float
@@ -88,18 +91,18 @@ class _Track:
 
 
 class ObjectTracker(Stateful):
-    """Segments the moving pixels of each frame into objects and associates these with those of earlier frames.
+    """Segments the moving pixels of each frame into objects and associates them with earlier objects.
 
-    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object in each pixel.
-    Where two objects that were separate touch, the connected region is split between them by the nearest predicted
-    pixel.
+    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel.
+    If two separate objects touch, their connected region is split by the nearest predicted pixel.
 
-    The velocity of an object is estimated over the last ``velocity_window`` seconds. While the object is fully visible,
-    it is the slope of a line through its positions: the visible surface of a rolling ball is faster than the ball. The
-    position of an object that is cut off by the image border or by an occluder is unknown; there it is the mean of its
-    displacements from frame to frame without outliers, each the median over the object's pixels, matched by
-    forward-backward optical flow (Lucas and Kanade 1981).
+    Velocities are estimated over the last ``velocity_window`` seconds:
 
+    * A fully visible object: slope of a line through its positions, because the visible surface of a rolling ball is
+      faster than the ball.
+    * An object cut off by the image border or an occluder: its position is unknown. Mean of its frame-to-frame
+      displacements without outliers, each the median over pixels matched by forward-backward optical flow (Lucas and
+      Kanade 1981).
     """
 
     _tracks: Remembered[list[_Track]]
@@ -175,7 +178,7 @@ class ObjectTracker(Stateful):
         return out
 
     def _segment(self, pixels: MovingPixels) -> list[NDArray[np.int64]]:
-        """Pixels (k,) of each object: regions are split where two objects touch, fragments are joined to objects."""
+        """Pixels (k,) of each object, after splitting regions of touching objects and joining fragments."""
         regions = [
             Region.of(pixels, indices)
             for start, stop in pixels.ranges
@@ -193,7 +196,7 @@ class ObjectTracker(Stateful):
         ]
 
     def _split(self, indices: NDArray[np.int64], pixels: MovingPixels) -> list[NDArray[np.int64]]:
-        """A region, split between the established objects that are predicted in it if there are several."""
+        """Parts of a region that contains several established objects; otherwise the region alone."""
         least = MIN_SHARE * pixels.shape[0] * pixels.shape[1]
         if len(indices) < 2 * least or len(self._tracks) < 2:
             return [indices]
@@ -209,7 +212,7 @@ class ObjectTracker(Stateful):
         return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)
 
     def _candidates(self, region: Region, groups: list[list[Region]]) -> list[list[Region]]:
-        """Objects that a region may be a fragment of: it is predicted to be the same, or it is much smaller."""
+        """Objects that may include a region: objects with the same prediction, or much larger ones."""
         same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
         track = next((track for track in self._tracks if track.id == region.predicted_id), None)
         if track and self._is_established(track, region.area):
@@ -221,7 +224,7 @@ class ObjectTracker(Stateful):
         return any(region.is_near(part, self.config.merge_distance) for part in group)
 
     def _is_established(self, track: _Track, area: float) -> bool:
-        """Whether an object has been seen for some time and a visible surface (m^2) is a substantial part of it."""
+        """Whether an object has been seen for some time and ``area`` (m^2) is a substantial part of it."""
         known = track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
         return known and area >= 0.3 * track.area
 
@@ -235,8 +238,8 @@ class ObjectTracker(Stateful):
     ) -> list[_Track]:
         """Track of each object, greedily by increasing cost: distance from the prediction - max_jump * shared pixels.
 
-        Only pairs are considered that share more than 0.3 of the pixels, lie closer than ``max_jump`` or have
-        overlapping boxes. An object without a track begins a new one.
+        A pair is considered if it shares more than 0.3 of the pixels, lies closer than ``max_jump`` or has overlapping
+        boxes. An object without a track begins a new one.
         """
         candidates, max_jump = [], self.config.max_jump
         if self._tracks:
@@ -288,7 +291,7 @@ class ObjectTracker(Stateful):
 def _instance_frame(
     timestamp: float, level: Level, pixels: MovingPixels, objects: list[NDArray[np.int64]], tracks: list[_Track]
 ) -> InstanceFrame:
-    """Images of the numbers and points of the moving objects of a frame."""
+    """Images of the ids and points of the moving objects of a frame."""
     ids = np.zeros(pixels.shape, dtype=np.int32)
     points = np.zeros((*pixels.shape, 3), dtype=np.float32)
     points.reshape(-1, 3)[pixels.flat] = pixels.points

@@ -10,13 +10,13 @@ from dudmap.core.backends.cpu import labeling
 from dudmap.core.frames.observation import Level
 
 SAMPLES = 60
-"""Points per region that the gap to another region is measured with."""
+"""Number of points per region for the distance to another region."""
 MAX_REGIONS = 24
-"""Regions of a frame that are considered, the largest first."""
+"""Largest number of regions per frame; the largest regions are used."""
 MIN_SHARE = 12 / (160 * 120)
-"""Regions of a smaller share of the image are noise: 12 pixels of a label image of the default size."""
+"""Smallest region as a share of the image; smaller ones are noise: 12 pixels of a default label image."""
 OCCLUSION_GAP = 0.1
-"""A surface nearer than an object's border by more than this occludes a part of the object, reference depths."""
+"""Depth step at an object's border beyond which a nearer surface occludes the object, reference depths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +26,9 @@ class MovingPixels:
     Attributes:
         flat: (n,) int, index of each pixel in the flattened image.
         points: (n, 3) float32, metres, world frame.
-        area: (n,) float32, surface that each pixel covers across the line of sight, square metres.
-        predicted_id: (n,) int32, number of the object expected in each pixel, 0 = none.
-        ranges: Start and stop of each region in these arrays, the region of the largest surface first.
+        area: (n,) float32, surface of each pixel across the line of sight, square metres.
+        predicted_id: (n,) int32, number of the predicted object, 0 = none.
+        ranges: Start and stop of each region in these arrays, largest surface first.
         shape: Height and width of the image.
     """
 
@@ -42,13 +42,13 @@ class MovingPixels:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Summary of some moving pixels that hang together.
+    """Summary of a connected set of moving pixels.
 
     Attributes:
-        indices: (k,) int, which of the ``MovingPixels``.
+        indices: (k,) int, into ``MovingPixels``.
         area: Visible surface, square metres.
         predicted_id: Most frequent predicted number, 0 = none.
-        sample: (m, 3) float32, some of its points, metres, world frame; ``box`` are their extreme coordinates.
+        sample: (m, 3) float32, some of its points, metres, world frame; ``box``: their extreme coordinates.
     """
 
     indices: NDArray[np.int64]
@@ -66,7 +66,7 @@ class Region:
         return cls(indices, float(pixels.area[indices].sum()), predicted_id, sample, box)
 
     def is_near(self, other: "Region", distance: float) -> bool:
-        """Whether some points of the two regions are closer to each other than a distance, metres."""
+        """Whether sampled points of the two regions are closer than ``distance``, metres."""
         for low, high, other_low, other_high in zip(*self.box, *other.box, strict=True):
             if low - other_high > distance or other_low - high > distance:
                 return False
@@ -79,8 +79,10 @@ class Region:
 def connected_regions(
     dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64], predicted_ids: NDArray[np.int32]
 ) -> MovingPixels | None:
-    """Moving pixels (h, w) of an image by region connected in the image and in depth; None if there is no region of
-    some size. ``predicted_ids`` are the objects expected in each 2x2 block, 0 = none."""
+    """Moving pixels (h, w) grouped into regions connected in the image and in depth; None if all regions are too small.
+
+    ``predicted_ids``: object predicted in each 2x2 block, 0 = none.
+    """
     moving = dynamic & (level.depth > 0)
     if not moving.any():
         return None
@@ -116,8 +118,10 @@ def connected_regions(
 
 
 def split_between(pixels: MovingPixels, indices: NDArray[np.int64], ids: Collection[int]) -> list[NDArray[np.int64]]:
-    """Pixels (k,) of a region by object: each goes to that of the nearest pixel predicted to show one of them. Each of
-    the objects ``ids`` is predicted in some pixels of the region."""
+    """Pixels (k,) of a region per object: each pixel belongs to the object of the nearest predicted pixel.
+
+    Each object of ``ids`` must be predicted in some pixels of the region.
+    """
     import cv2
 
     predicted = pixels.predicted_id[indices]
@@ -133,7 +137,7 @@ def split_between(pixels: MovingPixels, indices: NDArray[np.int64], ids: Collect
 
 
 def trimmed_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Extent (2, 3) of points (n, 3) without the outermost 1 % on each side, where readings of two surfaces mix."""
+    """Extent (2, 3) of points (n, 3) without the outermost 1 % on each side, which mix measurements of two surfaces."""
     cut = len(points) // 100
     order = np.partition(points, (cut, len(points) - 1 - cut), axis=0)
     return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)

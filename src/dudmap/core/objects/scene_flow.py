@@ -11,21 +11,24 @@ from dudmap.core.frames.observation import scaled_window
 from dudmap.core.frames.optical_flow import track_forward_backward
 
 PAIRED_PIXELS = 60
-"""Pixels of an object that are tracked into the last frame."""
+"""Number of pixels of an object that are tracked into the last frame."""
 FEWEST_PIXELS = 15
-"""Fewest pixels with a known displacement that determine that of their object."""
+"""Smallest number of matched pixels that determine the displacement of an object."""
 WINDOW = 9
-"""Edge of the window that a pixel is matched by, pixels of an image WINDOW_WIDTH wide."""
+"""Edge of the matching window, pixels of an image WINDOW_WIDTH wide."""
 RETURN_PX = 0.5
-"""Largest error of a pixel that is tracked into the last image and back, pixels of an image WINDOW_WIDTH wide."""
+"""Largest forward-backward error of a tracked pixel, pixels of an image WINDOW_WIDTH wide."""
 WINDOW_WIDTH = 160
 """Default width of the label image."""
 
 
 @dataclass(frozen=True, eq=False)
 class InstanceFrame:
-    """Moving pixels of a frame: grey image (h, w), number of the object (h, w) in each pixel, 0 = none, and point (h,
-    w, 3) float32, metres, world frame, 0 where nothing moves."""
+    """Moving pixels of a frame.
+
+    ``grey``: image (h, w). ``ids``: object (h, w) in each pixel, 0 = none. ``points``: (h, w, 3) float32, metres, world
+    frame, 0 at static pixels.
+    """
 
     timestamp: float
     grey: NDArray[np.uint8]
@@ -36,9 +39,11 @@ class InstanceFrame:
 def displacements(
     last: InstanceFrame, now: InstanceFrame, known: Collection[int], max_jump: float
 ) -> dict[int, NDArray[np.float64]]:
-    """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame,
-    by number, of those ``known`` objects in both frames with enough matched pixels. Displacements of a pixel longer
-    than ``max_jump`` metres are mismatches."""
+    """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame.
+
+    The result contains the ``known`` objects with enough matched pixels in both frames. Pixel displacements longer than
+    ``max_jump`` metres are mismatches.
+    """
     import cv2
 
     ids = now.ids.astype(np.float32)
@@ -66,7 +71,7 @@ def displacements(
     good[good] = last.ids[v[good], u[good]] == number[good]
     displacement = now.points[v_now[good], u_now[good]] - _interpolated(last.points, last.ids, matches[good])
     number = number[good]
-    plausible = np.linalg.norm(displacement, axis=1) < max_jump  # false for NaN, where a neighbour is another object's
+    plausible = np.linalg.norm(displacement, axis=1) < max_jump  # false for NaN: several objects nearby
     displacement, number = displacement[plausible], number[plausible]
     return {
         i: median(displacement[number == i]).astype(np.float64)
@@ -78,7 +83,7 @@ def displacements(
 def _interpolated(
     points: NDArray[np.float32], ids: NDArray[np.int32], pixels: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Bilinearly interpolated points (n, 3) at pixels (n, 2); NaN where the four pixels show several objects."""
+    """Bilinearly interpolated points (n, 3) at pixels (n, 2); NaN if the four pixels show several objects."""
     h, w = points.shape[:2]
     u0 = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, w - 2)
     v0 = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, h - 2)
