@@ -55,7 +55,7 @@ package: .venv/developed
 processors: .venv/developed
 	$(BIN)/python tests/processors.py
 
-# hostile files for all loaders: make fuzz SECONDS=60 LOADERS="bag,map", see docs/reliability.md
+# hostile files for all loaders: make fuzz SECONDS=60 LOADERS="bag,map", see CONTRIBUTING.md
 SECONDS ?= 60
 LOADERS ?=
 fuzz: .venv/developed

@@ -1,5 +1,6 @@
-"""The table of elements in docs/thesis.md: each place and each test exists."""
+"""The table of elements of the thesis, docs/thesis-elements.csv: each place and each test exists."""
 
+import csv
 import re
 from pathlib import Path
 
@@ -7,14 +8,14 @@ import pytest
 
 import dudmap
 
-PAGE = Path(__file__).parents[2] / "docs" / "thesis.md"
+TABLE = Path(__file__).parents[2] / "docs" / "thesis-elements.csv"
 SOURCE, TESTS = Path(dudmap.__file__).parent, Path(__file__).parents[1]
 VERDICTS = ("full", "differs", "project", "hardware")
 
 
 def rows():
-    text = PAGE.read_text(encoding="utf-8").split("## Elements")[1].split("## Errors")[0]
-    return re.findall(r"^\| ([^|]+) \| `([^`]+)` \| `([^`]+)` \| ([^|]+) \|$", text, flags=re.MULTILINE)
+    with TABLE.open(encoding="utf-8", newline="") as file:
+        return [tuple(row) for row in csv.reader(file)][1:]
 
 
 def resolved(root, place):
