@@ -41,14 +41,17 @@ check: .venv/developed
 docs: .venv/developed
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
 
-# wheel (from the sdist) and sdist, and the wheel in an environment that has nothing but what it requires
+# sdist, wheel (from the sdist) without kernels, wheel with the kernels for this Python on Linux, and the latter in an
+# environment that has nothing but what it requires
 package: .venv/developed
-	rm -rf dist build/clean
+	rm -rf dist build/clean build/kernels
 	$(BIN)/python -m build --no-isolation --outdir dist
+	$(BIN)/python -m dudmap.lab.wheel_kernels build/kernels
+	DUDMAP_KERNELS=build/kernels $(BIN)/python -m build --no-isolation --wheel --outdir dist
 	$(BIN)/twine check --strict dist/*
 	$(PYTHON) -m venv --without-pip build/clean
 	$(CLEAN) --requirement requirements/run.txt
-	$(CLEAN) --no-index --no-deps dist/*.whl
+	$(CLEAN) --no-index --no-deps dist/*-manylinux*.whl
 	cd build/clean && bin/dudmap --version && bin/dudmap demo --help >/dev/null && bin/dudmap config >/dev/null && \
 		bin/python -c 'import dudmap; [getattr(dudmap, name) for name in dudmap.__all__]'
 

@@ -56,6 +56,10 @@ FAKED = {
         ["benchmark", "soak"],
         {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
     ),
+    "benchmark compile": (
+        ["benchmark", "compile"],
+        {"dudmap.lab.benchmark.measure.in_own_process": lambda *_: {"rows": {}}},
+    ),
     "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
     "study run": (
         ["study", "design.toml"],

@@ -16,6 +16,7 @@ import dudmap
 from dudmap.core import kernel_cache
 from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import filtering
+from dudmap.core.faster_compiling import change_numba
 from dudmap.lab import warmup
 
 PROGRAM = """
@@ -108,6 +109,7 @@ def test_kernels_of_the_first_frames_do_not_compile_what_takes_seconds():
 
 
 def test_garbage_is_collected_again_once_a_kernel_is_compiled():
+    change_numba()
     with event.trigger_event("numba:compile"):
         with event.trigger_event("numba:compile"):
             assert not gc.isenabled()

@@ -18,7 +18,7 @@ import pytest
 from numba.core.caching import IndexDataCacheFile
 
 import dudmap
-from dudmap.core import formulas, kernel_cache
+from dudmap.core import formulas, kernel_cache, shipped_kernels
 from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import filtering
 
@@ -119,7 +119,7 @@ def test_a_run_without_home_and_cache_gives_what_any_run_gives(stranger, tmp_pat
 def kernel(tmp_path, monkeypatch):
     """Defines a new kernel and returns the brightness of a white pixel by it."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    kernel_cache._say_once.cache_clear()
+    shipped_kernels._said.clear()
 
     def intensity():
         out = np.zeros((1, 1), np.float32)
@@ -127,7 +127,7 @@ def kernel(tmp_path, monkeypatch):
         return out.item()
 
     yield intensity
-    kernel_cache._say_once.cache_clear()
+    shipped_kernels._said.clear()
 
 
 def test_kernels_are_compiled_in_memory_where_no_folder_can_be_written(kernel, monkeypatch):

@@ -107,8 +107,11 @@ def test_hooks_use_the_locked_tools():
 
 
 def test_the_workflow_pins_its_actions_and_calls_what_is_documented():
-    text = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
-    for used in re.findall(r"uses: (.*)", text):
+    release, text = (
+        (ROOT / ".github" / "workflows" / name).read_text(encoding="utf-8") for name in ("release.yml", "ci.yml")
+    )
+    assert "run: make package\n" in release
+    for used in re.findall(r"uses: (.*)", release + text):
         assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v[\d.]+", used)
     commands = [step["run"] for step in yaml.safe_load(text)["jobs"]["test"]["steps"] if "run" in step]
     assert commands == [".ci/run", "make package"]

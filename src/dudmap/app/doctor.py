@@ -143,8 +143,10 @@ def _caches() -> Iterator[Check]:
 
 
 def _kernel_cache() -> Check:
-    from dudmap.core import kernel_cache
+    from dudmap.core import kernel_cache, shipped_kernels
 
+    if shipped := shipped_kernels.folder():
+        return Check("kernels", "good", f"of the installation, for {shipped.name}")
     name, folder, count = "kernel cache", kernel_cache.folder(), kernel_cache.count()
     given = os.environ.get("NUMBA_CACHE_DIR")
     mend = "set NUMBA_CACHE_DIR to a folder that you can write and that lasts"

@@ -10,7 +10,7 @@ from typer import Argument, Option
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.benchmark_changes import changes
-from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, soak, speed
+from dudmap.cli.benchmark_machine import RUNS, QuickOption, compile_, gpu, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
 
@@ -65,6 +65,7 @@ def suite_command(
 
 for _command in (changes, speed, gpu, soak):
     app.command()(_command)
+app.command("compile")(compile_)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
 

@@ -1,4 +1,4 @@
-"""``dudmap benchmark speed | gpu | soak``: time and memory of the machine at hand."""
+"""``dudmap benchmark speed | compile | gpu | soak``: time and memory of the machine at hand."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +9,7 @@ from typer import Option
 from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
+from dudmap.errors import InternalError
 
 RUNS = Path("runs/benchmark")
 """Folder of the output folders, unless another one is named."""
@@ -70,6 +71,18 @@ def speed(
     figures = speed_figures(20 if quick else 300, _announced, open3d, sequence)
     text, tree = f"{markdown(figures)}\n{stages()}", {"figures": [figure._asdict() for figure in figures]}
     answer(save(None, text, out, "speed", tree), text, as_json=as_json, out=out)
+
+
+def compile_(as_json: o.JsonOption = False) -> None:
+    """Compile all kernels anew, in a process of its own, and print for each its seconds and its callers."""
+    from dudmap.lab.benchmark.compiling import compile_warmup, table
+    from dudmap.lab.benchmark.measure import in_own_process
+
+    _announced("the compilation of all kernels, one to two minutes")
+    tree = in_own_process(compile_warmup, None)
+    if "error" in tree:
+        raise InternalError(f"the kernels could not be compiled: {tree['error']}")
+    answer(tree, table(tree), as_json=as_json)
 
 
 def soak(

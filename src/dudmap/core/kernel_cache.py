@@ -1,14 +1,13 @@
-"""Folder of the compiled kernels, for all kernels.
+"""Compiled kernels: of the wheel, of a folder, or of this process.
 
 Numba refuses to define a kernel if none of its folders can be written. Then the kernels of dudmap are stored in a
 private folder of this user in the temporary folder, or are compiled in memory.
 """
 
-import multiprocessing
 import os
 import stat
 import tempfile
-import warnings
+from collections import Counter
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,10 @@ from typing import Any
 from numba.core import caching
 from numba.core.dispatcher import Dispatcher
 
+from dudmap.core import shipped_kernels
+from dudmap.core.faster_compiling import change_numba
 from dudmap.core.kernel_digest import digest, layout
+from dudmap.core.shipped_kernels import KernelCacheWarning as KernelCacheWarning
 
 _KINDS: dict[str, Any] = {
     kind.__name__.lstrip("_").removesuffix("CacheLocator"): kind for kind in caching.CacheImpl._locator_classes
@@ -28,8 +30,8 @@ _DAMAGED: type[Exception] = vars(caching)["pickle"].UnpicklingError
 """Error of Numba about a damaged file."""
 
 
-class KernelCacheWarning(UserWarning):
-    """Compiled kernels do not last."""
+counts = Counter[str]()
+"""Kernels of this process that were ``shipped`` in the wheel, ``stored`` in the folder, or ``compiled``."""
 
 
 def folder() -> Path | None:
@@ -42,6 +44,11 @@ def count() -> int:
     """Number of kernels in the folder."""
     place = folder()
     return 0 if place is None else sum(1 for _ in place.glob("*.nbi"))
+
+
+def is_cold() -> bool:
+    """Whether all kernels have to be compiled."""
+    return shipped_kernels.folder() is None and count() == 0
 
 
 def is_temporary() -> bool:
@@ -61,7 +68,7 @@ def store(kernel: Dispatcher) -> None:
 
 
 class _Store(caching.NullCache):
-    """Compiled forms of one kernel. The folder is opened when the first of them is needed."""
+    """Compiled forms of one kernel. The folder is only opened for a form that the wheel does not bring."""
 
     def __init__(self, kernel: Dispatcher) -> None:
         self._kernel = kernel
@@ -81,10 +88,17 @@ class _Store(caching.NullCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
         """The compiled form for a signature, None if it has to be compiled."""
-        return self._folder.load_overload(sig, target_context)
+        if found := shipped_kernels.load(self._kernel, sig, target_context):
+            counts["shipped"] += 1
+        elif found := self._folder.load_overload(sig, target_context):
+            counts["stored"] += 1
+        else:
+            change_numba()
+        return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ANN401
         """Store a compiled form."""
+        counts["compiled"] += 1
         self._folder.save_overload(sig, cres)
 
     def flush(self) -> None:
@@ -180,8 +194,6 @@ def _private() -> Path | None:
     return path if own else None
 
 
-@cache
 def _say_once(where: str) -> None:
-    if multiprocessing.parent_process() is None:
-        said = f"kernels are compiled {where}; set NUMBA_CACHE_DIR to a folder that you can write and that lasts"
-        warnings.warn(said, KernelCacheWarning, stacklevel=2)
+    advice = "set NUMBA_CACHE_DIR to a folder that you can write and that lasts"
+    shipped_kernels.say_once(f"kernels are compiled {where}; {advice}", "folder")

@@ -164,7 +164,7 @@ def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object
 def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
     """Before the demo as the first run of all, wait until two other processes have compiled what it needs, since a
     compiler takes as much memory again as the run."""
-    if kernel_cache.count() or num_threads() < 2:
+    if not kernel_cache.is_cold() or num_threads() < 2:
         yield
         return
     if not quiet:
@@ -177,10 +177,10 @@ def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
 def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
     """``compiled_beside`` for the first run, which no kernel is compiled for; before a later ``live`` one those of a
     calibration are loaded, which would hold up the frames."""
-    compiled = kernel_cache.count()
-    if live and compiled:
+    cold = kernel_cache.is_cold()
+    if live and not cold:
         dict(steps())["colour camera"]()
-    return compiled_beside(*(() if compiled else (BESIDE_RUN,)))
+    return compiled_beside(*((BESIDE_RUN,) if cold else ()))
 
 
 if __name__ == "__main__":

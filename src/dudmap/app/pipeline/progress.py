@@ -108,8 +108,8 @@ class RunProgress:
         self.console.print(sentence, style="yellow", soft_wrap=True)
 
     def announce_compilation(self) -> None:
-        """Report that kernels are compiled first, if none is cached."""
-        if not kernel_cache.count():
+        """Report that kernels are compiled first, if none is cached or part of the installation."""
+        if kernel_cache.is_cold():
             self.note(COMPILING)
 
     def once(self, sentence: str) -> None:

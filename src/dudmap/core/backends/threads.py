@@ -5,7 +5,6 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 """
 
 import atexit
-import gc
 import os
 import sys
 import threading
@@ -17,11 +16,8 @@ from importlib import import_module
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from numba import njit, version_info
-from numba.core import event
-from numba.core.codegen import CPUCodeLibrary
+from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numba.core.targetconfig import ConfigStack, TargetConfig
 
 from dudmap.core.kernel_cache import store
 
@@ -50,61 +46,6 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
 }
-
-
-class _Uncollected(event.Listener):
-    """Suspends the collection of garbage while a kernel is compiled: of the objects that a compilation makes nearly all
-    live until its end, and to look through them again and again takes a tenth of the time."""
-
-    def __init__(self) -> None:
-        self._nested, self._collects = 0, True
-
-    def on_start(self, event: event.Event) -> None:
-        if self._nested == 0:
-            self._collects = gc.isenabled()
-            gc.disable()
-        self._nested += 1
-
-    def on_end(self, event: event.Event) -> None:
-        self._nested -= 1
-        if self._nested == 0 and self._collects:
-            gc.enable()
-
-
-event.register("numba:compile", _Uncollected())  # sent under the lock of the compiler
-
-
-def _optimize_callers() -> None:
-    """Optimise what is always inlined, a ``Scalar``, only as far as inlining asks: all else is done in its callers, and
-    to do it before as well takes a tenth of the time of all compilations."""
-    optimize = CPUCodeLibrary._optimize_final_module
-
-    def optimize_less(self: CPUCodeLibrary) -> None:
-        flags, codegen = ConfigStack.top_or_none(), self._codegen
-        if flags is None or not (flags.forceinline and flags.no_cpython_wrapper):
-            optimize(self)
-            return
-        passes, builder = codegen._module_pass_manager(
-            loop_vectorize=False, slp_vectorize=False, opt=codegen._opt_level, cost="cheap"
-        )
-        passes.run(self._final_module, builder)
-
-    CPUCodeLibrary._optimize_final_module = optimize_less
-
-
-def _compare_flags_at_once() -> None:
-    """Compare the flags of compilations, which is done a hundred thousand times, by those that are set before all, and
-    hash them by their kind: Numba's own hash is that of their names, which all have."""
-    compare = TargetConfig.__eq__
-    TargetConfig.__hash__ = lambda self: hash(type(self))
-    TargetConfig.__eq__ = lambda self, other: (
-        (type(self) is type(other) and self._values == other._values) or compare(self, other)
-    )
-
-
-if version_info.short == (0, 68):  # whose private parts these are; others compile as they do
-    _optimize_callers()
-    _compare_flags_at_once()
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -50,7 +50,7 @@ def conduct(
     sentence ``error`` instead. With ``keep`` the run folders stay in ``runs/``. ``measure`` replaces the system.
     """
     unique = {run.key: run for run in runs}
-    if measure is None and not kernel_cache.count():  # once, not in every worker
+    if measure is None and kernel_cache.is_cold():  # once, not in every worker
         for _, step in steps():
             step()
     threads = max(1, machine()["cores_usable"] // jobs)
