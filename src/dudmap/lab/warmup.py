@@ -19,8 +19,9 @@ from dudmap.app.doctor import COMPILING
 from dudmap.app.terminal import say
 from dudmap.config import Config
 from dudmap.core import kernel_cache
-from dudmap.core.backends.cpu import rvl
+from dudmap.core.backends.cpu import points, rvl
 from dudmap.core.backends.cpu.evidence import BINS, EDGES
+from dudmap.core.backends.parameters import SensorNoise, TruncationBand
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.depth_readout import rectified_keyframe
@@ -28,12 +29,15 @@ from dudmap.core.calibration.keyframes import keyframe
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.dominant_motion import neighbour_votes, reproject, rigid_motion
 from dudmap.core.dynamics.masks import fit_mixture, full_size
+from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
+from dudmap.thesis.slam import ThesisSlam
+from dudmap.thesis_config import ThesisConfig
 
 SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
@@ -68,15 +72,21 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         return slam
 
     def variants() -> None:
-        for variant in ("dynamics.method=threshold", "tracker.robust=tukey"):
+        for variant in ("dynamics.method=threshold", "tracker.robust=tukey", "preprocess.drop_mixed=true"):
             slam = Slam(CAMERA, Config().override([variant, *SMALL]))
             for frame in frames:
                 slam.process(frame)
+        band = TruncationBand(1.0, 1.0, 1.0, 1.0, SensorNoise(1.0, 1.0, 1.0))
+        image, parameters = frames[0].depth, slam.tracker.parameters(band)
+        residual_weights(image, np.stack([image, image]), image, parameters)
+        thesis = ThesisSlam(CAMERA, ThesisConfig(levels=2))
+        for frame in frames:
+            thesis.process(frame)
 
     def image_motion() -> None:
-        points = np.random.default_rng(0).uniform(1, 2, (60, 3))
-        rigid_motion(points, reproject(start, points, CAMERA), CAMERA, start)
-        neighbour_votes(points, np.zeros(60, np.int32), points, np.zeros(60, np.int32), np.ones(60, bool), 5)
+        seen = np.random.default_rng(0).uniform(1, 2, (60, 3))
+        rigid_motion(seen, reproject(start, seen, CAMERA), CAMERA, start)
+        neighbour_votes(seen, np.zeros(60, np.int32), seen, np.zeros(60, np.int32), np.ones(60, bool), 5)
 
     def labels() -> None:
         slam, detector = Slam(CAMERA, config), DynamicDetector(config.dynamics, config.sensor)
@@ -120,13 +130,22 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         with tempfile.TemporaryDirectory() as folder:
             small_map().save(Path(folder) / "map.npz")
             TsdfVolume.load(Path(folder) / "map.npz")
+        volume = small_map()
+        blocks = volume.blocks
+        blocks.restore(blocks.state())
+        points.sample_points(
+            blocks.table, blocks.coords, blocks.slot_of, blocks.free_count, blocks.geometry, blocks.colors,
+            np.zeros((1, 3)), start[:3], volume.truncation / volume.sdf_unit, float(volume.config.carve_rate),
+        )  # fmt: skip
         rvl.decompressed(rvl.compressed(np.ones((2, 2), np.uint16)))  # of the frames that a map is rebuilt from
 
-    def synthetic_frames() -> None:
+    def synthetic_frames(noise: str | None = None) -> None:
         from dudmap.lab.synthetic import sequence
 
-        recording = sequence(frames=2, camera=CAMERA, start_dynamic=True)
+        recording = sequence(frames=2, camera=CAMERA, start_dynamic=True, noise=noise)
         _ = [recording[number] for number in range(len(recording))]
+        if noise:
+            recording.surface(observed=True)
 
     return [
         ("tracking, labels and map", process),
@@ -140,6 +159,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("labels", labels),
         ("calibration", calibration),
         ("several voxel sizes", several_voxel_sizes),
+        ("synthetic time of flight", lambda: synthetic_frames("l515")),
     ]
 
 

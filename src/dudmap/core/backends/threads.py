@@ -32,7 +32,7 @@ def _import_numba() -> None:
     if blas not in sys.modules:
         sys.modules[blas] = None  # pyright: ignore[reportArgumentType] - so that its import fails
         try:
-            import_module("numba.np.arraymath")
+            vars(import_module("numba.np.arraymath"))["_HAVE_BLAS"] = True  # as others find it
         finally:
             del sys.modules[blas]
 
