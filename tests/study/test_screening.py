@@ -116,9 +116,9 @@ def test_the_report_names_keys_that_matter_and_a_response_that_never_varies_has_
         describe_screening(report, found, name)
     report.save(tmp_path)
     text = (tmp_path / "report.md").read_text()
-    assert f"2 of {len(plan.factors)} keys have an effect on ate" in text
+    assert f"2 of {len(plan.factors)} keys affect ate" in text
     assert "volume.voxel_size" in text
-    assert f"0 of {len(plan.factors)} keys have an effect on ms" in text
+    assert f"0 of {len(plan.factors)} keys affect ms" in text
     words = summary(effects)
     assert words.startswith(f"2 of {len(plan.factors)} keys have a significant effect:\nate: volume.voxel_size")
     assert "tracker.huber" in words.partition("Without a significant effect on any response: ")[2]

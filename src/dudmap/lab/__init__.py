@@ -1,1 +1,1 @@
-"""What measures the system: synthetic recordings, benchmarks and designed studies."""
+"""Measurement of the system: synthetic recordings, benchmarks and designed studies."""

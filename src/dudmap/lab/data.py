@@ -1,4 +1,4 @@
-"""Data files of this package, and what has a name in them."""
+"""Data files of this package, and look-up of names in them."""
 
 import tomllib
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ def _fixed(value: Any) -> Any:  # noqa: ANN401 - any value of a TOML file
 
 
 def find(name: str, known: Mapping[str, Thing], what: str) -> Thing:
-    """Thing of the given name.
+    """Find a thing by name.
 
     Raises:
         ConfigError: The name is unknown.

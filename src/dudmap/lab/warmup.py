@@ -1,7 +1,7 @@
-"""The parts of the system that have kernels, run once on a few small images to compile them.
+"""Run the parts of the system that have kernels on a few small images, to compile the kernels.
 
-Two processes compile in about half the time of one, in which only one thread can compile: a second one goes through the
-parts in another order. Which of them compiles a kernel makes no difference; the other one loads it.
+One process compiles with one thread only, so that two take half the time: a second one runs the parts in another order.
+Each loads the kernels that the other has compiled.
 """
 
 import os
@@ -42,13 +42,13 @@ from dudmap.thesis_config import ThesisConfig
 SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 BESIDE = "labels", "several voxel sizes"
-"""Parts of all that a second process compiles, which take about as long as the others."""
+"""Parts that a second process compiles, which take about as long as the others."""
 BESIDE_RUN = "motion between images", "labels", "calibration", "mesh"
-"""Parts that it compiles while a run begins, in the order in which the frames need them."""
+"""Parts that the second process compiles while a run begins, in the order of their use."""
 
 
 def room(count: int) -> list[Frame]:
-    """Images of a wall, at rest, and of a box in front of it that moves; drawn without a kernel."""
+    """Images of a static wall and a moving box, drawn without a kernel."""
     shade = np.random.default_rng(0).integers(40, 220, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     frames = []
@@ -100,7 +100,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
             detector.memory.update(number, view.labelled, start, moving, segments)
             detector.memory.settled(number, view.labelled, start, segments, sigma, moving)
             full_size(moving, view.labelled.depth, view.observation.depth)
-        fit_mixture(np.ones(BINS, np.int64), EDGES)  # as of a whole run
+        fit_mixture(np.ones(BINS, np.int64), EDGES)  # as at the end of a run
 
     def calibration() -> None:
         preprocess, static = Preprocessor(CAMERA, config.preprocess), np.zeros(CAMERA.shape, bool)
@@ -137,7 +137,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
             blocks.table, blocks.coords, blocks.slot_of, blocks.free_count, blocks.geometry, blocks.colors,
             np.zeros((1, 3)), start[:3], volume.truncation / volume.sdf_unit, float(volume.config.carve_rate),
         )  # fmt: skip
-        rvl.decompressed(rvl.compressed(np.ones((2, 2), np.uint16)))  # of the frames that a map is rebuilt from
+        rvl.decompressed(rvl.compressed(np.ones((2, 2), np.uint16)))  # as for the stored frames of a map
 
     def synthetic_frames(noise: str | None = None) -> None:
         from dudmap.lab.synthetic import sequence
@@ -165,7 +165,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 @contextmanager
 def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
-    """Compiles parts in other processes during the block, if there are a core and a folder for them.
+    """Compile parts in other processes during the block, if there are a second core and a cache folder.
 
     The yielded function waits for the first process.
     """
@@ -182,8 +182,10 @@ def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object
 
 @contextmanager
 def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
-    """Before the demo as the first run of all, wait until two other processes have compiled what it needs, since a
-    compiler takes as much memory again as the run."""
+    """Before the first run of a demo, compile its kernels in two other processes and wait for them.
+
+    The demo waits, because a compiler needs as much memory as the run.
+    """
     if not kernel_cache.is_cold() or num_threads() < 2:
         yield
         return
@@ -195,8 +197,10 @@ def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
 
 
 def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
-    """``compiled_beside`` for the first run, which no kernel is compiled for; before a later ``live`` one those of a
-    calibration are loaded, which would hold up the frames."""
+    """``compiled_beside`` for the first run, which has no compiled kernels.
+
+    A later ``live`` run first loads the kernels of a calibration, which would delay its frames.
+    """
     cold = kernel_cache.is_cold()
     if live and not cold:
         dict(steps())["colour camera"]()

@@ -1,4 +1,4 @@
-"""What a frame costs besides arithmetic: launches, barriers, Python calls, files, time around kernels, and bytes."""
+"""Cost of a frame besides arithmetic: launches, barriers, Python calls, files, time around kernels, and bytes."""
 
 import gc
 import sys
@@ -28,25 +28,26 @@ if TYPE_CHECKING:
 CORE = str(Path(slam_module.__file__).parent)
 """Folder of the algorithm."""
 COUNTED_FROM = 40
-"""Frames before those that are counted: the first second has a map that knows little."""
+"""Frames before the counted ones: a map of the first second knows little."""
 BYTES_PER_PIXEL = 12 + 8 * 4 + 8
-"""Of one linearisation: depth, intensity, weight; eight voxels; two residuals."""
+"""Bytes per pixel of one linearisation: depth, intensity, weight; eight voxels; two residuals."""
 BYTES_PER_VOXEL, BYTES_PER_READING = 2 * 8, 13
-"""Of a fusion: distance, weight, intensity and colour, read and written; depth, colour, mask and packed pixel."""
+"""Bytes of a fusion, per voxel read and written (distance, weight, intensity, colour), and per pixel (depth, colour,
+mask, packed pixel)."""
 COPIED = 1 << 24
-"""Numbers of four bytes that are copied to measure the memory: more than caches hold."""
+"""Four-byte numbers copied to measure the memory bandwidth: more than caches hold."""
 
 
 class FrameCost(NamedTuple):
-    """Costs of two frames, one after the other.
+    """Costs of two consecutive frames.
 
     Attributes:
-        counts: Of the first, in the thread that calls ``Slam.process``. ``launches``: calls of compiled kernels;
-            ``barriers``: calls whose work other threads share, and which wait for it; ``calls``: calls of Python and C
-            functions outside of kernels; ``files``: files of ``core`` that the frame enters.
-        inside: By stage, of the first: ``kernel_us``, microseconds in them; ``launches``; ``barriers``; and ``bytes``
-            that registration and fusion read and write.
-        stages: Milliseconds by stage, of the second, which is not slowed down by the counting.
+        counts: Of the first frame, in the thread that calls ``Slam.process``. ``launches``: calls of compiled kernels.
+            ``barriers``: calls that wait for other threads. ``calls``: calls of Python and C functions outside of
+            kernels. ``files``: files of ``core`` that the frame enters.
+        inside: By stage, of the first frame: ``kernel_us``, microseconds in kernels; ``launches``; ``barriers``;
+            ``bytes`` that registration and fusion read and write.
+        stages: Milliseconds by stage, of the second frame, which is not slowed down by the counting.
     """
 
     counts: dict[str, int]
@@ -55,7 +56,7 @@ class FrameCost(NamedTuple):
 
 
 def count_calls(sequence: "Sequence", config: Config, frames: int) -> list[FrameCost]:
-    """Costs of the frames after the first ``COUNTED_FROM``; self-calibration, which runs beside the frames, is off."""
+    """Costs of the frames after the first ``COUNTED_FROM``, without self-calibration, which runs in the background."""
     config = config.override(["sensor.self_calibration=false"])
     slam = Slam(sequence.camera, config, calibration=sequence.calibration)
     costs, counted = [], None
@@ -77,8 +78,10 @@ def summary(costs: list[FrameCost]) -> dict[str, float]:
 
 
 def stage_table(costs: list[FrameCost], rate: float) -> str:
-    """Medians of each stage as a Markdown table: time in kernels and around them, launches, barriers, bytes, and the
-    time that the memory takes for these at ``rate`` bytes per second."""
+    """Markdown table of each stage's medians: time in kernels and around them, launches, barriers, bytes.
+
+    The last column is the memory time of these bytes at ``rate`` bytes per second.
+    """
     rows = []
     for name in dict.fromkeys(name for one in costs for name in one.stages):
         whole = median(one.stages.get(name, 0.0) for one in costs)
@@ -130,9 +133,9 @@ def _weighed(slam: Slam, view: FrameView, inside: dict[str, Counter[str]]) -> It
 
 def _counted(slam: Slam, view: FrameView) -> tuple[dict[str, int], dict[str, Counter[str]]]:
     """Counts of a frame, in all and by stage."""
-    # an isinstance would ask dead proxies
+    # isinstance would access dead proxies
     compiled = [found for found in gc.get_objects() if issubclass(type(found), Dispatcher)]
-    # formulas are inlined where kernels call them, and Python calls them uncompiled
+    # kernels inline formulas, and Python calls them uncompiled
     kernels = {found.py_func.__code__ for found in compiled if not found.targetoptions.get("forceinline")}
     sharing = threads.also_in_other_threads.__code__
     calls = 0

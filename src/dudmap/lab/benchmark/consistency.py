@@ -1,11 +1,11 @@
-"""How well trajectories explain the images of a recording: no truth is needed, and a wrong one is found out.
+"""Score trajectories by how well they explain the images of a recording, without ground truth.
 
-A frame seen from the pose of another one must show the depth and the intensities measured there. Trajectories are
-compared on the same pixels of the same pairs of frames, so that what no pose explains, such as noise, movers and
-occlusion, concerns them all alike. Each goes with a calibration of the cameras: the images stay as they were recorded,
-and a point reaches them by the pose, the velocity and the row times that both imply.
+A frame rendered from the pose of another frame must show the depth and intensities measured there. Trajectories are
+compared on the same pixels of the same pairs of frames. Noise, movers and occlusion, which no pose explains, therefore
+affect all alike. Each trajectory has a calibration of the cameras. The images stay as recorded; points are projected
+with the pose, the velocity and the row times.
 
-Trajectories with too few frames of the recording in common are a ``DatasetError``.
+Trajectories with too few common frames raise a ``DatasetError``.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,37 +35,39 @@ from dudmap.io.sequences import Sequence
 GAPS = 5, 15, 30
 """Frames between the two of a pair."""
 PAIRS = 100
-"""Approximate number of pairs of each gap that are compared."""
+"""Approximate number of compared pairs per gap."""
 TERMS = {"depth": "mm at 1 m", "intensity": "of 255"}
-"""What is compared, and its unit."""
+"""Compared quantities and their units."""
 WORST_DEPTH, WORST_INTENSITY = 0.05, 0.2
-"""Differences count up to these: depth over the squared depth (1/m), and intensity (0..1). A pixel whose depth differs
-by more with every trajectory is occluded or moves, and is left out."""
+"""Largest counted differences: of depth over the squared depth (1/m), and of intensity (0..1). A pixel whose depth
+differs by more for every trajectory is occluded or dynamic, and is excluded."""
 SMOOTH = 0.05
-"""Largest step of the depth to a neighbour, as a share of it, of a surface that is interpolated."""
+"""Largest relative step of the depth to a neighbour at which a surface is interpolated."""
 TEXTURED = 0.02
 """Smallest gradient of the intensity (0..1) per pixel."""
 BLUR = 1.0
-"""Standard deviation of the Gaussian that smooths the intensities, pixels: else interpolation, which only calibrated
-colours need, would take noise from them."""
+"""Standard deviation of the Gaussian that smooths the intensities, pixels. Without it, interpolation would reduce the
+noise of calibrated colours only."""
 ROW_STEPS = 3
-"""Steps of the fixed point that gives the row, and with it the time, at which a point was recorded; each leaves
-of the error readout times the image speed over the height, a tenth at most."""
+"""Iterations of the fixed point that gives the row, and so the time, at which a point was recorded. Each reduces the
+error by readout times image speed over the height, at most to a tenth."""
 FEWEST = 200
-"""Pixels that a pair must have in common; else it is left out, or its intensities are."""
+"""Fewest common pixels of a pair; with fewer, the pair or its intensities are excluded."""
 ROUNDING = 1e-4
-"""Share by which misfits differ by rounding."""
+"""Relative difference of misfits that rounding explains."""
 SAMPLES, LEAST_BLOCKS = 2000, 3
-"""Samples of the bootstrap, and stretches of the recording that it needs."""
+"""Samples of the bootstrap, and fewest stretches of the recording that it needs."""
 
 
 class Consistency(NamedTuple):
     """Misfits of k trajectories.
 
     Attributes:
-        names, gaps: Of the trajectories; frames between the two of a pair.
-        misfits, counts: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255), and (2,
-            gaps, blocks) pairs, that begin in one stretch of the recording, as long as the longest gap.
+        names: Of the trajectories.
+        gaps: Frames between the two of a pair.
+        misfits: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255). A block is the
+            pairs that begin in one stretch of the recording, as long as the longest gap.
+        counts: (2, gaps, blocks) numbers of pairs.
     """
 
     names: list[str]
@@ -78,20 +80,25 @@ class Consistency(NamedTuple):
         return self.misfits.sum(axis=2) / np.maximum(self.counts.sum(axis=2), 1)[..., None]
 
     def samples(self) -> NDArray[np.float64]:
-        """Mean misfits (SAMPLES, 2, gaps, k) of stretches drawn with replacement: pairs that overlap are not
-        independent, but stretches nearly are."""
+        """Bootstrap samples (SAMPLES, 2, gaps, k) of the mean misfits.
+
+        Stretches are drawn with replacement, because overlapping pairs are dependent and stretches hardly are.
+        """
         blocks = self.misfits.shape[2]
         times = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), SAMPLES)
         sums = np.einsum("sb,tgbk->stgk", times, self.misfits)
         return sums / np.maximum(np.einsum("sb,tgb->stg", times, self.counts), 1)[..., None]
 
     def intervals(self) -> NDArray[np.float64]:
-        """Ends (2, 2, gaps, k) of the intervals of 95 % of the means."""
+        """Ends (2, 2, gaps, k) of the 95 % intervals of the means."""
         return np.percentile(self.samples(), (2.5, 97.5), axis=0)
 
     def excess(self, term: int, one: int, other: int) -> tuple[float, float, float]:
-        """By which share the misfit of one trajectory is above that of another, in the mean over the gaps, and the ends
-        of its interval of 95 %; NaN where no pair could be compared."""
+        """Relative excess of one trajectory's misfit over another's, mean over the gaps, and the ends of its 95 %
+        interval.
+
+        NaN if no pair could be compared.
+        """
         seen = self.counts[term].any(axis=1)
         if not seen.any():
             return np.nan, np.nan, np.nan
@@ -100,7 +107,7 @@ class Consistency(NamedTuple):
         return (float(share), *np.percentile(drawn, (2.5, 97.5)).tolist())
 
     def verdicts(self) -> list[str]:
-        """For each term one sentence on every trajectory that is not the best one."""
+        """One sentence per term on every trajectory that is not the best one."""
         sentences = []
         for term, name in enumerate(TERMS):
             best = int(np.argmin(np.log(np.maximum(self.means()[term], 1e-9)).sum(axis=0)))
@@ -112,7 +119,7 @@ class Consistency(NamedTuple):
         return sentences
 
     def table(self) -> str:
-        """Markdown table of the misfits with half the width of their interval of 95 %, and the verdicts."""
+        """Markdown table of the misfits with half the width of their 95 % intervals, and the verdicts."""
         low, high = self.intervals()
         head = ["", *(f"{term} ({unit}), {gap}" for term, unit in TERMS.items() for gap in self.gaps)]
         cells = np.stack([self.means(), (high - low) / 2], axis=-1).reshape(-1, len(self.names), 2)
@@ -122,13 +129,13 @@ class Consistency(NamedTuple):
 
 
 class Images(NamedTuple):
-    """A frame as it was recorded.
+    """A frame as recorded.
 
     Attributes:
         camera: Of the depth.
-        depth: (h, w) float32, metres, 0 where there is no reading or something is known to move.
+        depth: (h, w) float32, metres, 0 = missing or known to be dynamic.
         intensity: (hc, wc) float32, 0..1, of the colour image.
-        color_offset: Time stamp of the colour image minus that of the depth image, seconds.
+        color_offset: Time stamp of the colour image minus the depth image's, seconds.
     """
 
     camera: Camera
@@ -138,7 +145,7 @@ class Images(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How a trajectory and its calibration relate two frames.
+    """Relation of two frames by a trajectory and its calibration.
 
     Attributes:
         T_second_first: (4, 4) of the depth cameras at the times of the middle rows.
@@ -158,9 +165,11 @@ def measure_consistency(
     max_frames: int | None = None,
     calibrations: Mapping[str, Calibration] | None = None,
 ) -> Consistency:
-    """Compare pairs of frames of a recording, as trajectories relate them; known dynamic pixels and gaps too long for
-    the recording are left out. Trajectories without one of the ``calibrations`` go with that of the recording; their
-    poses are those at the stamps of the depth images, which are ``depth_late``.
+    """Compare pairs of frames of a recording under several trajectories.
+
+    Known dynamic pixels, and gaps too long for the recording, are excluded. Trajectories without an entry in
+    ``calibrations`` use the recording's calibration. Poses are at the stamps of the depth images, which are
+    ``depth_late``.
     """
     stamps, given = sequence.timestamps[:max_frames], sequence.calibration or Calibration.registered(sequence.camera)
     cameras = [(calibrations or {}).get(name, given) for name in trajectories]
@@ -213,8 +222,10 @@ def measure_consistency(
 
 
 def pair_misfits(first: Images, second: Images, motions: List[Motion]) -> NDArray[np.float64]:
-    """Mean misfits (2, k) of the depth (mm at 1 m) and the intensity (of 255) of two frames on the same pixels, for k
-    motions; NaN where the images have too little in common."""
+    """Mean misfits (2, k) of depth (mm at 1 m) and intensity (of 255) of two frames on the same pixels, for k motions.
+
+    NaN if the images have too little in common.
+    """
     import cv2
 
     shape, near = first.depth.shape, np.ones((3, 3), np.uint8)
@@ -240,7 +251,7 @@ def pair_misfits(first: Images, second: Images, motions: List[Motion]) -> NDArra
         differences.append(other - greys[-1])
     static = valid & (np.min(gaps, axis=0) < WORST_DEPTH)
     slopes = np.linalg.norm(np.gradient(np.mean(greys, axis=0)), axis=0)
-    textured = static & colored & (slopes > TEXTURED)  # slopes beside the image are NaN
+    textured = static & colored & (slopes > TEXTURED)  # slopes next to the image border are NaN
     out = np.full((2, len(motions)), np.nan)
     if np.count_nonzero(static) >= FEWEST:
         out[0] = [1000 * gap[static].mean() for gap in gaps]
@@ -271,8 +282,10 @@ def _moving(
 def _seen(
     points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64], offset: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Pixels (n, 2) at which a camera beside the depth camera recorded points (3, n) of the latter, and their depths
-    (n,) there. See ``Calibration``; ``offset`` is the difference of the time stamps."""
+    """Pixels (n, 2) at which a second camera recorded points (3, n) of the depth camera, and their depths (n,) there.
+
+    See ``Calibration``; ``offset`` is the difference of the time stamps.
+    """
     camera, at = calibration.camera, _moving(points, velocity)
     readout, delay = calibration.depth_readout + calibration.readout, np.float32(offset + calibration.delay)
     seen = _moved(calibration.T_color_depth, at(np.full(points.shape[1], -delay)))
@@ -286,7 +299,7 @@ def _seen(
 def _shades(
     images: Images, points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Intensities (h, w) of points (3, h * w) in the colour image, NaN outside of it, and what vignetting leaves."""
+    """Intensities (h, w) of points (3, h * w) in the colour image, NaN outside, and their vignetting factor."""
     height, width = images.intensity.shape
     camera = calibration.camera.resized(width, height)
     pixels, _ = _seen(points, replace(calibration, camera=camera), velocity, images.color_offset)
@@ -297,7 +310,7 @@ def _shades(
 
 
 def _sampled(image: NDArray[np.float32], pixels: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Values (h, w), a shape, between the pixels of an image at places (h * w, 2), NaN outside of it."""
+    """Interpolated values (h, w), ``shape``, of an image at pixels (h * w, 2), NaN outside of it."""
     import cv2
 
     us, vs = pixels.T.reshape(2, *shape)
@@ -311,13 +324,13 @@ def _smoothed(intensity: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _velocity(poses: Mapping[int, NDArray[np.float64]], stamps: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Twist (6,) per second of frame ``n`` from the poses around it; 0 where these are not near."""
+    """Twist (6,) per second of frame ``n`` from neighbouring poses; 0 if none is near."""
     first, last = (m if m in poses and abs(stamps[m] - stamps[n]) <= MAX_GAP / 2 else n for m in (n - 1, n + 1))
     return central_velocity((stamps[first], poses[first]), (stamps[last], poses[last]))
 
 
 def _pose(trajectory: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
-    """Pose (4, 4) at a time within the trajectory; None where it has no row near it."""
+    """Pose (4, 4) at a time within the trajectory; None if no row is near."""
     stamps = trajectory.timestamps
     if not stamps[0] - 1e-6 <= timestamp <= stamps[-1] + 1e-6 or np.abs(stamps - timestamp).min() > LARGEST_GAP:
         return None

@@ -1,6 +1,6 @@
-"""Accuracy gate: on a small fixed set of recordings no figure may be worse than the recorded one plus a margin.
+"""Accuracy gate: on a small fixed set of recordings no metric may be worse than the recorded one plus a margin.
 
-A file or a figure that is missing in it is a ``ConfigError``.
+A missing file or metric raises a ``ConfigError``.
 """
 
 import tomllib

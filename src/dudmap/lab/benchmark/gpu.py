@@ -1,4 +1,4 @@
-"""Time per frame and per kernel on a GPU, and on the CPU beside it."""
+"""Time per frame and per kernel on a GPU, and on the CPU for comparison."""
 
 import statistics
 import time
@@ -14,8 +14,7 @@ from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 
 KERNELS_EVERY = 4
-"""In every fourth frame the kernels are measured, in the others the frame and its stages: events around each kernel
-take time."""
+"""Every fourth frame measures kernels, the others the frame and its stages, because events around kernels take time."""
 
 
 def measure_devices(
@@ -25,9 +24,9 @@ def measure_devices(
     wanted: str,
     announce: Callable[[str], None],
 ) -> list[Row]:
-    """Rows of recordings by name with each voxel size (m), on the GPU, if there is one, and on the CPU beside it.
+    """Rows of recordings by name with each voxel size (m), on the GPU, if there is one, and on the CPU.
 
-    ``announce`` is called with what is measured next.
+    ``announce`` is called with a description of the next measurement.
     """
     device, rows = resolve(wanted), list[Row]()
     for name, recording in recordings.items():
@@ -39,12 +38,12 @@ def measure_devices(
 
 
 def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> Row:
-    """Process the first ``frames`` frames with voxels in metres.
+    """Process the first ``frames`` frames with voxels of a size (m).
 
     Returns:
-        Medians in milliseconds of a frame, of its ``stages``, on a GPU of its ``kernels``, of a mesh and its number of
-            triangles, and of a view of the camera's size; the map and the peak memory of a GPU, MB. ``error`` stands in
-            their place where the device cannot do all of it.
+        Medians in milliseconds: of a frame, of its ``stages``, of ``kernels`` on a GPU, of a mesh, and of a view of the
+            camera's size. Also the number of triangles, and MB of the map and of the peak GPU memory. Only ``error`` if
+            the device fails.
     """
     row: Row = {"what": name, "voxel": voxel, "device": device}
     try:
@@ -85,7 +84,7 @@ def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
-    """Milliseconds that each kernel of an action takes, by events of the GPU; names lose Warp's prefix and hash."""
+    """Milliseconds per kernel of an action, by events of the GPU; names lose Warp's prefix and hash."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
@@ -100,7 +99,7 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown: times and memory of each run, then the kernels of those on a GPU."""
+    """Markdown: times and memory of each run, then the kernels of runs on a GPU."""
     stages, body = list(dict.fromkeys(stage for row in rows for stage in row.get("stages", ()))), []
     for row in rows:
         figures = {**row.get("stages", {}), **row}

@@ -1,7 +1,7 @@
 """The limit of dynamics: the largest dynamic share of the image with which tracking still succeeds.
 
-People cover more and more of the image, for each of several speeds and camera paths, and when they are there from the
-first frame on (``limits`` in ``suites.toml``; ``docs/limits.md`` defines the figures).
+The share of people in the image grows, for several speeds, for several camera paths, and with people from the start
+(``limits`` in ``suites.toml``). ``docs/limits.md`` defines the metrics.
 """
 
 from collections.abc import Collection

@@ -1,6 +1,6 @@
-"""Measurement of a system on a recording, in a process of its own so that nothing is shared, and tables of it.
+"""Measure a system on a recording, in a separate process so that nothing is shared; tables of the results.
 
-A recording that cannot be used, and one in which nothing is tracked, is a ``DudmapError``.
+An unusable recording, or one without a tracked frame, raises a ``DudmapError``.
 """
 
 import csv
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 """One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
-"""Figures of a trajectory; the drift is that after aligning the first pose only."""
+"""Metrics of a trajectory; the drift is measured after aligning the first pose only."""
 COMPLETE_WITHIN = 0.02
-"""Largest distance to the mesh of a point of the true surface that counts as reconstructed, metres."""
+"""Largest distance to the mesh of a reconstructed point of the true surface, metres."""
 SAMPLES = 100_000
 """Points sampled on each surface; shares then vary by at most 0.03 %, a third of the gate's smallest margin."""
 FEWER_SAMPLES = 40_000
-"""The same where many runs are compared; the standard error of a share of 1 % is then at most 0.05 %."""
+"""The same for comparisons of many runs; the standard error of a share of 1 % is then at most 0.05 %."""
 
 
 DIED: Row = {"error": "its process died without a result, as when it crashes or runs out of memory"}
@@ -50,8 +50,8 @@ DIED: Row = {"error": "its process died without a result, as when it crashes or 
 class Job(NamedTuple):
     """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run.
 
-    Without a folder the mesh is not scored. ``calibrate`` says whether the calibration of the colour camera is
-    estimated first, as ``dudmap run`` does.
+    Without a folder the mesh is not scored. ``calibrate`` is whether the colour camera is calibrated first, as in
+    ``dudmap run``.
     """
 
     entry: Entry
@@ -80,16 +80,16 @@ def measure_sequence(
     calibrate: bool = False,
     ahead: int | None = None,
 ) -> Row:
-    """Run a system on a recording: figures of its metrics.json and errors of trajectory and mesh.
+    """Run a system on a recording: metrics of its metrics.json and errors of trajectory and mesh.
 
     Args:
+        sequence, config: Recording and parameters.
         surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
         max_frames: Use only the first frames.
         samples: Number of points sampled on each surface.
         passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
-        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the
-            recording is taken as given.
+        calibrate: Estimate the calibration of the colour camera first, as in ``dudmap run``; else use the recording's.
     """
     from dudmap.app.pipeline.frame_source import AHEAD
     from dudmap.app.pipeline.run import run
@@ -157,16 +157,16 @@ def measure_each(
     *,
     shared: bool = False,
 ) -> list[Row]:
-    """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a process of its own.
+    """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a separate process.
 
     Args:
         function: Makes a row of an argument; if it fails, the row has ``error``.
-        jobs: Labels, which JSON can hold and which differ, and arguments.
+        jobs: Distinct labels for JSON, and arguments.
         workers: Number of processes at a time. Times per frame are reliable with one only.
         done: Called with every row as soon as it is measured.
-        kept: File (.jsonl) to which every row is added then; rows that it already has are not measured again.
-        shared: Measure in as many processes as there are workers, whose start many short jobs share. If one of them
-            dies, the remaining jobs have processes of their own.
+        kept: File (.jsonl) to which every new row is added; rows in it are not measured again.
+        shared: Share ``workers`` processes between many short jobs, to save process starts. If one of them dies, the
+            remaining jobs have separate processes.
     """
     jobs = list(jobs)
     rows: dict[str, Row] = {}
@@ -231,7 +231,7 @@ def _processes(count: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this process with the one that started it, which may be killed: it would wait for its next job forever."""
+    """End this process with its parent, which may be killed, because it would wait for its next job forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
@@ -283,7 +283,7 @@ def markdown(rows: list[Row]) -> str:
 
 
 def save(rows: list[Row] | None, text: str, out: Path, name: str, more: Row | None = None) -> Row:
-    """Write <name>.md, <name>.json and, of rows, <name>.csv into a folder, in stored units; returns what JSON holds."""
+    """Write <name>.md, <name>.json and, for rows, <name>.csv, in stored units; return the JSON content."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.md").write_text(text, encoding="utf-8")
     content: Row = {"machine": machine(), "versions": versions(), **(more or {})}

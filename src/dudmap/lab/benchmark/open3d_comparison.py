@@ -1,6 +1,6 @@
-"""Open3D's dense SLAM on the same frames and the same machine, in turn with ours.
+"""Open3D's dense SLAM and dudmap on the same frames and machine, alternately.
 
-A program that fails is a ``DudmapError``.
+A failing program raises a ``DudmapError``.
 """
 
 import json
@@ -29,7 +29,8 @@ WARM_UP = 10
 
 
 class Comparison(NamedTuple):
-    """Median times per frame (ms), ATE RMSE of the last round (m; None without truth), frames, version of Open3D."""
+    """Median times per frame (ms), ATE RMSE of the last round (m; None without ground truth), frames, version of
+    Open3D."""
 
     ours_ms: float
     theirs_ms: float
@@ -42,8 +43,8 @@ class Comparison(NamedTuple):
 def compare_with_open3d(python: Path, sequence: Sequence, frames: int, rounds: int = ROUNDS) -> Comparison:
     """Run both systems alternately on the first frames of a recording; ``python`` is an interpreter that has open3d.
 
-    Both receive decoded images and are timed until the pose is estimated and the frame is fused: ours with the default
-    configuration including dynamic labels, theirs with the same voxel size and largest depth.
+    Both receive decoded images and are timed until the pose is estimated and the frame is fused. dudmap has its default
+    configuration with dynamic labels, Open3D the same voxel size and largest depth.
     """
     count = min(frames, len(sequence))
     if count < 2:

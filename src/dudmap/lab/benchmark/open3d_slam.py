@@ -2,9 +2,9 @@
 
     python open3d_slam.py FOLDER VOXEL_SIZE DEPTH_MAX
 
-FOLDER holds depth.npy (N, H, W) uint16, color.npy (N, H, W, 3) uint8 and camera.json with fx, fy,
-cx, cy and depth_scale. The steps and values are those of Open3D's own example dense_slam.py: frame to model tracking,
-integration with a band of 8 voxels, model frame by ray casting. Prints one JSON object: version, ms per frame, poses.
+FOLDER holds depth.npy (N, H, W) uint16, color.npy (N, H, W, 3) uint8 and camera.json with fx, fy, cx, cy and
+depth_scale. Steps and values follow Open3D's example dense_slam.py. They are frame-to-model tracking, integration with
+a band of 8 voxels, and ray casting of the model frame. Prints one JSON object: version, ms per frame, poses.
 """
 
 import json

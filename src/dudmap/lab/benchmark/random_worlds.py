@@ -1,4 +1,4 @@
-"""Random worlds with random sensors: how often a system fails, how badly, and whether it says so."""
+"""Random worlds with random sensors: frequency and size of failures, reported and silent."""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ SILENT_ATE, SILENT_LOST = 0.05, 0.2
 NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
 """Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
 DRAWN = tables("benchmark/random_worlds.toml")
-"""What is drawn, and with which probabilities or from which ranges."""
+"""Drawn parameters, with their probabilities or ranges."""
 
 
 def _drawn(fault: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
@@ -75,10 +75,10 @@ def measure_worlds(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """One row per world, in the order of their numbers; ``done`` is called with each that was measured now.
+    """One row per world, in the order of their numbers; ``done`` is called with each new row.
 
-    Each is written to seed-<seed>-<fingerprint>.jsonl in ``out`` as soon as it is measured; worlds of the same code and
-    configuration that the file holds are not measured again.
+    Each row is written to seed-<seed>-<fingerprint>.jsonl in ``out`` at once. Worlds of the same code and configuration
+    in that file are not measured again.
     """
     out.mkdir(parents=True, exist_ok=True)
     fingerprint = hashlib.sha256(f"{code_hash()}{config.to_toml()}".encode()).hexdigest()[:8]
@@ -95,7 +95,7 @@ def _measure(job: tuple[Entry, Config]) -> Row:
 
 
 def is_silent_failure(row: Row) -> bool:
-    """Whether a world is wrong without saying so."""
+    """Whether a world failed silently."""
     ate = row.get("ate_rmse_m")
     return ate is not None and ate > SILENT_ATE and row["lost"] < SILENT_LOST * row["frames"]
 

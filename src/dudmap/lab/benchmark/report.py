@@ -48,9 +48,9 @@ def run_suite(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> tuple[Row, str]:
-    """Measure a suite, write <suite>.md, .csv and .json into ``out``, and return what JSON holds and the Markdown.
+    """Measure a suite; write <suite>.md, .csv and .json into ``out``; return the JSON content and the Markdown.
 
-    Runs are kept in ``out``/runs/<system>/<sequence>, but for those of the suite ``limits``. ``others`` are folders
+    Runs are kept in ``out``/runs/<system>/<sequence>, except for the suite ``limits``. ``others`` are folders
     with results of other systems by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
     """
     kept = None if suite.name == "limits" else out / "runs"
@@ -71,7 +71,7 @@ def run_suite(
     text = f"# Suite {suite.name}\n\n{table}\n{_missing(suite)}{comparison_tables(rows, printed, suite)}"
     text += limits_table(rows, [*systems, *others]) if suite.name == "limits" else ""
     if workers > 1:
-        text += f"\n{workers} runs at a time: the times per frame are not those of an otherwise idle machine.\n"
+        text += f"\n{workers} runs at a time: the times per frame are not of an otherwise idle machine.\n"
     cpu = machine()
     text += f"\n{cpu['cpu']}, {cpu['cores_usable']} cores; dudmap {versions()['dudmap']}\n"
     more = {

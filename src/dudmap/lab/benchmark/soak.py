@@ -1,4 +1,4 @@
-"""A long run in one room: whether time, memory and error grow over many frames that are stored as they come."""
+"""A long run in one room: growth of time, memory and error over many frames."""
 
 import tempfile
 import time
@@ -30,7 +30,7 @@ MORE = 1.1
 
 
 class Rendered:
-    """Recording that notes the processor time at which a frame is rendered, which is not the system's."""
+    """Recording that sums the processor time of rendering, to subtract it."""
 
     def __init__(self, recording: Sequence) -> None:
         self._recording, self.rendered = recording, 0.0
@@ -48,7 +48,7 @@ class Rendered:
 
 
 class Tenths(RunObserver):
-    """Figures of each tenth of a run; a pose is compared after the motion that makes the first one right."""
+    """Metrics of each tenth of a run; poses are aligned by the first one."""
 
     def __init__(self, recording: Rendered, done: Callable[[Row], None]) -> None:
         self.rows: list[Row] = []
@@ -81,13 +81,13 @@ class Tenths(RunObserver):
 
 
 def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[Row], None]) -> list[Row]:
-    """Process a room with people at 15 Hz, the camera to and fro on an arc once in 20 s; the noise never repeats.
+    """Process a room with people at 15 Hz; the camera swings on an arc once in 20 s, and the noise never repeats.
 
     ``done`` is called with every row as soon as its tenth of the run ends.
 
     Returns:
-        One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map,
-            size of the run folder, frames lost so far, and the largest error of a pose.
+        One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map, size
+            of the run folder, frames lost so far, and the largest error of a pose.
     """
     world = {"movers": ("people",), "camera_path": "orbit", "frames": frames, "fps": FPS, "seed": seed, "camera": size}
     recording = Rendered(Entry("room-people", parameters=world).open())
@@ -99,7 +99,7 @@ def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[
 
 
 def grown(rows: list[Row]) -> list[str]:
-    """What grew from the second tenth to the last: time or memory by more than 10 %, the error by half a voxel."""
+    """Quantities that grew from the second tenth to the last: time or memory by over 10 %, error by half a voxel."""
     early, late = rows[1], rows[-1]
     found = [f"{key} {late[key] / early[key]:.2f} times" for key in ("cpu_ms", "memory_mb")
              if late[key] > MORE * early[key]]  # fmt: skip

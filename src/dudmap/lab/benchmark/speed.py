@@ -1,6 +1,6 @@
-"""Speed and memory on this machine, compared with their targets; everything timed runs in a new process.
+"""Speed and memory on this machine, compared with targets; each measurement runs in a new process.
 
-A measurement that fails is a ``DudmapError``.
+A failing measurement raises a ``DudmapError``.
 """
 
 import os
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 WARM_UP = 10
-"""Number of frames at the start of a run that are not timed."""
+"""Frames at the start of a run that are not timed."""
 FRAME_TARGETS = {0.01: 20.0, 0.02: 14.0, 0.005: 40.0}
-"""Largest acceptable median time per frame by voxel size, milliseconds by metres."""
+"""Largest acceptable median time per frame, milliseconds, by voxel size, metres."""
 
 
 class SpeedFigure(NamedTuple):
@@ -50,15 +50,16 @@ def speed_figures(
     open3d: Path | None = None,
     recording: Path | None = None,
 ) -> list[SpeedFigure]:
-    """Measure all figures over so many frames; ``announce`` is called with a description of the next measurement.
+    """Measure all quantities; ``announce`` is called with a description of the next measurement.
 
     Args:
+        frames: Number of frames.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
         recording: Recording of that comparison; None takes a static synthetic room.
     """
     figures, compared = list[SpeedFigure](), list[SpeedFigure]()
-    if open3d is not None:  # first, since the other program may not start
-        announce("Open3D's dense SLAM and ours in turn")
+    if open3d is not None:  # first, because the other program may not start
+        announce("Open3D's dense SLAM and dudmap alternately")
         compared = _open3d_figures(open3d, recording, frames)
     announce("frames at 1, 2 and 0.5 cm voxels")
     for voxel, target in FRAME_TARGETS.items():
@@ -70,7 +71,7 @@ def speed_figures(
             figures += [
                 SpeedFigure(f"frame, {100 * voxel:g} cm voxels, 95th percentile", "ms", 50.0, row["p95"]),
                 SpeedFigure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, block),
-                SpeedFigure("free space, share of what its voxels would cost", "%", 1.0, free),
+                SpeedFigure("free space, share of the cost of its voxels", "%", 1.0, free),
                 SpeedFigure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
                 SpeedFigure("mesh again after one frame", "ms", None, row["again_ms"], again),
                 SpeedFigure("artificial view, 320x240", "ms", 40.0, row["view_ms"]),
@@ -109,7 +110,7 @@ def markdown(figures: list[SpeedFigure]) -> str:
 
 
 def stages() -> str:
-    """Table of what the stages of an ordinary frame of the same room cost, see ``calls.stage_table``."""
+    """Table of the cost of an ordinary frame's stages in the same room, see ``calls.stage_table``."""
     return _measured(_stages, COUNTED_FROM + 20)["table"]
 
 
@@ -146,7 +147,7 @@ with beside:
         observers=(First(),),
     )
 """
-"""Program that ends at the first computed pose, that of the second frame; the first one is the identity."""
+"""Program that ends at the first computed pose, of the second frame; the first pose is the identity."""
 
 
 def _start_times() -> list[SpeedFigure]:
@@ -186,7 +187,7 @@ def _room(frames: int) -> "Sequence":
 
 
 def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
-    """Process a recording; yields the system and the time of every frame in milliseconds.
+    """Process a recording; yield the system and the time of every frame in milliseconds.
 
     As in a run, the next frame is prepared meanwhile, and the time ends when both are complete. Rendering is not timed.
     """
@@ -249,10 +250,8 @@ def median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
 
 
 def time_iteration(frames: int) -> Row:
-    """Time of one linearisation of the 320 pixels wide level against the map of a number of frames, on one thread.
-
-    The thread is that of this process, which does nothing else.
-    """
+    """Time of one linearisation of the 320 pixels wide level against the map of some frames, on the thread of this
+    process."""
     os.environ["DUDMAP_THREADS"] = "1"
     from dudmap.core.frames.observation import Level
 

@@ -1,6 +1,6 @@
-"""Input with faults: what a run makes of faults of the stream and of recordings that are spoilt in one way.
+"""Measure the reaction of a run to faults of its input stream.
 
-An unknown fault, or a recording without true poses, is a ``ConfigError``.
+An unknown fault, or a recording without true poses, raises a ``ConfigError``.
 """
 
 from collections.abc import Iterator
@@ -22,22 +22,22 @@ from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SILENT_ERROR = 0.03
-"""Error of a pose said to be tracked from which on it is wrong, metres; at least
-``SILENT_RATIO`` times the largest error of the run without the fault."""
+"""Smallest error of a wrong pose, metres, and at least ``SILENT_RATIO`` times the largest error without the fault."""
 SILENT_RATIO = 3.0
 LAST_FRAMES = 5
-"""Frames at the end of a stream without a pose from which on it counts as lost to the end."""
+"""Number of last frames without a pose at which a stream is lost to the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class FaultRun:
-    """What became of the frames of one stream with a fault: frames lost, and submaps in the end.
+    """Result of a stream with a fault.
 
     Attributes:
+        fault: Name of the fault.
         rejected: Number of frames not used, by kind (``FrameResult.rejected``, ``FrameError.kind``).
-        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a
-            pose.
-        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or
+        lost, maps: Numbers of lost frames and of submaps in the end.
+        errors: (N,) position error per arrived frame, metres; NaN without a pose.
+        flagged: (N,) bool, poses that the run itself reports as doubtful: ``FrameResult.blind``, ``uncertain`` or
             repeated.
     """
 
@@ -49,12 +49,12 @@ class FaultRun:
     flagged: NDArray[np.bool_]
 
     def wrong(self, clean: "FaultRun") -> tuple[int, int]:
-        """Numbers of wrong poses that the run calls tracked: not flagged, and flagged as doubtful."""
+        """Numbers of wrong tracked poses: not flagged, and flagged as doubtful."""
         wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
         return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
     def frames_to_recovery(self) -> int | None:
-        """Longest run of frames that arrived without getting a pose; None if the last LAST_FRAMES have none."""
+        """Longest sequence of arrived frames without a pose; None if the last LAST_FRAMES have none."""
         without, longest = 0, 0
         for missing in np.isnan(self.errors):
             without = without + 1 if missing else 0
@@ -62,7 +62,7 @@ class FaultRun:
         return None if without >= LAST_FRAMES else longest
 
     def outcome(self, clean: "FaultRun") -> str:
-        """What happened, in words; it begins with FAILED where a wrong pose was called tracked, or none came back."""
+        """Outcome in words; begins with FAILED if a wrong pose counts as tracked, or tracking stays lost."""
         if self.wrong(clean)[0]:
             return "FAILED: wrong poses are called tracked"
         if self.frames_to_recovery() is None:
@@ -83,10 +83,10 @@ def default_room(frames: int, width: int, seed: int) -> Sequence:
 def measure_stream_faults(
     recording: Sequence, config: Config, faults: list[str] | None = None, frames: int | None = None
 ) -> Iterator[tuple[FaultRun, FaultRun]]:
-    """Run the system over a recording once without a fault and once with each of those named (none: all).
+    """Run the system over a recording without a fault and with each named fault (none: all).
 
     Yields:
-        A run as soon as it ends, and the one without a fault, which is the first.
+        A run as soon as it ends, and the run without a fault, which is the first.
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
@@ -100,9 +100,9 @@ def measure_stream_faults(
 
 
 def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
-    """Process a stream and compare every pose with the truth of its frame.
+    """Process a stream and compare every pose with the true pose of its frame.
 
-    The poses of each submap are compared after the rigid motion that makes its first one right.
+    The poses of each submap are aligned by its first pose.
     """
     slam = Slam(stream.camera, config, calibration=stream.calibration)
     truth = _true_poses(stream)
@@ -144,7 +144,7 @@ def table_head(name: str, frames: int) -> str:
 
 
 def fault_row(run: FaultRun, clean: FaultRun) -> str:
-    """Line of the table: errors are those of the poses said to be tracked."""
+    """Line of the table; errors are of the tracked poses."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
     errors, recovery = 1000 * run.errors[np.isfinite(run.errors)], run.frames_to_recovery()
     cells = [run.fault, FAULTS[run.fault].description, run.outcome(clean), len(run.errors), kinds, run.lost,

@@ -1,6 +1,6 @@
 """Recordings of a benchmark, the suites they belong to, and the systems compared; suites.toml lists them.
 
-A name that is unknown is a ``ConfigError``, a folder without recordings a ``DatasetError``.
+An unknown name raises a ``ConfigError``, a folder without recordings a ``DatasetError``.
 """
 
 from collections.abc import Mapping
@@ -27,11 +27,11 @@ class Entry:
     """One recording of a suite.
 
     Attributes:
-        name: Name in tables, folders and published figures.
+        name: Name in tables, folders and published metrics.
         path: Folder, file or archive of a recording on disk; None for a synthetic one.
-        parameters: Arguments of ``lab.synthetic.sequence``; ``camera`` is a (width, height) in pixels, ``faults`` a
-            mapping of the fields of ``SensorFaults`` that differ from those of the sensor.
-        address: Public page it can be downloaded from, empty if there is none.
+        parameters: Arguments of ``lab.synthetic.sequence``. ``camera`` is (width, height) in pixels, ``faults`` maps
+            fields of ``SensorFaults`` that differ from the sensor's.
+        address: Public page of its download, empty if there is none.
         max_frames: Use only this many frames from the start.
     """
 
@@ -73,12 +73,12 @@ def local_entries(data: Path) -> list[Entry]:
     folders = [data, *sorted(child for child in data.iterdir() if child.is_dir())]
     found = [Entry(folder.resolve().name, folder) for folder in folders if is_recording(folder)]
     if not found:
-        raise DatasetError(f"no recording found in {data}; `dudmap info` says what it finds in a folder")
+        raise DatasetError(f"no recording found in {data}; `dudmap info` describes a folder")
     return found
 
 
 class Excerpt:
-    """The first ``frames`` frames of a recording (None: all), each of which is read or rendered once."""
+    """The first ``frames`` frames of a recording (None: all), each read or rendered once."""
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
@@ -87,7 +87,7 @@ class Excerpt:
         self._frames: dict[int, Frame] = {}
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
 
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - what else the recording has
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - any attribute of the recording
         return getattr(self.recording, name)
 
     def __len__(self) -> int:
@@ -107,27 +107,27 @@ class Excerpt:
 
 DATA = tables("benchmark/suites.toml")
 SUITES: dict[str, str] = DATA["suites"]
-"""What each suite is, by name."""
+"""Description of each suite, by name."""
 WORLDS: dict[str, dict[str, dict[str, Any]]] = DATA["worlds"]
 """Parameters of the synthetic worlds of a suite, by name."""
 SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
 """Differences from the default configuration, by name."""
 PASSES = {"two-passes": 2}
-"""Systems that process a recording more than once, and how often."""
+"""Systems that process a recording several times, and how often."""
 UNCALIBRATED = ("colour-as-given",)
-"""Systems that take the colour camera as the recording gives it; the others calibrate it first."""
+"""Systems that use the recording's colour camera; the others calibrate it first."""
 USUAL = {
     "ablation": ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))]),
     "sensors": "colour-as-given,no-colour,dudmap",
     "limits": "dudmap,none,threshold,em",
 }
-"""Systems of a suite unless others are named; of the other suites the default alone."""
+"""Default systems of a suite; other suites have only the default system."""
 QUICK = ("room-static", "room-person", "room-people-at-start", "two-people", "speed-1.0-50", "camera_path-still-30")
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Recordings of a suite that were found, and those that are missing."""
+    """Found and missing recordings of a suite."""
 
     name: str
     entries: list[Entry]
@@ -142,6 +142,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     """Find the recordings of one of ``SUITES``.
 
     Args:
+        name: Name of the suite.
         data: Folder that is searched, two levels deep, or one recording; synthetic worlds need none.
         quick: A few synthetic worlds, in images of 320x240, and at most 60 frames of every recording.
     """
@@ -171,7 +172,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder or archive is ``data``, in it or one level below, and the others.
+    """Entries whose folder or archive is ``data``, in it or one level below, and the missing ones.
 
     The images of a CoRBS scene are in ``<name>_pre_registereddata``, as downloaded.
     """
@@ -184,7 +185,7 @@ def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]
 
 
 def systems(names: str) -> dict[str, Config]:
-    """Configurations by name, of a comma-separated list of ``SYSTEMS`` and of paths of TOML files."""
+    """Configurations by name, from a comma-separated list of ``SYSTEMS`` and of paths of TOML files."""
     found: dict[str, Config] = {}
     for name in (name.strip() for name in names.split(",") if name.strip()):
         if name not in SYSTEMS and not name.endswith(".toml"):

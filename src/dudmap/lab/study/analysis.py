@@ -1,6 +1,6 @@
 """Analysis of the runs of a study, response by response, as a report.
 
-A response that no run has is a ``ConfigError``.
+A response that no run has raises a ``ConfigError``.
 """
 
 from typing import TYPE_CHECKING
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from dudmap.lab.study.plan import Plan
 
 MOST_FAILURES = 10
-"""Failed runs that a report lists one by one."""
+"""Most failed runs listed one by one in a report."""
 ENOUGH_TRACKED = 0.9
-"""Share of the frames below which a run is named among those that lost frames."""
+"""Share of tracked frames below which a run is listed as having lost frames."""
 MOST_POINTS = 100
-"""Points of a design whose means a report lists; runs.csv holds those of larger ones."""
+"""Most points of a design whose means a report lists; runs.csv holds all."""
 MOST_INTERACTION_FACTORS = 6
-"""Factors whose interactions are drawn; 36 plots fill a page."""
+"""Most factors whose interactions are drawn; 36 plots fill a page."""
 
 
 def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> Table | None:
-    """Add all that is known about one response but its confirmation; return the effects of a Plackett-Burman design."""
+    """Add the analysis of one response without its confirmation; return the effects of a Plackett-Burman design."""
     scale, factors = plan.scale(name), plan.factors
     report.heading(scale.heading)
     data = scale.usable(table)
@@ -55,10 +55,10 @@ def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> 
 
 
 def describe_surface(report: Report, predicted: Prediction) -> None:
-    """Add the quadratic model, its optimum and what speaks against it."""
+    """Add the quadratic model, its optimum and the doubts about it."""
     surface, best = predicted.surface, predicted.best
     report.text(
-        f"Full quadratic model: R2 = {surface.r2:.2f}, {surface.r2_predicted:.2f} when each run is left out in turn, "
+        f"Full quadratic model: R2 = {surface.r2:.2f}, {surface.r2_predicted:.2f} by leave-one-out, "
         f"residual standard deviation {surface.residual_sd:.3g}{surface.scale.unit}."
     )
     figure = figures.surface_figure(surface, best, surface.scale.heading)
@@ -72,7 +72,7 @@ def describe_surface(report: Report, predicted: Prediction) -> None:
 
 
 def point_table(plan: "Plan", table: Table) -> Table:
-    """Mean responses, in the units of the report, of every point all of whose runs succeeded."""
+    """Mean responses, in the units of the report, of every point without failed runs."""
     known = {name: RESPONSES[name] for name in plan.responses if RESPONSES[name].key in table}
     complete = table.dropna(subset=[response.key for response in known.values()])
     sizes = complete.groupby("point")["run"].transform("size")
@@ -95,20 +95,20 @@ def describe_points(report: Report, plan: "Plan", table: Table) -> None:
 
 
 def describe_losses(report: Report, table: Table) -> None:
-    """Add the runs that lost many frames: errors are those of the tracked frames only, and may be small for that."""
+    """Add the runs that lost many frames, because their errors cover tracked frames only and may look small."""
     if "tracked_share" not in table or not (table["tracked_share"] < ENOUGH_TRACKED).any():
         return
     partial = table[table["tracked_share"] < ENOUGH_TRACKED]
     report.heading("Runs that lost frames")
     report.text(f"{len(partial)} of {len(table)} runs tracked less than {ENOUGH_TRACKED:.0%} of the frames. Trajectory "
-                "errors are those of the tracked frames, so that such a run may look better than one that tracks all: "
+                "errors cover tracked frames only, so that such a run may look better than one that tracks all: "
                 "read them together with the response lost.")  # fmt: skip
     counts = partial.groupby("sequence", sort=False).size()
     report.items(f"{name}: {count} of {(table['sequence'] == name).sum()}" for name, count in counts.items())
 
 
 def describe_failures(report: Report, table: Table) -> None:
-    """Add the runs that failed, which are missing from every figure above."""
+    """Add the failed runs, which are missing from all metrics above."""
     if "error" not in table or table["error"].isna().all():
         return
     failed = table[table["error"].notna()]

@@ -1,6 +1,6 @@
-"""Factors of a study (configuration keys with levels or a range) and designs: which combinations are run.
+"""Factors of a study (configuration keys with levels or a range), and designs, which choose their combinations.
 
-What a design file says wrong of them is a ``ConfigError``.
+Errors in a design file raise a ``ConfigError``.
 """
 
 import json
@@ -58,7 +58,7 @@ class Factor:
         return (values - (low + high) / 2) / ((high - low) / 2)
 
     def value(self, coded: float) -> float | int:
-        """Value in the units of the key, inside the range; a whole number where the key needs one."""
+        """Value in the units of the key, inside the range; rounded if the key needs a whole number."""
         low, high = self._transformed(self.low), self._transformed(self.high)
         number = float((low + high) / 2 + coded * (high - low) / 2)
         number = float(np.exp(number)) if self.scale == "log" else number
@@ -176,7 +176,7 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
 
 
 def count_of(factors: Sequence[Factor], options: DesignOptions) -> int:
-    """Number of points of a design, without making those of one that can be large."""
+    """Number of points of a design, without creating a large design."""
     if options.kind == "full-factorial":
         return int(np.prod([max(len(factor.levels), 1) for factor in factors], dtype=object))
     by_kind = {

@@ -55,9 +55,8 @@ def anova(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table
     Sums of squares are of type II (statsmodels). Partial eta squared is SS / (SS + SS_residual). Recordings are blocks.
 
     Returns:
-        One row per term (sum of squares, degrees of freedom, F, p, partial eta squared), the last that of the residual,
-        and the model in words; None if the runs do not suffice even for the main effects, or the response does not
-        vary.
+        One row per term (sum of squares, degrees of freedom, F, p, partial eta squared), with the residual last, and
+        the text of the model. None if the runs do not suffice for the main effects, or the response does not vary.
     """
     import pandas as pd
     from statsmodels.formula.api import ols

@@ -1,6 +1,6 @@
-"""A study as planned: factors, design, recordings and responses of a design file, and the list of all runs.
+"""Plan of a study: factors, design, recordings and responses of a design file, and the list of all runs.
 
-What is wrong in a design file is a ``ConfigError``, a recording that it cannot use a ``DatasetError``.
+Errors in a design file raise a ``ConfigError``, unusable recordings a ``DatasetError``.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, c
 from dudmap.lab.study.responses import RESPONSES, Scale, check_truth
 
 MAX_RUNS = 1000
-"""Runs of a design that is not refused unless ``--max-runs`` allows more."""
+"""Most runs of a design, unless ``--max-runs`` allows more."""
 STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -47,7 +47,7 @@ class RealTable(BaseModel):
 
 
 class SyntheticTable(BaseModel):
-    """Table ``sequences`` of a synthetic recording: what is checked here of its parameters."""
+    """Table ``sequences`` of a synthetic recording, with the parameters that are checked here."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -80,7 +80,7 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 
 def checked(kind: type[Checked], given: object, what: str) -> Checked:
-    """A table of a design file as what it must be."""
+    """Validate a table of a design file."""
     try:
         return kind.model_validate(given, strict=True)
     except ValidationError as error:
@@ -101,9 +101,9 @@ class Run:
     Attributes:
         point: Number of the point in the design; -1 for a confirmation run.
         values: Values of the factors by key.
-        entry, sequence, replicate: The recording, its name without its replicate, and the number of that.
+        entry, sequence, replicate: The recording, its name without the replicate, and the replicate's number.
         config: All parameters.
-        calibrate: Whether the colour camera is calibrated first, as ``dudmap run`` does.
+        calibrate: Whether the colour camera is calibrated first, as in ``dudmap run``.
         surfaces: Whether the mesh is scored.
         code: Hash of the code that runs it.
     """
@@ -120,7 +120,7 @@ class Run:
 
     @property
     def key(self) -> str:
-        """Hash of everything that the result depends on: the same run has the same folder."""
+        """Hash of all inputs of the result; equal runs share a folder."""
         content = [
             self.config.model_dump(), place_of(self.entry), dict(self.entry.parameters), self.entry.max_frames,
             self.calibrate, self.surfaces, self.code,
@@ -130,12 +130,12 @@ class Run:
 
 @dataclass(frozen=True)
 class Plan:
-    """A study as a design file describes it; see ``docs/study.md`` for the file.
+    """A study as described by a design file (``docs/study.md``).
 
     Attributes:
         base: Configuration of the keys that are no factors.
-        entries: Recordings: the name of each without its replicate, the number of the replicate, and the recording.
-        responses: Names of the responses; the first is optimised, the others are reported beside it.
+        entries: Recordings: name without the replicate, number of the replicate, and recording.
+        responses: Names of the responses; the first is optimised, the others are reported.
         file: The design file.
         tune: Its table of that name.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
@@ -170,7 +170,7 @@ class Plan:
         ]
 
     def confirmation_runs(self, point: Point) -> list[Run]:
-        """Runs at the predicted optimum: on every real recording, and on synthetic ones with seeds never seen."""
+        """Runs at the predicted optimum: on every real recording, and on synthetic ones with new seeds."""
         entries: list[tuple[str, int, Entry]] = []
         for name in self.recordings:
             same = [(replicate, entry) for other, replicate, entry in self.entries if other == name]
@@ -188,11 +188,11 @@ class Plan:
         return list(dict.fromkeys(name for name, _, _ in self.entries))
 
     def scale(self, response: str) -> Scale:
-        """How a response is analysed."""
+        """Scale on which a response is analysed."""
         return Scale(response, response in self.file.log)
 
     def check(self, max_runs: int = MAX_RUNS) -> None:
-        """Check everything that can be known before anything is run."""
+        """Check everything that can be known before the first run."""
         count = count_of(self.factors, self.options) * len(self.entries)
         if count > max_runs:
             raise ConfigError(f"the design has {count} runs, more than --max-runs {max_runs}")
@@ -207,7 +207,7 @@ class Plan:
 
 
 def load_plan(path: str | Path) -> Plan:
-    """Plan of a design file. Paths of recordings are relative to it."""
+    """Plan of a design file; paths of recordings are relative to it."""
     path = Path(path)
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -235,7 +235,7 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
         file=file,
         tune=checked(TuneOptions, file.tune, "tune"),
         judges=make_entries(file.judge, folder) if file.judge else (),
-        code=code_hash(without=("cli", "lab/study")),  # what a result depends on
+        code=code_hash(without=("cli", "lab/study")),  # inputs of a result
     )
 
 

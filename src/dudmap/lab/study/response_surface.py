@@ -15,7 +15,7 @@ from dudmap.lab.study.responses import Scale
 Numbers = NDArray[np.float64]
 
 STARTS = 50
-"""Starting points of the search for the optimum. In a box a quadratic has few local optima, which few starts miss."""
+"""Starting points of the search for the optimum. A quadratic in a box has few local optima."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +40,18 @@ class Surface:
 
     @property
     def r2(self) -> float:
-        """Share of the variance that the model explains; 0 of values that are all equal."""
+        """Share of the variance that the model explains; 0 if all values are equal."""
         return float(self.model.rsquared) if np.ptp(self.observed) > 0 else 0.0
 
     @property
     def r2_predicted(self) -> float:
-        """Share of the variance that it predicts when each run is left out in turn (PRESS)."""
+        """Share of the variance predicted by leave-one-out (PRESS)."""
         press = self.model.get_influence().resid_press
         return float(1 - np.sum(press**2) / np.sum((self.observed - self.observed.mean()) ** 2))
 
     @property
     def residual_sd(self) -> float:
-        """Standard deviation of the residuals, with the degrees of freedom of the model taken off."""
+        """Standard deviation of the residuals, corrected for the model's degrees of freedom."""
         return float(np.sqrt(self.model.mse_resid))
 
     def predict(self, coded: Numbers) -> Numbers:
@@ -60,7 +60,7 @@ class Surface:
         return terms @ self.model.params[: terms.shape[1]]
 
     def interval(self, coded: Numbers, count: int) -> tuple[float, float, float]:
-        """Prediction at one point, and the interval in which the mean of ``count`` new runs should fall."""
+        """Prediction at one point, and the interval that should contain the mean of ``count`` new runs."""
         from scipy import stats
 
         frame = self.model.get_prediction(self._exog(coded[None]))
@@ -75,13 +75,13 @@ class Surface:
 
     @property
     def point_means(self) -> Numbers:
-        """(M,) mean response of every different point over its recordings and replicates."""
+        """(M,) mean response of every distinct point over its recordings and replicates."""
         _, group = np.unique(self.coded.round(9), axis=0, return_inverse=True)
         return np.bincount(group.ravel(), self.observed) / np.bincount(group.ravel())
 
     @property
     def best_seen(self) -> float:
-        """Best mean response of a point that was run."""
+        """Best mean response of an observed point."""
         return float(self.scale.sign * np.min(self.scale.sign * self.point_means))
 
     def _exog(self, coded: Numbers) -> Numbers:
@@ -95,7 +95,7 @@ def quadratic_terms(coded: Numbers) -> Numbers:
 
 
 def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface | str:
-    """Fit the full quadratic model to runs of ``Scale.usable`` by least squares, or say why there is none.
+    """Fit the full quadratic model to runs of ``Scale.usable`` by least squares, or return the reason why not.
 
     Recordings are blocks whose effects sum to zero.
     """
@@ -124,7 +124,7 @@ def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface
 
 
 def values_text(values: dict[str, Any]) -> str:
-    """Values of factors in words."""
+    """Text of the values of factors."""
     return ", ".join(
         f"{key.rpartition('.')[2]} {value:.4g}" if isinstance(value, float) else f"{key.rpartition('.')[2]} {value}"
         for key, value in values.items()
@@ -158,7 +158,7 @@ def optimum(surface: Surface) -> Optimum:
 
 
 ENOUGH_EXPLAINED = 0.5
-"""Smallest share of the variance that a model must predict (leave-one-out) to be better than a guess."""
+"""Smallest share of the variance that a useful model predicts (leave-one-out)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +166,9 @@ class Prediction:
     """Quadratic model of a response, its optimum and the best point of the design.
 
     Attributes:
-        point: Values of all factors at the optimum; those without numbers have their best level.
+        point: Values of all factors at the optimum; factors without numbers have their best level.
         best_point: Values of all factors at the best point of the design.
-        reasons: What speaks against the optimum before it is confirmed, each a sentence.
+        reasons: Sentences that cast doubt on the optimum before its confirmation.
     """
 
     surface: Surface
@@ -179,7 +179,7 @@ class Prediction:
 
 
 def predict_optimum(data: Table, factors: Sequence[Factor], scale: Scale) -> Prediction | str:
-    """Quadratic model of runs of ``Scale.usable`` and its optimum, or a sentence that says why there is none."""
+    """Quadratic model of runs of ``Scale.usable`` and its optimum, or a sentence on why there is none."""
     surface = fit_surface(data, factors, scale)
     if isinstance(surface, str):
         return surface
@@ -201,12 +201,12 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a value of a table as plain Pyt
 
 
 def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
-    """Reasons not to believe the optimum of a surface before it is confirmed, each a sentence."""
+    """Sentences that cast doubt on the optimum of a surface before its confirmation."""
     reasons, scale = [], surface.scale
     if surface.r2_predicted < ENOUGH_EXPLAINED:
         reasons.append(
             f"The model explains {surface.r2:.0%} of the variance (R2 = {surface.r2:.2f}) and predicts "
-            f"{max(surface.r2_predicted, 0):.0%} of it when each run is left out in turn "
+            f"{max(surface.r2_predicted, 0):.0%} of it by leave-one-out "
             f"(R2 = {surface.r2_predicted:.2f})."
         )
     seen = surface.best_seen
@@ -224,13 +224,12 @@ def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Runs at the predicted optimum, beside runs at the best point of the design on the same recordings.
+    """Runs at the predicted optimum, and runs at the best point of the design on the same recordings.
 
     Attributes:
-        scale: The response; all values are as it is analysed.
-        predicted, low, high: Prediction of the model, and the interval in which the mean of ``count`` runs should
-            fall.
-        design_mean: Mean of all runs of the design: what one would predict without a model.
+        scale: The response; all values are as analysed.
+        predicted, low, high: Prediction of the model, and the interval that should contain the mean of ``count`` runs.
+        design_mean: Mean of all runs of the design: the prediction without a model.
         measured, best_point: Means of the runs at the optimum and at the best point of the design.
     """
 
@@ -245,7 +244,7 @@ class Confirmation:
 
     @property
     def informative(self) -> bool:
-        """Whether the interval excludes the mean of the design: a wider one holds whatever is measured."""
+        """Whether the interval excludes the mean of the design; a wider one would hold for any measurement."""
         return not self.low <= self.design_mean <= self.high
 
     @property
@@ -255,7 +254,7 @@ class Confirmation:
 
     @property
     def held(self) -> bool:
-        """Whether the model held: it said what would be measured, more exactly than the mean does, and where to go."""
+        """Whether the model held: a correct, informative prediction that improves on the best point."""
         return self.low <= self.measured <= self.high and self.informative and self.improves
 
     def __str__(self) -> str:
@@ -272,7 +271,7 @@ class Confirmation:
 
 
 def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_point: Sequence[float]) -> Confirmation:
-    """Compare runs at the optimum (M,), as many on every recording, with the prediction and with the best point.
+    """Compare runs at the optimum (M,), equally many per recording, with the prediction and with the best point.
 
     ``best_point`` (M,) is the response of runs at the best point of the design, on the same recordings.
     """

@@ -1,6 +1,6 @@
-"""Responses of a study: which figure of a run each stands for, and what a recording must have for it.
+"""Responses of a study: the metric of a run and the requirements on a recording for each.
 
-A response that no run has is a ``ConfigError``, a recording that cannot have it a ``DatasetError``.
+A response that no run has raises a ``ConfigError``, an unsuitable recording a ``DatasetError``.
 """
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -19,10 +19,10 @@ class Response(NamedTuple):
     """One response, with its name and unit in a report.
 
     Attributes:
-        key: Key of the figure in a row of ``dudmap.lab.benchmark.measure``.
-        factor: From the unit of the row to that of the report.
+        key: Key of the metric in a row of ``dudmap.lab.benchmark.measure``.
+        factor: From the unit of the row to the unit of the report.
         better: Whether low or high values are good.
-        needs: What the recording must have.
+        needs: Ground truth that the recording must have.
     """
 
     key: str
@@ -53,7 +53,7 @@ RESPONSES = {
 
 
 class Scale(NamedTuple):
-    """How the response of a name is analysed: as it is, or as its logarithm."""
+    """Analysis of a response: as it is, or as its logarithm."""
 
     response: str
     log: bool = False
@@ -96,7 +96,7 @@ class Scale(NamedTuple):
 
 
 def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) -> None:
-    """Check that a recording has the truth that the responses need."""
+    """Check that a recording has the ground truth that the responses need."""
     for name in names:
         needs, lacking = RESPONSES[name].needs, ""
         if needs in ("truth", "surface") and sequence.ground_truth is None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Conduct = Callable[[Sequence[Run]], list[Row]]
 """Does runs, equal ones once, and returns the figures of each in their order."""
 CACHED_BYTES = 300e6
-"""Frames of a recording that a worker keeps read or rendered between runs, bytes at most."""
+"""Most bytes of frames of a recording that a worker keeps between runs."""
 PIXEL_BYTES = 8
 """Bytes per pixel of a kept frame: depth, colour and mask."""
 
@@ -95,8 +95,7 @@ def measure_run(job: Job) -> Row:
 
 
 def _reset_peak_memory() -> None:
-    """Let the peak of the resident memory start anew, where the system can (Linux); elsewhere it is that of all runs of
-    the process so far."""
+    """Reset the peak resident memory (Linux only); elsewhere the peak covers all earlier runs of the process."""
     import gc
 
     gc.collect()

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 FALSE_SHARE = 0.05
 """Share of the effects called significant that may be due to chance (Benjamini and Hochberg 1995)."""
 MOST_SHOWN = 16
-"""Keys that a figure shows."""
+"""Most keys in a figure."""
 
 
 def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:
     """Every numeric key as a factor between its value divided by a ratio and its value times the ratio.
 
-    Both ends are kept inside the bounds of the key; where a bound excludes its own value, the end lies halfway between
-    value and bound. A whole number changes by 1 at least. Of a list of numbers all elements change together, and the
-    factor has two levels. A key with the value 0 has no ratio and is left out, as are the keys ``chosen`` by the design
-    file and those that its table (``ratio``, ``without``) names.
+    Both ends are kept inside the bounds of the key; for an exclusive bound, the end lies halfway between value and
+    bound. A whole number changes by 1 at least. All elements of a list change together, with two levels. Keys with the
+    value 0 are skipped, because they have no ratio. Keys ``chosen`` by the design file and keys that its table
+    (``ratio``, ``without``) names are skipped too.
     """
     if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
         raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
@@ -85,8 +85,8 @@ def bounds_of(key: str) -> dict[str, float]:
 def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
     """Effect of every two-level factor on every recording: mean at its high end minus mean at its low end.
 
-    Least squares with all factors together (statsmodels), each recording on its own, so that a key that matters on one
-    recording only is found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
+    Least squares with all factors together (statsmodels) per recording, so that a key that matters on one recording is
+    found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
     and Hochberg 1995). In a design that is folded over, interactions of two factors are in the residual.
 
     Returns:
@@ -129,8 +129,8 @@ def describe_screening(report: "Report", effects: Table, heading: str) -> None:
     """Add the keys that matter for a response, with their effects per recording."""
     order, count = strongest(effects), effects["key"].nunique()
     report.text(
-        f"{len(order)} of {count} keys have an effect on {heading} on at least one recording (from the low to the high "
-        f"end; at most {FALSE_SHARE:.0%} of them by chance, Benjamini and Hochberg)."
+        f"{len(order)} of {count} keys affect {heading} on at least one recording, from the low to the high end. At "
+        f"most {FALSE_SHARE:.0%} of these effects are due to chance (Benjamini and Hochberg)."
     )
     if not order:
         return
@@ -144,7 +144,7 @@ def describe_screening(report: "Report", effects: Table, heading: str) -> None:
 
 
 def summary(effects: Mapping[str, Table]) -> str:
-    """Which keys matter for which response, in words.
+    """Text on the keys that matter for each response.
 
     Args:
         effects: Tables of ``screen`` by the name of the response.

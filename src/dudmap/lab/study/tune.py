@@ -1,10 +1,10 @@
-"""Search for a configuration on training recordings, judged on recordings it never saw.
+"""Search for a configuration on training recordings, and judge it on other recordings.
 
-Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). All figures are ratios to the base
+Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). All metrics are ratios to the base
 configuration on the same recording, so that recordings count equally. The proposals depend on the seed and on earlier
-results only, and results are kept: a search that was stopped proposes the same again and finds its results.
+results only, and results are kept, so that a stopped search continues.
 
-A search that cannot be judged is refused with a ``DudmapError`` before anything is run.
+A search that cannot be judged raises a ``DudmapError`` before the first run.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,22 +28,22 @@ if TYPE_CHECKING:
 
 Numbers = NDArray[np.float64]
 Measure = Callable[[Sequence[Point], Plan], list[Numbers | None]]
-"""Ratios (recordings, responses) to the base configuration of each point; None where a run failed."""
+"""Ratios (recordings, responses) to the base configuration of each point; None if a run failed."""
 
 RATIOS = ("ate", "rpe", "mesh_accuracy", "ms", "memory")
-"""Responses that are positive and whose ratio to the base configuration therefore means something."""
+"""Positive responses, whose ratio to the base configuration is meaningful."""
 SIGNIFICANT = 0.05
-"""Largest p (one-sided t test of the log ratios on the second set, corrected after Holm) of what is recommended."""
+"""Largest p of a recommendation: one-sided t test of log ratios on the second set, corrected after Holm."""
 FEWEST_JUDGES = 3
-"""Recordings of the second set at least; a t test of two ratios finds next to nothing."""
+"""Fewest recordings of the second set; a t test of two ratios finds hardly anything."""
 BATCH = 4
 """Configurations proposed at a time. A constant, so that the proposals do not depend on the number of workers."""
 MOST_JUDGED = 5
-"""Configurations of the training front that are judged; each one more weakens the test of all."""
+"""Most configurations of the training front that are judged; each additional one weakens all tests."""
 
 
 def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:
-    """Check everything that can be known before anything is run."""
+    """Check everything that can be known before the first run."""
     for name in plan.responses:
         if name not in RATIOS:
             raise ConfigError(f"tune cannot use the response {name}, which can be 0; it knows {', '.join(RATIOS)}")
@@ -111,9 +111,9 @@ def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
     """Search, and judge the training front on the second set.
 
     Returns:
-        Values of the factors, and a row of the table: these, the geometric mean over the recordings of both sets of
-        each response relative to the base configuration (NaN if a run failed or lost more frames than with that), the
-        probability p of such ratios of the first response if there were no improvement, and whether it holds.
+        Values of the factors, and a row of the table. The row holds these values and, per response and set, the
+        geometric mean ratio to the base configuration (NaN if a run failed or lost more frames). It also holds the
+        probability p of the first response's ratios without an improvement, and whether the improvement holds.
     """
     from statsmodels.stats.multitest import multipletests
 

@@ -15,7 +15,7 @@ from dudmap.lab.synthetic.faults import SensorFaults
 
 Image = NDArray[np.float32]
 TARGET_LEVEL = 110.0
-"""Mean grey value that the automatic exposure aims at; assumed, a little below the middle of the scale."""
+"""Mean grey value targeted by the automatic exposure; assumed, a little below the middle of the scale."""
 LARGEST_GAIN = 4.0
 """Range of the exposure, as a factor up and down: two stops, assumed."""
 WHITE_BALANCE_PERIOD = 8.0
@@ -23,7 +23,7 @@ WHITE_BALANCE_PERIOD = 8.0
 
 
 class ColorCamera:
-    """Colour camera beside a depth camera, with true intrinsics ``camera``.
+    """Colour camera that accompanies a depth camera, with true intrinsics ``camera``.
 
     The exposure of a row takes ``exposure_time`` (0: no motion blur); times in seconds.
     """
@@ -31,17 +31,17 @@ class ColorCamera:
     def __init__(self, faults: SensorFaults, depth_camera: Camera, exposure_time: float, frame_interval: float) -> None:
         self.camera = faults.color_camera(depth_camera)
         self._faults = faults
-        # Moments of the exposure: three for short ones, five for half the frame interval and more.
+        # Moments of the exposure: three for short ones, five for half the frame interval or more.
         count = int(np.clip(round(10 * exposure_time / frame_interval), 3, 5)) if exposure_time > 0 else 1
         self._moments = (np.arange(count) - (count - 1) / 2) / count * exposure_time
         self._step = exposure_time / count
 
     def view(self, t: float, render: Callable[[float, Camera], Image]) -> Image:
-        """What falls on the sensor (H, W, 3), 0..255, in the frame stamped ``t``.
+        """Light on the sensor (H, W, 3), 0..255, in the frame stamped ``t``.
 
         Args:
             t: Seconds.
-            render: Gives the image of an ideal camera, at the place of this one, at a time in seconds.
+            render: Image of an ideal camera, at the place of this one, at a time in seconds.
         """
         margin = self._lens.margin if self.camera.distortion else 0
         height, width = self.camera.height + 2 * margin, self.camera.width + 2 * margin
@@ -51,7 +51,7 @@ class ColorCamera:
         )  # fmt: skip
         color = np.zeros((height, width, 3), dtype=np.float32)
         for first, last, offset in self._faults.row_bands(self.camera.height, margin, self._step):
-            low, high = max(first - 1, 0), min(last + 1, height)  # pixels at a border look at their neighbours
+            low, high = max(first - 1, 0), min(last + 1, height)  # pixels at a border use their neighbours
             band = replace(wide, cy=wide.cy - low, height=high - low)
             for moment in self._moments:
                 seen = render(t + offset + moment, band)
@@ -82,10 +82,10 @@ class ColorCamera:
 
 
 def exposure_gains(levels: NDArray[np.float64], times: NDArray[np.float64], lag: float) -> NDArray[np.float64]:
-    """Exposure factors (N,) of an automatic exposure with a lag in seconds, of mean grey values (N,) at factor 1.
+    """Factors (N,) of an automatic exposure with a lag in seconds, from mean grey values (N,) at factor 1.
 
-    A control loop of first order on the logarithm of the exposure: each frame moves by 1 - exp(-dt / lag) towards the
-    factor that would have brought the frame before to ``TARGET_LEVEL``. The first frame is settled.
+    It is a first-order control loop on the logarithm of the exposure. Each frame moves by 1 - exp(-dt / lag) towards
+    the factor that would have brought the previous frame to ``TARGET_LEVEL``. The first frame is settled.
     """
     wanted = np.clip(np.log(TARGET_LEVEL / np.maximum(levels, 1.0)), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
     gains = np.empty(len(times))
@@ -136,7 +136,7 @@ EDGE = (0.04, 0.02)
 
 
 class DepthFaults:
-    """Systematic errors of the depth of one sensor, whose patterns are drawn from a seed."""
+    """Systematic depth errors of one sensor, with patterns drawn from a seed."""
 
     def __init__(self, faults: SensorFaults, camera: Camera, seed: int) -> None:
         self._faults, self._camera, self._seed = faults, camera, seed
@@ -156,7 +156,7 @@ class DepthFaults:
         return bool(smooth or f.flying_pixels)
 
     def truth(self) -> dict[str, Any]:
-        """The patterns, with the formula that they belong to."""
+        """The patterns and their formula."""
         return {
             "depth_model": "z1 = z (1 + depth_scale_error + z/2 sum_k size_k cos(pi (wave_u_k u / W + wave_v_k v / H) "
             "+ phase_k + turn_k z)) + depth_offset; reading = 1 / (1 / z1 + band(u)), band(u) = bands[int(u n / W)]; "
@@ -167,7 +167,7 @@ class DepthFaults:
         }
 
     def multiplier(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Any]) -> NDArray[np.float64]:
-        """Factor of scale error and smooth distortion at pixels u, v and true depths z in metres, arrays that match."""
+        """Factor of scale error and smooth distortion at pixels u, v and true depths z in metres (matching arrays)."""
         total = np.zeros(np.broadcast(u, v, z).shape)
         if self._faults.depth_distortion:
             width, height = self._camera.width, self._camera.height
@@ -176,7 +176,7 @@ class DepthFaults:
         return 1.0 + self._faults.depth_scale_error + 0.5 * z * total
 
     def apply(self, exact: NDArray[np.float32], index: int) -> NDArray[np.float32]:
-        """Depth (H, W) in metres that the sensor would read without noise, of the true one; 0 stays 0."""
+        """Noise-free depth measurement (H, W) of true depth, metres; 0 stays 0."""
         faults, depth = self._faults, exact
         if faults.flying_pixels:
             depth = with_flying_pixels(depth, faults.flying_pixels, np.random.default_rng([self._seed, 7, index]))

@@ -1,4 +1,4 @@
-"""Faults of real RGB-D sensors, with which a synthetic recording can be rendered."""
+"""Faults of real RGB-D sensors for rendered recordings."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -14,48 +14,47 @@ from dudmap.errors import ConfigError
 from dudmap.lab.data import find
 
 BAND_ROWS, MOST_BANDS = 16, 24
-"""Rows of a colour image with a rolling shutter are rendered in up to ``MOST_BANDS`` bands of one time each, of at
-least ``BAND_ROWS`` rows; the time of a row is then wrong by at most 1/30 of the readout at 240 rows, 1/48 from 384
-rows on. Blurred images need fewer: there it is wrong by at most half the step between two moments of the exposure."""
+"""Rows per band of a rolling shutter image (at least), and bands (at most); a band is rendered at one time. The time of
+a row errs by at most 1/30 of the readout at 240 rows, and 1/48 at 384 rows or more. Blurred images need fewer bands:
+half the step between two moments of the exposure bounds their error."""
 
 
 def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
-    """Field with the smallest and the largest value that is accepted."""
+    """Field with the smallest and the largest accepted value."""
     return field(default=usual, metadata={"limits": (low, high)})
 
 
 @dataclass(frozen=True)
 class SensorFaults:
-    """What a real sensor does and its files do not say; the default is a sensor without faults.
+    """Errors of a real sensor that its files do not state; by default none.
 
-    Depth is taken by the recording's camera at the time stamp. Colour is taken by a camera of its own, whose image has
-    the same size; the files present it as if it were registered to the depth and taken at the same time.
+        Depth is taken by the recording's camera at the time stamp. Colour is taken by a separate camera with the same
+        image size. The files present it as registered to the depth and taken at the same time.
 
     Attributes:
         color_translation: Position of the colour camera in the frame of the depth camera, metres.
         color_rotation_deg: Rotation vector (axis times angle) of the colour camera in that frame, degrees.
-        color_focal_ratio: Focal lengths of the colour camera over those of the depth camera.
-        color_center_shift: Principal point of the colour camera minus that of the depth camera (u, v), pixels.
+        color_focal_ratio: Focal lengths of the colour camera over the depth camera's.
+        color_center_shift: Principal point of the colour camera minus the depth camera's (u, v), pixels.
         color_delay: Time from the stamp to the exposure of the middle of the colour image, seconds.
-        color_readout: Time from the first to the last row of the colour image (rolling shutter), seconds; row v of H is
+        color_readout: Time from the first to the last row of the colour image (rolling shutter), seconds. Row v of H is
             exposed at stamp + color_delay + color_readout ((v + 1/2) / H - 1/2). Negative: the last row is first.
         color_distortion: Lens distortion left in the colour image: k1, k2, p1, p2 of the Brown-Conrady model (thesis
             eq. 3.88) with the intrinsics of the colour camera.
-        auto_exposure: Time constant, in seconds, with which the exposure follows the mean brightness of the image,
-            from the frame before on; 0 for a fixed exposure.
+        auto_exposure: Time constant in seconds of an exposure that follows the mean brightness of the previous frame; 0
+            for a fixed exposure.
         white_balance_drift: Relative amplitude of a slow oscillation of red against blue.
-        vignetting: Share of the brightness lost in the corners of the image, in addition to the little that every
-            recording has.
+        vignetting: Share of the brightness lost in the image corners, in addition to the small loss of every recording.
         jpeg_quality: Quality 1 to 100 of the JPEG compression of the colour; 0 for none.
         depth_scale_error: Relative error of all depths.
         depth_offset: Constant added to all depths, metres.
-        depth_bands: Root mean square depth error at 1 m, in metres, of vertical bands of constant disparity error, as
-            of a cold sensor; it grows with z^2.
-        depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern over the image that changes
-            with the range and grows with z.
-        flying_pixels: Share of the pixels next to a depth edge that read a depth between both surfaces.
+        depth_bands: Root mean square depth error at 1 m of vertical bands of constant disparity error, metres, as in a
+            cold sensor; it grows with z^2.
+        depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern that changes with the range
+            and grows with z.
+        flying_pixels: Share of the pixels at a depth edge with a depth between both surfaces.
         dropped_frames: Share of the frames that are missing.
-        late_frames: Share of the frames taken late, by 10 to 60 % of the frame interval; their stamps say so.
+        late_frames: Share of the frames taken late, by 10 to 60 % of the frame interval, with correct stamps.
 
     Raises:
         ConfigError: A value is outside ``LIMITS`` or has the wrong number of elements.
@@ -98,7 +97,7 @@ class SensorFaults:
         return T
 
     def color_camera(self, camera: Camera) -> Camera:
-        """Intrinsics of the colour camera beside the depth camera ``camera``."""
+        """Intrinsics of the colour camera that accompanies the depth camera ``camera``."""
         return replace(
             camera,
             fx=camera.fx * self.color_focal_ratio,
@@ -110,7 +109,7 @@ class SensorFaults:
 
     @property
     def color_is_separate(self) -> bool:
-        """Whether colour is seen from another place, at another time or through another lens than depth."""
+        """Whether the pose, time or lens of colour differs from depth."""
         without: Any = SensorFaults()
         names = [fault.name for fault in fields(self) if fault.name.startswith("color_")]
         return any(np.any(np.not_equal(getattr(self, name), getattr(without, name))) for name in names)
@@ -118,8 +117,8 @@ class SensorFaults:
     def row_bands(self, height: int, margin: int = 0, step: float = 0.0) -> list[tuple[int, int, float]]:
         """Bands of rows rendered at one time: first row, row after the last, and time relative to the stamp, s.
 
-        Rows count from 0 at the upper edge of an image that is ``margin`` rows larger at the top and at the bottom.
-        Bands need not differ by less than ``step`` seconds, the resolution of a blurred exposure.
+        Rows count from 0 at the upper image edge; ``margin`` rows are added above and below. Times of bands differ by
+        at least ``step`` seconds, the resolution of a blurred exposure.
         """
         count = max(min(MOST_BANDS, height // BAND_ROWS), 1) if self.color_readout else 1
         if step > 0:
@@ -130,7 +129,7 @@ class SensorFaults:
         return [(int(a), int(b), float(times[a:b].mean())) for a, b in pairwise(edges)]
 
     def frame_times(self, frames: int, fps: float, seed: int) -> NDArray[np.float64]:
-        """Stamps (N,) in seconds of the frames that arrive out of ``frames``; the first always does, at 0."""
+        """Stamps (N,) in seconds of the frames that arrive out of ``frames``; the first always arrives, at 0."""
         times = np.arange(frames) / fps
         if not self.dropped_frames and not self.late_frames:
             return np.round(times, 6)
@@ -142,7 +141,7 @@ class SensorFaults:
         return np.round(times[arrives], 6)
 
     def truth(self, camera: Camera) -> dict[str, Any]:
-        """What is written beside a recording: the faults, and the colour camera that they amount to."""
+        """Ground truth for the recording's folder: the faults, and the resulting colour camera."""
         return {
             "faults": asdict(self),
             "depth_camera": asdict(camera),
@@ -156,7 +155,7 @@ LIMITS: dict[str, tuple[float, float]] = {fault.name: fault.metadata["limits"] f
 
 
 def parse_faults(assignments: Sequence[str]) -> dict[str, Any]:
-    """Faults of ``NAME=VALUE`` pairs by name; a value of several numbers is comma-separated.
+    """Faults of ``NAME=VALUE`` pairs by name; several numbers are comma-separated.
 
     Raises:
         ConfigError: A pair cannot be understood.

@@ -28,12 +28,16 @@ def write_folder(
 ) -> Path:
     """Render all frames into a folder, which is created if needed.
 
-    The folder receives rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = dynamic), their
-    lists rgb.txt, depth.txt, mask.txt and associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (dynamic
-    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults of the sensor), surface.ply (the static
-    surface) and surface_observed.ply (the part of it that the camera saw). If writing is interrupted, the lists contain
-    the complete frames. ``overwrite`` accepts a folder that is not empty; ``progress`` is called with the number of
-    finished frames.
+    The folder receives:
+
+    - rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre) and masks/ (255 = dynamic).
+    - rgb.txt, depth.txt, mask.txt, associations.txt, groundtruth.txt and intrinsics.txt.
+    - coverage.txt (dynamic share of the image) and movers.jsonl.
+    - scene.json and sensor_truth.json (the faults of the sensor).
+    - surface.ply (the static surface) and surface_observed.ply (the part that the camera saw).
+
+    If writing is interrupted, the lists contain the complete frames. ``overwrite`` accepts a folder that is not empty.
+    ``progress`` is called with the number of finished frames.
 
     Raises:
         DatasetError: The folder is not empty, or cannot be written.

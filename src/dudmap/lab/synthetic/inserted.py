@@ -1,4 +1,4 @@
-"""A thing that was never there, rendered into the frames of a real recording."""
+"""A thing rendered into the frames of a real recording."""
 
 from dataclasses import replace
 
@@ -14,13 +14,13 @@ from dudmap.lab.synthetic.sensors import Sensor
 
 
 class WithThing:
-    """Some frames of a recording, with solids where nothing nearer hides them; a pixel without a reading does not.
+    """Some frames of a recording, with solids inserted unless nearer depth hides them; missing depth does not hide.
 
     Args:
         recording: Its colour must be registered to its depth.
         frames: Numbers of the frames.
-        trajectory: Poses of the camera in the world of the solids; frames without one stay as they are.
-        solids: The thing; without any the frames are those of the recording.
+        trajectory: Camera poses in the world of the solids; frames without a pose stay unchanged.
+        solids: The thing; without any the frames stay unchanged.
     """
 
     def __init__(self, recording: Sequence, frames: range, trajectory: Trajectory, solids: list[Primitive]) -> None:
@@ -38,7 +38,7 @@ class WithThing:
             solids,
         )  # fmt: skip
         self.seen: list[NDArray[np.float64]] = []
-        """Points (n, 3) of the thing that each frame read so far showed, metres, world of the solids."""
+        """Points (n, 3) of the thing visible in each frame read so far, metres, world of the solids."""
 
     def __len__(self) -> int:
         return len(self._frames)

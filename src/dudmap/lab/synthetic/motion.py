@@ -65,7 +65,7 @@ class FloorPath:
         return np.array([x, y]), yaw, walked
 
     def pose(self, t: float, height: float) -> NDArray[np.float64]:
-        """Pose (4, 4) of what stands at a height in metres and faces along the path, at time ``t``."""
+        """Pose (4, 4) of an object at a height in metres that faces along the path, at time ``t``."""
         position, yaw, _ = self.at(t)
         return pose((*position, height), float(np.degrees(yaw)))
 
@@ -85,8 +85,8 @@ def crossing(
 ) -> FloorPath:
     """Path from one end of ``line`` to the other and, after a second out of view, back again, until ``duration``.
 
-    The middle 40 % of the line are covered at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
-    also come into view. 25 % of the line are covered at the time ``enter`` in seconds; with ``start_inside`` the path
+    The middle 40 % of the line are passed at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
+    also come into view. The first 25 % are passed at the time ``enter`` in seconds. With ``start_inside`` the path
     begins in the middle of the view.
     """
     a, b = np.asarray(line[0], float), np.asarray(line[1], float)

@@ -163,7 +163,7 @@ def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers
 def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Array:
     """Recorded trajectory, resampled at ``times`` and placed in the scene by a rigid motion.
 
-    The mean orientation becomes that of the home pose. The centre of the positions is placed as close to the home
+    The mean orientation becomes the home pose's. The centre of the positions is placed as close to the home
     position as possible, such that all positions are in the free space of the scene and clear of its solids.
     """
     start, end = trajectory.timestamps[0], trajectory.timestamps[-1]

@@ -28,9 +28,9 @@ DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, heigh
 
 
 class MoverState(NamedTuple):
-    """State of a mover in one frame: identity from 1 on, pose (4, 4), velocity (3,) in m/s (world frame), kind.
+    """State of a mover in one frame: identity (1, 2, ...), pose (4, 4), velocity (3,) in m/s (world frame), kind.
 
-    ``moving`` says whether it counts as dynamic in this frame.
+    ``moving`` is whether it counts as dynamic in this frame.
     """
 
     id: int
@@ -44,11 +44,11 @@ class SyntheticSequence:
     """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        camera: Intrinsics of the depth camera, which are also those that the files state for colour.
-        faults: What the sensor does and its files do not say.
+        camera: Intrinsics of the depth camera; the files state them for colour too.
+        faults: Errors of the sensor that its files do not state.
         timestamps: (N,) seconds.
-        parameters: Arguments from which it was made.
-        renderer: Renders all solids, those of the movers last.
+        parameters: Arguments of its construction.
+        renderer: Renders all solids; solids of movers come last.
     """
 
     calibration = None
@@ -97,9 +97,8 @@ class SyntheticSequence:
     def mask(self, index: int) -> NDArray[np.bool_]:
         """True dynamic mask (H, W): pixels that show a mover that moves in this frame.
 
-        A person always counts as moving. Any other mover moves while the mean speed of any of its points over the
-        interval of the frame (half a frame before to half a frame after) exceeds 0.01 m/s. A mover is labelled as a
-        whole.
+        A person always counts as moving. Any other mover moves if the mean speed of one of its points exceeds 0.01 m/s
+        over the frame's interval (half a frame before to half a frame after). A mover is labelled as a whole.
         """
         index = self._number(index)
         if index in self._kept:
@@ -107,15 +106,15 @@ class SyntheticSequence:
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth and visible primitive of a frame, and what falls on the colour camera.
+        """Ideal depth and visible primitive of a frame, and the light on the colour camera.
 
-        The colour has the place, time and lens of the colour camera, but no noise, and neither its exposure, white
-        balance, vignetting nor compression.
+        The colour has the place, time and lens of the colour camera, but no noise, exposure, white balance, vignetting
+        or compression.
         """
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
-        """Ideal depth (H, W) of a frame in metres, 0 where the ray hits nothing."""
+        """Ideal depth (H, W) of a frame in metres, 0 if the ray hits nothing."""
         return self._render(self._number(index), with_color=False).depth
 
     @property
@@ -161,12 +160,11 @@ class SyntheticSequence:
     def surface(self, observed: bool = False) -> Mesh:
         """True static surface in the world frame at the end of the sequence.
 
-        It includes the movers that were at rest during the last second. Triangles inside or between solids are left
-        out.
+        It includes movers at rest during the last second. Triangles inside or between solids are omitted.
 
         Args:
-            observed: Only the part that the camera saw (not occluded by movers, within the range of the sensor, not at
-                a grazing angle) in at least three of up to 120 evenly spread frames.
+            observed: Only the part that the camera saw in at least three of up to 120 evenly spread frames: not
+                occluded by movers, within the sensor's range, not at a grazing angle.
         """
         mesh = self._surface
         if not observed:
@@ -215,7 +213,7 @@ class SyntheticSequence:
         return replace(frame, depth=frame.depth.copy(), color=frame.rgb.copy()), mask
 
     def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
-        """What the sensor measures apart from noise: depth with its systematic errors, colour with its exposure."""
+        """Ideal measurement without noise: depth with its systematic errors, colour with its exposure."""
         assert rendering.color is not None
         gain = float(self.exposure_gains[index])
         color = self._color_camera.exposed(rendering.color, float(self.timestamps[index]), gain)
@@ -232,7 +230,7 @@ class SyntheticSequence:
         return exposure_gains(levels, self.timestamps, self.faults.auto_exposure)
 
     def sensor_truth(self) -> dict[str, object]:
-        """Everything that the sensor does and its files do not say, for a JSON file."""
+        """Errors of the sensor that its files do not state, for a JSON file."""
         truth = self.faults.truth(self.camera)
         if self._depth_faults:
             truth |= self._depth_faults.truth()
@@ -248,7 +246,7 @@ class SyntheticSequence:
         return self._by_pixel(moving, rendering)
 
     def _by_pixel(self, of_movers: NDArray[Any], rendering: Rendering) -> NDArray[Any]:
-        """Value (H, W) of the mover that each pixel shows, of values (M,) of all movers; 0 or False for none."""
+        """Value (H, W) of the mover that each pixel shows, from values (M,) per mover; 0 or False for none."""
         still = np.zeros(len(self.scene.primitives), dtype=of_movers.dtype)
         return np.concatenate([still, of_movers[self._owner], still[:1]])[rendering.primitive]
 
@@ -278,7 +276,7 @@ class SyntheticSequence:
         return color
 
     def _pose_at(self, t: float) -> NDArray[np.float64]:
-        """Pose of the depth camera at any time; before the first and after the last frame with constant velocity."""
+        """Pose of the depth camera at any time, extrapolated with constant velocity."""
         stamps, Ts = self.timestamps, self.ground_truth.Ts_world_camera
         if stamps[0] <= t <= stamps[-1]:
             return self.ground_truth.interpolate(t)

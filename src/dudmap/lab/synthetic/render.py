@@ -25,7 +25,7 @@ class Rendering:
     """Image of an ideal camera.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 where the ray hits nothing.
+        depth: (H, W) float32, metres, 0 if the ray hits nothing.
         primitive: (H, W) int16, number of the visible primitive, -1 for none.
         color: (H, W, 3) float32 in 0..255, or None.
         cosine: (H, W) float32, cosine of the angle between the ray and the surface normal, or None.
@@ -38,9 +38,9 @@ class Rendering:
 
 
 class Renderer:
-    """Renderer of a fixed set of primitives (static ones first, then those of the movers) at any poses.
+    """Renderer of a fixed set of primitives at any poses: first the static ones, then the movers'.
 
-    Primitives from ``len(scene.primitives)`` on belong to movers; ``atlas`` holds the textures in use.
+    The first ``len(scene.primitives)`` primitives are static; ``atlas`` holds the textures in use.
     """
 
     def __init__(self, scene: Scene, primitives: list[Primitive]) -> None:
@@ -67,12 +67,13 @@ class Renderer:
         """Render an image of a camera, whose distortion is ignored, at T_world_camera (4, 4).
 
         Args:
+            camera: The camera.
+            T_world_camera: (4, 4).
             Ts_world_mover: (M, 4, 4) poses of the movers' primitives.
             present: (M,) which of them exist in this image.
             with_color: Also compute the colour.
             gain: Exposure factor of the colour.
-            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit
-                depth.
+            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit depth.
         """
         T_camera_world = se3.inverse(T_world_camera)
         Ts = T_camera_world @ np.concatenate([self._static, Ts_world_mover])
@@ -100,10 +101,10 @@ class Renderer:
     def _bin(
         self, camera: Camera, Ts: NDArray[np.float64], exists: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Front-to-back order, smallest depths, and the tile columns and rows that the box of each primitive covers.
+        """Front-to-back order, smallest depths, and tile columns and rows covered by the box of each primitive.
 
-        A box is left of the plane x = s z through the camera centre if its support function in the plane's normal
-        is negative; for tile columns and rows these planes are shared, so the test costs P (C + R).
+        A box is left of the plane x = s z through the camera centre if its support function along the plane's normal is
+        negative. Tile columns and rows share these planes, so the test costs P (C + R).
         """
         center, axes = Ts[:, :3, 3], Ts[:, :3, :3] * self._bounds[:, None, :]
         reach = np.abs(axes[:, 2]).sum(axis=1)

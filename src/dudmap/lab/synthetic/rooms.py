@@ -1,7 +1,7 @@
-"""Furniture, and the built-in static scenes, which ``scenes.toml`` describes; z is up, lengths in metres.
+"""Furniture and built-in static scenes (``scenes.toml``); z is up, lengths in metres.
 
-A row of ``solids`` names a kind of solid or of furniture with its position (the start of a capsule or cylinder), its
-other measures, and a material of the scene or of the furniture. A row with ``repeat`` (first, end, step) stands for
+A row of ``solids`` names a solid or furniture with its position (the start of a capsule or cylinder), its other
+measures, and a material of the scene or the furniture. A row with ``repeat`` (first, end, step) stands for
 several, each with one of these numbers in place of every "*".
 """
 
@@ -36,7 +36,7 @@ MATERIALS = {"wood": WOOD, "dark wood": DARK_WOOD, "metal": METAL, "cardboard": 
 
 
 SOLIDS = tables("synthetic/solids.toml")
-"""Rows of furniture and of what moves."""
+"""Rows of furniture and of movers."""
 
 
 def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:

@@ -78,7 +78,7 @@ class Primitive:
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (N,) in metres of points (N, 3) in the body frame; negative inside.
 
-        Exact except for the ellipsoid, where it is a first-order approximation with the correct sign.
+        Exact except for the ellipsoid: there it is a first-order approximation with the correct sign.
         """
         R, t = self.T_body_primitive[:3, :3], self.T_body_primitive[:3, 3]
         local = (points - t) @ R

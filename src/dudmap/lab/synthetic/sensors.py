@@ -1,6 +1,6 @@
-"""Sensors: noise models of depth and colour, and five RGB-D cameras as people own them.
+"""Sensors: noise models of depth and colour, and five common RGB-D cameras.
 
-An unknown name is a ``ConfigError``.
+An unknown name raises a ``ConfigError``.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ NOISE_SIZE = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseModel:
-    """What all noise models have.
+    """Parameters of all noise models.
 
     Attributes:
         lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
-        grazing: Cosine of the angle of incidence below which readings are lost.
-        edge_loss: Share of readings lost at a depth edge: on its far side, by time of flight on both.
-        speckle: Share of readings lost at random.
+        nearest, fade, farthest: Range, metres; the share of missing depth grows between fade and farthest.
+        grazing: Cosine of the angle of incidence below which depth is lost.
+        edge_loss: Share of depth lost at a depth edge: on its far side, for time of flight on both.
+        speckle: Share of depth lost at random.
         correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
         color_noise: Standard deviation of the colour noise, grey values.
     """
@@ -76,13 +76,13 @@ class SensorModel(NoiseModel):
 class TimeOfFlightModel(NoiseModel):
     """Sensor that measures the range itself, so that its noise does not follow z^2.
 
-    The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 plus slant z^1.5 (theta / (pi/2 -
-    theta))^2 in metres, theta = angle of incidence (the form of Fankhauser et al. 2015).
+    The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 + slant z^1.5 (theta / (pi/2 - theta))^2
+    in metres. theta is the angle of incidence (form of Fankhauser et al. 2015).
 
     Attributes:
         noise: Coefficients of 1, z and z^2, metres.
         slant: Coefficient of the term that grows with the angle of incidence, metres.
-        native_width: Width in pixels at which the sensor measures; a wider image is interpolated from it. 0: any.
+        native_width: Width in pixels of the measurement; wider images are interpolated from it. 0: any.
     """
 
     noise: tuple[float, float, float]
@@ -111,7 +111,7 @@ class Sensor:
         self._seed = seed
 
     def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Depth (H, W) float32 in metres, 0 = no reading, and colour (H, W, 3) uint8 of frame ``index``."""
+        """Depth (H, W) float32 in metres, 0 = missing, and colour (H, W, 3) uint8 of frame ``index``."""
         exact, color, cosine = rendering.depth, rendering.color, rendering.cosine
         assert color is not None
         assert cosine is not None
@@ -164,11 +164,11 @@ def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]
 
 @dataclass(frozen=True)
 class CameraModel:
-    """One camera, described as its driver delivers it: colour registered to depth.
+    """One camera as its driver delivers it: colour registered to depth.
 
-    Only what registration leaves over is a fault of place; add ``color_translation`` and the like for unregistered
-    streams. ``field_of_view`` is that of a 4:3 depth image, horizontally, in degrees, and ``motion_blur`` the exposure
-    time of the colour as a share of the frame interval.
+    ``faults`` holds only the errors that registration leaves; add ``color_translation`` and the like for unregistered
+    streams. ``field_of_view`` is the horizontal one of a 4:3 depth image, degrees. ``motion_blur`` is the exposure time
+    of the colour as a share of the frame interval.
     """
 
     noise: str

@@ -109,25 +109,24 @@ def sequence(
 
     Args:
         scene: Name of a scene (``names()["scenes"]``).
-        movers: Names of the movers, () for none; None for one person, or those of the situation.
-        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or that of the
+        movers: Names of the movers, () for none; None for one person, or the movers of the situation.
+        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or the path of the
             situation.
         frames: Number of frames.
         fps: Frames per second.
-        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or that of the sensor.
+        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or the sensor's.
         speed: Speed of the movers in m/s; None for the natural speed of each.
-        coverage: Share of the image, 0 to 0.95, that a stream of people covers on average; it replaces the movers,
-            and 0 means no movers.
-        start_dynamic: Whether the movers are in view from the first frame on.
+        coverage: Mean share of the image, 0 to 0.95, covered by a stream of people, which replaces the movers; 0 means
+            no movers.
+        start_dynamic: Whether the movers are in view in the first frame.
         situation: Name of a difficult situation (``names()["situations"]``).
         seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics, or width and height in pixels of an image with 525 px focal length at 640x480, or with the
-            view of the sensor; None for 640x480.
-        motion_blur: Exposure time as a share of the frame interval; None for 0, or that of the sensor.
+        camera: Intrinsics, or width and height in pixels. The view is the sensor's, else of 525 px focal length at
+            640x480. None for 640x480.
+        motion_blur: Exposure time as a share of the frame interval; None for 0, or the sensor's.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
         sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
-        faults: What the sensor does and its files do not say, or what of it differs from the named sensor, or from one
-            without faults.
+        faults: Errors of the sensor that its files do not state; a mapping changes the faults of ``sensor``.
 
     Raises:
         ConfigError: An argument is invalid; the message names the known values.

@@ -1,4 +1,4 @@
-"""Faults of the stream of frames between a sensor and the program, injected into any recording."""
+"""Faults of the frame stream between a sensor and the program, injected into any recording."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,17 +17,17 @@ from dudmap.lab.data import find
 Alteration = Callable[[Frame], Frame]
 """Changes a frame, or raises FrameError if the fault leaves none."""
 SPAN = 0.4, 0.6
-"""Part of the recording in which frames are altered or missing, as shares of its frames."""
+"""Part of the recording with altered or missing frames, as shares of its frames."""
 LONG_GAP, CLOCK_STEP = 10.0, 3600.0
-"""Length of a gap, and step of a clock that is set, seconds."""
+"""Length of a gap, and step of a clock adjustment, seconds."""
 BURST, BURST_SPACING = 5, 0.001
 """Frames that arrive together, and the time between their stamps, seconds."""
 INVALID_SHARE = 0.3
-"""Share of the pixels whose depth is not a length."""
+"""Share of the pixels with invalid depth."""
 
 
 class Delivery(NamedTuple):
-    """One frame as it arrives: number in the recording, stamp that it carries (s), and what happens to its images."""
+    """One arriving frame: number in the recording, its stamp (s), and the alteration of its images."""
 
     number: int
     timestamp: float
@@ -39,7 +39,7 @@ Schedule = Callable[[NDArray[np.float64]], list[Delivery]]
 
 
 class StreamFault(NamedTuple):
-    """A fault: what happens, for tables, and the deliveries of a recording from its stamps."""
+    """A fault: description for tables, and the deliveries of a recording from its stamps."""
 
     description: str
     schedule: Schedule
@@ -82,7 +82,7 @@ def _plain(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _altered(times: NDArray[np.float64], alter: Alteration) -> list[Delivery]:
-    """All frames of the span altered in the same way."""
+    """Alter all frames of the span."""
     first, stop = _span(times)
     return [item._replace(alter=alter) if first <= item.number < stop else item for item in _plain(times)]
 
@@ -106,7 +106,7 @@ def _out_of_order(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
-    """In the span frames arrive in bursts and are stamped on arrival, which is when the last of them was taken."""
+    """In the span frames arrive in bursts and are stamped on arrival, when the last one was taken."""
     items = _plain(times)
     first, stop = _span(times)
     for start in range(first, stop - BURST + 1, BURST):
@@ -117,16 +117,16 @@ def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _missing(times: NDArray[np.float64], gap: float) -> list[Delivery]:
-    """The frames of the span never arrive, and it lasts ``gap`` seconds longer: the camera moves meanwhile."""
+    """The frames of the span never arrive, and it lasts ``gap`` seconds longer, because the camera moves meanwhile."""
     first, stop = _span(times)
     kept = [item for item in _plain(times) if not first <= item.number < stop]
     return [item._replace(timestamp=item.timestamp + gap * (item.number >= stop)) for item in kept]
 
 
 def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -> list[Delivery]:
-    """The stamps of all frames from the span on, or of some, are later by ``step`` seconds.
+    """Add ``step`` seconds to the stamps of ``frames`` frames (None: all) after the start of the span.
 
-    A pause of a camera at rest, or a clock that is set.
+    It models a pause of a camera at rest, or a clock adjustment.
     """
     items, (first, _) = _plain(times), _span(times)
     stop = len(items) if frames is None else first + frames
@@ -134,7 +134,7 @@ def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -
 
 
 def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Delivery]:
-    """The frames of the span show the image before it."""
+    """Frames of the span repeat the image before it."""
     first, _ = _span(times)
     kept: list[Frame] = []
 
@@ -152,7 +152,7 @@ def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Del
 
 
 def scaled(frame: Frame, factor: float) -> Frame:
-    """Depth in another unit, metres and 16-bit values alike."""
+    """Scale the depth, as in another unit."""
     return replace(frame, depth=frame.depth * np.float32(factor))
 
 
@@ -161,7 +161,7 @@ def _exposed(frame: Frame, gain: float) -> Frame:
 
 
 def black(frame: Frame) -> Frame:
-    """Colour without light."""
+    """Set the colour to black."""
     return replace(frame, color=np.zeros_like(frame.rgb))
 
 
@@ -171,7 +171,7 @@ def _half_size(frame: Frame) -> Frame:
 
 
 def _invalid(frame: Frame) -> Frame:
-    """NaN, both infinities and negative lengths in random pixels."""
+    """Set random pixels to NaN, infinities and negative lengths."""
     rng = np.random.default_rng(round(1000 * frame.timestamp))
     values = rng.choice(np.array([np.nan, np.inf, -np.inf, -1.0], np.float32), frame.depth.shape)
     return replace(frame, depth=np.where(rng.random(frame.depth.shape) < INVALID_SHARE, values, frame.depth))
@@ -211,4 +211,4 @@ FAULTS: dict[str, StreamFault] = {
     "depth x 5": StreamFault("unit of 1 mm for 0.2 mm", partial(_altered, alter=partial(scaled, factor=5.0))),
     "depth / 5": StreamFault("unit of 0.2 mm for 1 mm", partial(_altered, alter=partial(scaled, factor=0.2))),
 }  # fmt: skip
-"""All faults by name; the first is a stream without any."""
+"""All faults by name; the first is a stream without faults."""

@@ -260,7 +260,7 @@ def build_atlas(names: set[str]) -> NDArray[np.int32]:
 
 @cache
 def _mip_maps(name: str) -> NDArray[np.int32]:
-    """Texels of all levels of a texture, from the finest on; scenes share textures, which take long to compute."""
+    """Texels of all levels of a texture, finest first; cached, because they take long to compute."""
     image = np.clip(_MAKERS[name](np.random.default_rng([0, TEXTURES.index(name)])), 0.0, 1.0)
     levels = []
     for level in range(LEVELS):

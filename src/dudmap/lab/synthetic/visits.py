@@ -1,4 +1,5 @@
-"""Two visits to one place, between which things appeared, disappeared, moved or got other colours, with exact truth."""
+"""Two visits to one place with exact ground truth: things appeared, disappeared, moved or got other colours between
+them."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -28,33 +29,34 @@ TRUTH = "changes.json"
 SKINS = ("cardboard", "books", "plaid", "checks", "denim", "brick", "stripes", "paper")
 KINDS = {"appeared", "disappeared", "moved", "opened", "recoloured"}
 NEAREST, FARTHEST, GRAZING = 0.5, 4.5, 0.2
-"""Distances (m) and least cosine of the angle of incidence at which a surface counts as seen."""
+"""Distances (m) and smallest cosine of the angle of incidence of an observed surface."""
 VIEWS = 5
-"""Frames of 30 that must see a surface, or through it."""
+"""Frames, of 30, that must see a surface, or look through it."""
 CLEAR = 0.03
-"""A ray that goes on so far behind a point sees it empty, metres: twice the noise of a Kinect at 2.5 m."""
+"""Distance behind a point, metres, that a ray must reach to see it empty: twice the noise of a Kinect at 2.5 m."""
 LEAST_SEEN = 0.35
-"""Share of the face of a thing (its longest edge times its middle one) that must have been seen to change."""
+"""Smallest observed share of the face of a changed thing (its longest edge times its middle one)."""
 NORMAL_LENGTH = 0.05
-"""Length of the normals beside the points that both visits must have seen of one side: 3 cm are 35 degrees."""
+"""Length of normals in the comparison of sides that both visits saw, metres: 3 cm correspond to 35 degrees."""
 GAP = 0.12
-"""Distance between things, and to the solids beside them, metres."""
+"""Distance between things, and to neighbouring solids, metres."""
 TRIES = 400
 
 
 @dataclass(frozen=True, eq=False)
 class TrueChange:
-    """What happened to a thing.
+    """True change of a thing.
 
     Attributes:
-        thing, kind, size: Its name, one of ``KINDS`` without "opened", or "unknown" where a visit could not see it; its
-            longest edge, metres.
-        T_after_before: (4, 4) its motion in the common frame of both visits; the identity if it did not move.
-        before, after: Points (n, 3) of its surface that one visit saw and where the other looked through, or in both
-            its surface for a change of the colour alone, metres.
-        symmetric: Whether rotations about its vertical axis leave its shape as it is.
-        common: Whether both visits saw enough of the same sides of it to tell that it is one thing.
-        at: (3,) its centre before, or after if it was not there before.
+        thing: Its name.
+        kind: One of ``KINDS`` without "opened", or "unknown" if a visit could not see it.
+        size: Longest edge, metres.
+        T_after_before: (4, 4) motion in the common frame of both visits; the identity if it did not move.
+        before, after: (n, 3) points of its surface that one visit saw and the other looked through, metres. Of a
+            recoloured thing, its surface in both visits.
+        symmetric: Whether rotations about its vertical axis preserve its shape.
+        common: Whether both visits saw enough of the same sides to identify it.
+        at: (3,) its centre before, or after if it was absent before.
     """
 
     thing: str
@@ -68,7 +70,7 @@ class TrueChange:
     common: bool = True
 
     def tree(self) -> dict[str, Any]:
-        """For a JSON file."""
+        """Values for a JSON file."""
         return {
             "thing": self.thing, "kind": self.kind, "size": round(self.size, 3), "symmetric": self.symmetric,
             "common": self.common,
@@ -113,12 +115,12 @@ THINGS: dict[str, tuple[Callable[[np.random.Generator, float], list[Primitive]],
     "chair": (_chair, (0.9, 0.9), False), "shelf": (_shelf, (1.26, 1.68), False), "door": (_door, (1.95, 1.95), False),
     "poster": (_box, (0.3, 1.0), False),
 }  # fmt: skip
-"""Maker of the solids on the origin, range of the longest edge in metres, and whether it is symmetric."""
+"""Function that makes the solids at the origin, range of the longest edge in metres, and symmetry."""
 
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A thing in the frame of each visit in which it is there; solids of a poster are those on its wall."""
+    """A thing in the frame of each visit that contains it; a poster's solids are on its wall."""
 
     name: str
     kind: str
@@ -148,7 +150,7 @@ def parsed_changes(text: str) -> list[tuple[str, str]]:
 
 
 class _Stage:
-    """Free spots of a scene in view of its home camera, on which things are put one after the other."""
+    """Free spots of a scene in view of its home camera, on which things are placed one after another."""
 
     def __init__(self, scene: Scene, recording: SyntheticSequence, rng: np.random.Generator) -> None:
         self.scene, self.rng, self.taken = scene, rng, list[Array]()
@@ -162,7 +164,8 @@ class _Stage:
         self.spots = points[:-1][flat & near[:-1]]
 
     def put(self, solids: list[Primitive], around: Array | None = None) -> Array | None:
-        """Pose (4, 4) of a thing, None without room for it; at a distance drawn from 5 cm to 3 m of a pose before."""
+        """Pose (4, 4) for a thing, None without room; with ``around``, at a random distance of 5 cm to 3 m from that
+        pose."""
         solid = _samples(solids)
         far = float(np.exp(self.rng.uniform(np.log(0.05), np.log(3.0))))
         for _ in range(TRIES):
@@ -204,7 +207,7 @@ def _samples(solids: list[Primitive]) -> Array:
 
 
 def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | None:
-    """A thing of a name on free spots of the stage; None if it does not fit."""
+    """Place a thing on free spots of the stage; None if it does not fit."""
     rng, scene = stage.rng, stage.scene
     make, (low, high), _ = THINGS[name]
     if name == "poster":
@@ -254,15 +257,15 @@ def visits(
     paths: tuple[str, str] = ("pan", "pan"),
     **options: Any,  # noqa: ANN401 - those of ``sequence``
 ) -> tuple[list[SyntheticSequence], list[TrueChange]]:
-    """Recordings before and after some changes, in one world frame, and what each visit could see of them.
+    """Recordings before and after some changes, in one world frame, and the true changes visible in them.
 
     Args:
-        changes: Things and what happens to them, as ``parsed_changes`` gives them.
+        changes: Things and their changes, from ``parsed_changes``.
         scene: Name of the scene.
-        seed: Seed of all that is drawn.
+        seed: Seed of all random numbers.
         size: Longest edge of boxes, balls and bins, metres; drawn by default.
         people: Whether people walk through the second visit.
-        other_light: Whether the lamps of the second visit stand elsewhere.
+        other_light: Whether the lamps of the second visit are elsewhere.
         paths: Camera paths of the visits.
         options: Of both recordings, see ``sequence``.
 
@@ -296,7 +299,7 @@ def _is_same(a: Primitive, b: Primitive) -> bool:
 
 
 def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
-    """What the visits could see of a change: surface of one of them that the other saw, or looked through."""
+    """Visible part of a change: surface that one visit saw and the other saw or looked through."""
     recoloured = thing.kind == "recoloured"
     changed, shown, areas = [], [], []
     for own, other, solids in zip(recordings, recordings[::-1], (thing.before, thing.after), strict=True):
@@ -332,7 +335,7 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
 
 
 def _moved(T: Array, oriented: Array) -> Array:
-    """Points beside their normals (n, 6) after a rigid motion (4, 4)."""
+    """Points and normals (n, 6) after a rigid motion (4, 4)."""
     return np.hstack([oriented[:, :3] @ T[:3, :3].T + T[:3, 3], oriented[:, 3:] @ T[:3, :3].T])
 
 
@@ -347,7 +350,7 @@ def _views(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
 
 
 def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
-    """Number of frames (V,) whose rays go on behind each vertex."""
+    """Number of frames (V,) whose rays continue behind each vertex."""
     counts, camera = np.zeros(len(surface.vertices), np.int32), recording.camera
     for T_world_camera, depth in _shots(recording):
         T = se3.inverse(T_world_camera)
@@ -361,7 +364,7 @@ def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.in
 def write_visits(
     recordings: Sequence[SyntheticSequence], truth: Sequence[TrueChange], out: Path, *, overwrite: bool = False
 ) -> None:
-    """Write the recordings as visit-1 and visit-2 with their true changes beside them.
+    """Write the recordings as visit-1 and visit-2, and their true changes, into a folder.
 
     Raises:
         DatasetError: A folder is not empty, or cannot be written.

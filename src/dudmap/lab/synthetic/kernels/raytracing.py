@@ -120,7 +120,7 @@ def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
 
 @compiled(inline="always", fastmath=_MATHS)
 def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
-    """Update one line of a tile, from column u0 on, where primitive p is nearer than the hits so far."""
+    """Update one tile line, starting at column u0, at pixels whose nearest hit is primitive p."""
     best, found = out
     for k in range(best.size):
         x = (u0 + k - cx) / fx
@@ -137,10 +137,17 @@ def trace(
 ):
     """Exact depth and visible primitive of the tile rows [row_from, row_to).
 
-    order (P,) primitives front to back, nearest (P,) their smallest depth; in_columns (P, C) and in_rows (P, R) tell
-    which tile columns and rows a primitive touches; kinds (P,), rotations (P, 3, 3) camera to primitive, origins (P, 3)
-    the camera centre in the primitive's frame, halves (P, 3); intrinsics fx fy cx cy. Fills depth (H, W) float32 metres
-    (0 = nothing) and ids (H, W) int16 (-1 = nothing).
+    Args:
+        order: (P,) primitives front to back.
+        nearest: (P,) their smallest depths.
+        in_columns, in_rows: (P, C) and (P, R), whether a primitive touches a tile column or row.
+        kinds: (P,).
+        rotations: (P, 3, 3) camera to primitive.
+        origins: (P, 3) camera centre in the primitive's frame.
+        halves: (P, 3).
+        intrinsics: fx fy cx cy.
+        depth: Filled, (H, W) float32 metres, 0 = nothing.
+        ids: Filled, (H, W) int16, -1 = nothing.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -240,11 +247,11 @@ def texture_color(atlas, texture, level, u, v):
 
 @compiled(inline="always", fastmath=_MATHS)
 def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
-    """Colour (0..1, three numbers) and cosine of incidence of primitive p where the ray (x, y, 1) t meets it.
+    """Colour (0..1, three numbers) and cosine of incidence of primitive p at the hit (x, y, 1) t of a ray.
 
-    Textures are projected along the largest component of the normal and filtered by the pixel's footprint (mip map);
-    light is Lambert's law from point lights plus a hemisphere that is brighter from above. See Renderer for the
-    columns of materials and lights.
+    Textures are projected along the largest component of the normal and filtered by the pixel's footprint (mip map).
+    Light is Lambert's law from point lights plus a hemisphere that is brighter above. See Renderer for the columns of
+    materials and lights.
     """
     X, Y = x * t, y * t
     px = rotations[p, 0, 0] * X + rotations[p, 0, 1] * Y + rotations[p, 0, 2] * t + origins[p, 0]
@@ -272,7 +279,7 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
     texture = textures[p]
     r0, g0, b0 = texture_color(atlas, texture, finer, u, v)
     r1, g1, b1 = texture_color(atlas, texture, finer + 1, u, v)
-    # Texture 0 once more, large and at an incommensurable scale, so that no two repeats of a pattern look alike.
+    # Texture 0 at a large, incommensurable scale makes repeats of a pattern look different.
     cloud, _, _ = texture_color(atlas, 0, 2, s * 0.233 + materials[p, 3], w * 0.233 + materials[p, 2])
     variation = 1.0 + materials[p, 7] * (cloud - 128.0) * (1.0 / 128.0)
 
@@ -299,8 +306,8 @@ def shade(
 ):  # fmt: skip
     """Colour (adds into (H, W, 3) float32, 0..255) and cosine of incidence (H, W) float32 of the tile rows.
 
-    Pixels at the border between two primitives are averaged over 2x2 rays, all others need one: inside a surface
-    the mip map already filters.
+    Pixels at the border between two primitives are averaged over 2x2 rays. Others need one ray, because the mip map
+    filters inside a surface.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -320,7 +327,7 @@ def shade(
                         or (v + 1 < height and ids[v + 1, u] != p)
                     )
                     count = 0
-                    if border:  # the sub-pixels show what the pixels around show
+                    if border:  # sub-pixels show the primitives of the neighbouring pixels
                         for k in range(9):
                             vv, uu = v + k // 3 - 1, u + k % 3 - 1
                             if vv < 0 or uu < 0 or vv >= height or uu >= width or ids[vv, uu] < 0:
@@ -371,8 +378,8 @@ def shade(
 def count_views(first, last, vertices, normals, T, intrinsics, depth, near, far, grazing, counts):
     """Add one to counts[k] for every vertex in [first, last) that the ideal depth image (H, W) shows.
 
-    vertices, normals (V, 3) float32 world; T (4, 4) world to camera; intrinsics fx fy cx cy; only between near and far
-    (m) and at a cosine of incidence above grazing. The tolerance is what one pixel's slant can explain.
+    A vertex counts between near and far (m) and at a cosine of incidence above grazing. The tolerance is the slant of
+    one pixel. vertices, normals (V, 3) float32 world; T (4, 4) world to camera; intrinsics fx fy cx cy.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
