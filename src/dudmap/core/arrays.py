@@ -1,4 +1,4 @@
-"""Copies of a caller's arrays: dudmap keeps all arrays in memory of its own."""
+"""Copies of a caller's arrays: dudmap never shares their memory."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def copied(
         values: The caller's array, list or number.
         what: Name in messages.
         dtype: Type of the copy; None keeps the type of ``values``.
-        shape: The only possible shape; None allows all.
+        shape: Required shape; None allows all.
 
     Raises:
         DatasetError: ``values`` is no array of numbers, or has another shape.

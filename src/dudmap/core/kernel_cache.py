@@ -1,7 +1,7 @@
 """Compiled kernels: of the wheel, of a folder, or of this process.
 
-Numba refuses to define a kernel if none of its folders can be written. Then the kernels of dudmap are stored in a
-private folder of this user in the temporary folder, or are compiled in memory.
+Numba refuses to define a kernel if it can write none of its folders. The kernels of dudmap are then stored in a private
+folder of this user in the temporary folder, or compiled in memory.
 """
 
 import os
@@ -23,11 +23,11 @@ from dudmap.core.shipped_kernels import KernelCacheWarning as KernelCacheWarning
 _KINDS: dict[str, Any] = {
     kind.__name__.lstrip("_").removesuffix("CacheLocator"): kind for kind in caching.CacheImpl._locator_classes
 }
-"""Numba's choices of a folder, by names that had an underscore before Numba 0.62."""
+"""Numba's locators of a folder, by name; before Numba 0.62 the names had an underscore."""
 
 
 _DAMAGED: type[Exception] = vars(caching)["pickle"].UnpicklingError
-"""Error of Numba about a damaged file."""
+"""Numba's error for a damaged file."""
 
 
 counts = Counter[str]()
@@ -58,7 +58,7 @@ def is_temporary() -> bool:
 
 
 def environment() -> dict[str, str]:
-    """Environment variables with which a child process stores its kernels in the same folder, without a warning."""
+    """Environment variables that make a child process store its kernels in the same folder, without a warning."""
     return {"NUMBA_CACHE_DIR": str(_private())} if is_temporary() else {}
 
 
@@ -112,20 +112,20 @@ class _Cache(caching.FunctionCache):
     def __init__(self, function: Any, stamp: str) -> None:  # noqa: ANN401 - any function
         super().__init__(function)
         self._cache_file._source_stamp = stamp
-        # two processes that compile for different types at the same time write different files
+        # processes that compile different types at the same time write different files
         self._cache_file._data_name_pattern = self._cache_file._data_name_pattern.replace(
             "{number", f"{os.getpid()}.{{number"
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
-        """The compiled form for a signature, None if it has to be compiled."""
+        """The compiled form for a signature, None if it must be compiled."""
         try:
             return super().load_overload(sig, target_context)
         except (OSError, EOFError, _DAMAGED):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
-        """Store a compiled form if that is possible."""
+        """Store a compiled form if possible."""
         try:
             try:
                 super().save_overload(sig, data)
@@ -140,13 +140,13 @@ class _Cache(caching.FunctionCache):
 
 
 class _Locator:
-    """Chooses the folder: NUMBA_CACHE_DIR, the package's own, the user's, or the temporary one."""
+    """Chooses the folder: NUMBA_CACHE_DIR, the package's, the user's, or the temporary one."""
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> Any:  # noqa: ANN401 - a locator of Numba
-        """Locator of the first folder that can be written, None if there is none."""
+        """Locator of the first writable folder, None if there is none."""
         kinds = [_KINDS["UserProvided"], _KINDS["InTree"]]
-        if os.path.isabs(os.path.expanduser("~")):  # else Numba would make a folder of the name ~
+        if os.path.isabs(os.path.expanduser("~")):  # otherwise Numba would make a folder named ~
             kinds.append(_KINDS["UserWide"])
         found = (kind.from_function(function, file) for kind in (*kinds, _PrivateLocator))
         return next((locator for locator in found if locator is not None), None)
@@ -181,7 +181,7 @@ def _private() -> Path | None:
     try:
         base = Path(tempfile.gettempdir())
         temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}
-        if os.name != "posix" or str(base) not in temporary:  # not the current folder, Python's last resort
+        if os.name != "posix" or str(base) not in temporary:  # not the current folder, Python's fallback
             return None
         if base.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:  # other users may rename its content
             return None

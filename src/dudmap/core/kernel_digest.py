@@ -1,4 +1,4 @@
-"""Digest of all that the machine code of a kernel depends on, in whichever file it is written."""
+"""Digest of everything that determines the machine code of a kernel, in all files."""
 
 import hashlib
 import inspect
@@ -11,14 +11,14 @@ import numpy as np
 from numba.core import types
 
 LIBRARIES = {"builtins", "llvmlite", "math", "numba", "numpy"}
-"""Packages whose functions enter a digest by their names alone."""
+"""Packages whose functions contribute only their names to a digest."""
 PLAIN = (bool, int, float, complex, str, bytes, np.generic, type(None))
 
 
 def digest(kernel: Any) -> str:  # noqa: ANN401 - a dispatcher of Numba
     """Digest of a kernel: its code, its options, and all functions and constants that it reads, recursively.
 
-    Comments, docstrings and line numbers do not enter it.
+    Comments, docstrings and line numbers do not change it.
     """
     return hashlib.sha256("\n".join(sorted(reached(kernel).values())).encode()).hexdigest()
 
@@ -36,7 +36,7 @@ def reached(kernel: Any) -> dict[Any, str]:  # noqa: ANN401
 
 
 def layout(type_: Any) -> str:  # noqa: ANN401 - a type of Numba, or several
-    """Name of an argument type with the field names of named tuples, which Numba's own name lacks."""
+    """Name of an argument type with the field names of named tuples, which Numba's name lacks."""
     parts: Any = type_ if isinstance(type_, tuple | types.BaseTuple) else ()
     if not parts:
         return str(type_)
@@ -46,7 +46,7 @@ def layout(type_: Any) -> str:  # noqa: ANN401 - a type of Numba, or several
 
 @cache
 def _read(kernel: Any) -> tuple[str, tuple[Any, ...]]:  # noqa: ANN401
-    """Text of one function, without the functions that it calls, and these functions."""
+    """Text of one function without its callees, and the callees."""
     function, called = inspect.unwrap(kernel), list[Any]()
     code = function.__code__
     read = {name: function.__globals__[name] for name in _names(code) if name in function.__globals__}
@@ -57,7 +57,7 @@ def _read(kernel: Any) -> tuple[str, tuple[Any, ...]]:  # noqa: ANN401
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Code of a function and of the functions inside it."""
+    """Code of a function and its inner functions."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -75,7 +75,7 @@ def _code(code: CodeType, doc: str | None = None) -> str:
 
 
 def _name(function: Any) -> str:  # noqa: ANN401
-    """Full name of a function with its options, in an order that does not vary between processes."""
+    """Full name of a function with its options, in a reproducible order."""
     options = sorted((key, _text(value)) for key, value in getattr(function, "targetoptions", {}).items())
     module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", function)  # NumPy 1 has none
     return f"{module}.{name} {options}"
@@ -85,7 +85,7 @@ def _text(value: Any, called: list[Any] | None = None) -> str:  # noqa: ANN401
     """Text of a value that a kernel reads; a function is added to ``called``.
 
     Raises:
-        TypeError: The text of such a value is not known.
+        TypeError: The value has an unsupported type.
     """
     value = getattr(value, "inlined", value)
     if isinstance(value, PLAIN):
@@ -106,7 +106,7 @@ def _text(value: Any, called: list[Any] | None = None) -> str:  # noqa: ANN401
         return f"class {value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
     if not callable(value):
         raise TypeError(f"kernels may read numbers, arrays, tuples and functions; one reads a {type(value).__name__}")
-    own = isinstance(value, FunctionType) or hasattr(value, "__wrapped__")  # and not a function written in C
+    own = isinstance(value, FunctionType) or hasattr(value, "__wrapped__")  # excludes functions written in C
     if called is not None and own and value.__module__.partition(".")[0] not in LIBRARIES:
         called.append(value)
     return f"function {_name(value)}"

@@ -1,4 +1,4 @@
-"""Results of a system: the result of each frame, and maps, trajectories and calibration so far."""
+"""Results of a system: the result of each frame, and the maps, trajectories and calibration so far."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -35,37 +35,35 @@ class FrameResult:
     """Result of processing one frame.
 
     Attributes:
-        timestamp: Time of the depth image, seconds; on the clock of the first frames if the clock was set since.
-        state: "tracked", "lost", or "repeated" if the frame has the images, or the depth image, of the frame before.
+        timestamp: Time of the depth image, seconds; after a change of the clock, on the clock of the first frames.
+        state: "tracked", "lost", or "repeated" if the images, or the depth image, equal the frame before.
         lost_reason: Names the check that failed; empty for a tracked frame.
-        rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
-            else empty.
+        rejected: Kind of stream error for which a lost frame was ignored (``frames/stream_check.py``); else empty.
         T_world_camera: Camera pose (4, 4); None if lost. A repeated frame has the pose of the frame before. If only the
             depth repeats, the pose is predicted; the trajectory interpolates it once the next frame is tracked.
         fused: Whether the frame changed the map.
         skipped_similar: Whether the frame was not fused because it is a redundant view.
         dynamic_mask: (H, W) bool, dynamic pixels of the recorded image.
-        dynamic_share: Share of the depth readings that lie in the mask.
-        residuals: (h, w) float32 signed distances of the readings to the map, metres, at the resolution of the labels;
-            NaN off the map.
+        dynamic_share: Share of the depth measurements in the mask.
+        residuals: (h, w) float32 signed distances of the measurements to the map, metres, at label resolution; NaN off
+            the map.
         labels: Full result of the labelling; None if it did not run.
         tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
         relocalized: Whether the pose comes from a recognised place after tracking was lost.
-        find_movers: Finds the moving objects; None if there are none.
-        submap: Number of the submap that the pose belongs to, 0 the first.
-        corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
-        blind: Whether the image was textureless, or missing in a map with colours, or rejected after a change of the
-            light: its pose rests on the distances alone, and it is not fused.
-        colorless: Whether the frame has no colour image: its pose rests on the distances alone.
+        find_movers: Computes the moving objects; None if there are none.
+        submap: Number of the submap of the pose, 0 the first.
+        corrected: Whether this frame closed a loop, which changed all earlier poses of the submap.
+        blind: Whether only the distances determine the pose, and the frame is not fused: the image is textureless,
+            missing in a map with colours, or rejected after a change of the light.
+        colorless: Whether the frame has no colour image, so that only the distances determine the pose.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Reason why pose and labels of a tracked frame may be wrong, else empty. Such a frame is not fused.
-        unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the pose follows the
+        unobservable: (k, 6) twists, camera axes, that the view does not observe and along which the pose follows the
             prediction (``core/tracking/observability.py``). Such a frame is ``uncertain``.
         repeats: Part that equals the frame before bit for bit: the whole ``frame``, its ``depth`` or its ``color``. A
             frame with repeated colour is tracked by its distances alone (``blind``).
-        checks: Values of all checks of the frame (``tracking/checks.py``), NaN if unknown; empty for a frame that was
-            not registered.
+        checks: Values of all checks of the frame (``tracking/checks.py``), NaN if unknown; empty without registration.
     """
 
     timestamp: float
@@ -99,7 +97,7 @@ class FrameResult:
         return f"FrameResult({self.timestamp:.6f} s, {self.state}{reason}, {self.dynamic_share:.1%} dynamic)"
 
     def without_details(self) -> "FrameResult":
-        """Pose and mask alone, as of a frame that repeats this one."""
+        """Pose and mask alone, for a frame that repeats this one."""
         return FrameResult(
             self.timestamp, self.state, self.lost_reason, self.T_world_camera, fused=False, skipped_similar=False,
             dynamic_mask=self.dynamic_mask, dynamic_share=self.dynamic_share, residuals=self.residuals, labels=None,
@@ -113,7 +111,7 @@ class FrameResult:
         return () if self.find_movers is None else deepcopy(self.find_movers())
 
     def detached(self) -> "FrameResult":
-        """The same with copies of all arrays: a caller may keep and change them."""
+        """Copy with copies of all arrays, which the caller may keep and change."""
         return replace(deepcopy(replace(self, find_movers=None)), find_movers=self.find_movers)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -123,7 +121,7 @@ class FrameResult:
 
 @dataclass(frozen=True, eq=False)
 class SlamArguments:
-    """Arguments of ``Slam``, except a first pass and a saved map, of which the state holds what is used."""
+    """Arguments of ``Slam``, except a first pass and a saved map, whose used parts belong to the state."""
 
     camera: Camera
     config: Config
@@ -137,13 +135,13 @@ class SlamArguments:
 
 
 class SlamResults:
-    """The read-only side of ``Slam``; a map that is being rebuilt after a correction is completed first.
+    """The read-only side of ``Slam``; a map in rebuilding after a correction is completed first.
 
     Attributes:
         config, camera: Configuration, and camera of the images without lens distortion.
         atlas: Submaps, keyframes, stored frames and poses.
-        mapper: Fuses frames into it.
-        monitor: How well frames fit the map.
+        mapper: Fuses frames into the atlas.
+        monitor: Fit of recent frames to the map.
         color_calibration: Calibration of the colour camera.
         objects: The moving objects.
         detector: Labels moving pixels.
@@ -163,12 +161,12 @@ class SlamResults:
 
     @property
     def reference(self) -> TsdfVolume:
-        """Map that frames are registered to: the current one, or in a second pass the map of the first pass."""
+        """Map for registration: the current one, or in a second pass the map of the first pass."""
         return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     @property
     def volume(self) -> TsdfVolume:
-        """Complete map of the current submap; rebuilding after a correction is finished first.
+        """Complete map of the current submap; a rebuilding after a correction is finished first.
 
         A new or joined submap is another object. ``atlas.volume`` is the map in its current state.
         """
@@ -182,29 +180,29 @@ class SlamResults:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all tracked frames of the submap with the most frames, at their time stamps, after all
-        corrections."""
+        """Poses of all tracked frames of the largest submap, at their time stamps, after all corrections."""
         return self._trajectory(self.atlas.by_size()[0])
 
     def _trajectory(self, number: int) -> Trajectory:
-        """Trajectory of a submap. Given poses belong to the stamps, even if the images were taken at other times."""
+        """Trajectory of a submap. Given poses belong to the time stamps, even if the images were captured at other
+        times."""
         given = self.arguments.poses == "given"
         return self.atlas.image_poses(number) if given else self.atlas.trajectory(number)
 
     @property
     def image_poses(self) -> Trajectory:
-        """The trajectory at the times of exposure, if a calibration finds the stamps of the depth images late."""
+        """The trajectory at the capture times, if a calibration finds the stamps of the depth images late."""
         return self.atlas.image_poses(self.atlas.by_size()[0])
 
     @property
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
-        """Trajectory and complete map of each submap, the one with the most frames first; each has its own world."""
+        """Trajectory and complete map of each submap, largest first; each has its own world frame."""
         self.atlas.complete()
         return [(self._trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
     @property
     def saved_map(self) -> SavedMap:
-        """The main map in the form that a later run continues."""
+        """The main map, which a later run can continue."""
         return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
 
     @property
@@ -214,26 +212,26 @@ class SlamResults:
 
     @property
     def calibration_waits(self) -> int:
-        """Frames that waited for a calibration estimated in another process."""
+        """Number of frames that waited for a calibration from another process."""
         return self.color_calibration.waits
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
-        """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of the rigid ones."""
+        """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of rigid objects."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
     def finish(self) -> int:
-        """Fuse the frames that a young map holds back: after the end of the stream no later frame shows slow motion.
+        """Fuse the frames that a young map holds back, because no later frame of an ended stream shows slow motion.
 
-        Only a map that is younger than 0.4 s holds frames back. Frames may follow.
+        Only a map younger than 0.4 s holds frames back. Frames may follow.
 
         Returns:
-            Number of frames that were fused.
+            Number of fused frames.
         """
         return self.mapper.finish()
 
     def as_prior_map(self) -> PriorMap:
-        """The largest submap and the memory that a second pass over the same recording needs."""
+        """The largest submap and the state that a second pass over the same recording needs."""
         self.finish()
         self.atlas.complete()
         self.atlas.keyframes.settle()

@@ -10,12 +10,11 @@ from dudmap.errors import MapError
 
 
 class ScratchStore:
-    """Lists of byte strings by keys, in a temporary SQLite database that uses the room of removed ones again.
-
-    Methods may be called by any thread.
+    """Lists of byte strings by keys, in a temporary SQLite database that reuses the space of removed lists.
+    Thread-safe.
 
     Args:
-        content: What is stored, for messages.
+        content: Name of the content in messages.
     """
 
     def __init__(self, content: str) -> None:
@@ -27,7 +26,7 @@ class ScratchStore:
         self.close = weakref.finalize(self, _close, connection, self._lock)
 
     def write(self, key: str, parts: Sequence[bytes | memoryview]) -> None:
-        """Store the parts of a key, in place of what was stored of it.
+        """Store the parts of a key, replacing its previous parts.
 
         Raises:
             MapError: The file cannot be written.
@@ -47,7 +46,7 @@ class ScratchStore:
         """The parts of a key.
 
         Raises:
-            MapError: The file cannot be read, or does not hold the key.
+            MapError: The file cannot be read, or has no such key.
         """
         try:
             with self._lock:
@@ -66,5 +65,5 @@ class ScratchStore:
 
 
 def _close(connection: sqlite3.Connection, lock: threading.Lock) -> None:
-    with lock:  # a connection that is closed while another thread uses it ends the process
+    with lock:  # closing a connection that another thread uses crashes the process
         connection.close()

@@ -1,4 +1,4 @@
-"""The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
+"""The algorithm: register a frame to the map, label moving pixels, fuse the static pixels (thesis algorithm 4)."""
 
 import time
 from dataclasses import replace
@@ -42,24 +42,25 @@ from dudmap.core.tracking.tracker import Tracker
 
 
 class Slam(SlamResults, Stateful):
-    """Dense RGB-D SLAM in scenes where things move.
+    """Dense RGB-D SLAM in dynamic scenes.
 
     Args:
-        camera: Camera of the frames that will come.
+        camera: Camera of the frames.
         config: All parameters; None for the defaults.
-        first_pass: A system that has processed the whole recording. All frames, passed again from the first, are
-            registered and labelled with its map and fused into a new one. The new map excludes objects that seemed
-            static before they moved or were seen through.
-        calibration: Of the colour camera; None for registered colour. An estimated one is not changed. With
+        first_pass: A system that has processed the whole recording. The second pass repeats all frames. They are
+            registered and labelled with the map of the first pass and fused into a new map. It excludes objects that
+            seemed static before they moved or were seen through.
+        calibration: Calibration of the colour camera; None for registered colour. An estimated one is not changed. With
             ``sensor.self_calibration``, any other is the start of the estimation.
         live: No frame waits for a calibration, and the first poses are not estimated a second time.
         saved_map: Map of an earlier run to continue; the system takes it over. All poses are in its world frame. Frames
             are lost until one is recognised in it, or until a new submap starts, which may be joined later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
-        max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results stay.
+        max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results do not
+            change.
         timed: Whether the times of the frames are measured; False for assumed times.
         poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
-        ignore: (H, W) bool, pixels of the depth or colour image that never count: not used, not fused, never dynamic.
+        ignore: (H, W) bool, pixels of the depth or colour image that are never used, fused or dynamic.
     """
 
     stream: Remembered[StreamCheck]
@@ -76,7 +77,7 @@ class Slam(SlamResults, Stateful):
     redundancy: Remembered[RedundantViews]
     loops: Remembered[LoopCloser]
     objects: Remembered[MovingObjects]
-    _last: Remembered[FrameResult | None] = None  # of the last frame, for one that repeats it
+    _last: Remembered[FrameResult | None] = None  # result of the last frame, for a frame that repeats it
 
     def __init__(
         self,
@@ -133,12 +134,12 @@ class Slam(SlamResults, Stateful):
             self.relocalizer.start_in_saved_map()
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
-        """The part of the work on a frame that needs no other frame, as input of ``process``.
+        """The part of ``process`` that needs no other frame; returns its input.
 
         May run in another thread while an earlier frame is processed; one frame at a time.
 
         Args:
-            frame: Depth and colour; a frame that is prepared already only gets the mask.
+            frame: Depth and colour; a prepared frame only receives the mask.
             dynamic_mask: As for ``process``.
 
         Raises:
@@ -148,7 +149,7 @@ class Slam(SlamResults, Stateful):
             start, now = time.perf_counter(), not self.color_motion.rectifies
             frame = FrameView.of(self.preprocess(frame), self.config, self.detector, now=now)
             if now and self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
-                _ = frame.pyramid.corners  # cached there for the comparison with other images
+                _ = frame.pyramid.corners  # cached for the comparison with other images
             frame.timer.timings["preprocess"] = 1000 * (time.perf_counter() - start)
         if dynamic_mask is not None:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
@@ -164,9 +165,9 @@ class Slam(SlamResults, Stateful):
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
 
         Args:
-            frame: Depth and colour, in the order of arrival; prepared or not, the result is the same. A frame whose
-                stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
-            dynamic_mask: (H, W) bool, known dynamic pixels, which are left out of all registrations and of the map.
+            frame: Depth and colour, in order of arrival, prepared or not. A frame with an impossible time stamp or
+                image is lost and changes nothing (``FrameResult.rejected``).
+            dynamic_mask: (H, W) bool, known dynamic pixels, excluded from all registrations and from the map.
             T_world_camera: (4, 4) given pose of the depth camera, see ``poses``; metres.
             arrays: ``depth``, ``timestamp`` and ``rgb`` instead of a frame. ``depth`` (H, W) is float32 in metres or
                 uint16 with ``camera.depth_scale`` units per metre (default 1000: millimetres), 0 = no measurement.
@@ -183,7 +184,7 @@ class Slam(SlamResults, Stateful):
     # -- steps of process ---------------------------------------------------------------------------------------------
 
     def _processed(self, view: FrameView) -> FrameResult:
-        """``process`` of a prepared frame; the result shares memory with the state of the system."""
+        """``process`` for a prepared frame; the result shares memory with the state of the system."""
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation) or self.motion.missing
         if rejection:
@@ -194,7 +195,7 @@ class Slam(SlamResults, Stateful):
         view = self.color_motion.predicted(self._rectified(view))
         if self.reference.is_empty:
             return self._start_map(view)
-        blind = view.textureless or self.stream.repeats == "color"  # the colours of the frame say nothing, or are none
+        blind = view.textureless or self.stream.repeats == "color"  # the colours carry no information
         view = replace(view, blind=blind and not self.bootstrap.textureless)
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
@@ -228,7 +229,7 @@ class Slam(SlamResults, Stateful):
         )  # fmt: skip
 
     def _rectified(self, view: FrameView) -> FrameView:
-        """The frame at the time of its middle row; itself where all rows are taken at once or the camera rests."""
+        """The frame rectified to the time of its middle row; unchanged with a global shutter or a camera at rest."""
         with view.timer("rectify"):
             observation = self.color_motion.rectified(view.observation)
             if observation is view.observation:
@@ -237,15 +238,15 @@ class Slam(SlamResults, Stateful):
             return replace(FrameView.of(observation, self.config, self.detector), timer=view.timer, known_dynamic=known)
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
-        """Report a frame that the stream has spoilt."""
+        """Report a rejected frame, which changes nothing."""
         nothing = np.zeros_like(view.observation.readings)
         return self._result(view, None, nothing, reason=rejection.reason, rejected=rejection.kind)
 
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
-        """Result of a frame that repeats the one before, or its depth.
+        """Result of a frame that repeats the frame before, or its depth.
 
-        It has the pose of the frame it repeats, or with new colours the predicted one, which is interpolated once the
-        next frame is tracked. Neither is used for longer than a prediction can be trusted.
+        It has the pose of the repeated frame, or with new colours the predicted pose, which is interpolated once the
+        next frame is tracked. Neither is used longer than predictions are valid.
         """
         repeats, time = self.stream.repeats, view.timestamp
         result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
@@ -261,7 +262,7 @@ class Slam(SlamResults, Stateful):
         return result
 
     def _resumed(self, view: FrameView) -> FrameView:
-        """The frame on the clock of the first ones; after a pause neither velocity nor place is known any more."""
+        """The frame on the clock of the first frames; a long pause invalidates velocity and place."""
         if self.stream.clock_offset != 0:
             view = replace(view, observation=self.stream.restamped(view.observation))
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
@@ -269,7 +270,7 @@ class Slam(SlamResults, Stateful):
         return view
 
     def _start_map(self, view: FrameView) -> FrameResult:
-        """Make a map of a single frame, whose camera frame becomes the world frame."""
+        """Start a map with a single frame, whose camera frame becomes the world frame."""
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, self.motion.start)
         mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
@@ -288,7 +289,7 @@ class Slam(SlamResults, Stateful):
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
-        """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
+        """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
         self.monitor.lose()
         view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
@@ -304,7 +305,7 @@ class Slam(SlamResults, Stateful):
         return found.estimate
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
-        """Report a lost frame, or start a new submap with it after a while."""
+        """Report a lost frame, or start a new submap with it after some time."""
         mostly_dynamic = self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
         self.relocalizer.lost(view.timestamp, mostly_dynamic=mostly_dynamic)
         self.front_end.lose(view.timestamp)
@@ -314,7 +315,7 @@ class Slam(SlamResults, Stateful):
         return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 
     def _start_submap(self, view: FrameView) -> FrameResult:
-        """Go on in a new map, which is made of this frame."""
+        """Start a new map with this frame."""
         self.color_calibration.interrupt()
         self.atlas.start_submap()
         for remembered in (self.monitor, self.detector, self.predictor.ego_motion, self.redundancy):
@@ -323,14 +324,13 @@ class Slam(SlamResults, Stateful):
         return self._start_map(view)
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Take over the pose and the labels of a frame."""
         self.front_end.update(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
     def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
-        """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
+        """Whether to fuse a tracked frame: its pose is certain, and its view is not redundant."""
         with view.timer("similarity"):
             known = view.blind or uncertain or self.localize
             return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
@@ -338,7 +338,7 @@ class Slam(SlamResults, Stateful):
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], bool]:
-        """Pose of the frame after a loop closure, and whether there was one."""
+        """Pose of the frame after a loop closure, and whether a loop was closed."""
         T_world_camera = estimate.T_world_camera
         if self.atlas.history is None or view.without_image or self.motion.is_given:
             return T_world_camera, False
@@ -348,7 +348,7 @@ class Slam(SlamResults, Stateful):
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
-        self.bootstrap.abandon()  # frames held back have poses of before
+        self.bootstrap.abandon()  # the poses of held-back frames are outdated
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
         self.detector.apply_correction(correction)
@@ -357,9 +357,9 @@ class Slam(SlamResults, Stateful):
     def _calibrate(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
     ) -> bool:
-        """Learn the calibration of the colour camera; returns whether a new one is in use from the next frame on."""
+        """Update the calibration of the colour camera; returns whether the next frame uses a new one."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
-        if calibrated:  # the pose of the last image is that of colours elsewhere
+        if calibrated:  # the colours move relative to the last image
             self.predictor.ego_motion.reset()
         return calibrated
 
@@ -375,7 +375,7 @@ class Slam(SlamResults, Stateful):
         uncertain: str = "",
         **details: Any,  # noqa: ANN401 - further attributes of the result
     ) -> FrameResult:
-        """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
+        """The result of a frame, with the mask in the recorded (distorted) image."""
         labels, tracking = (None, None) if estimate is None else (estimate.labels, estimate.tracking)
         readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(

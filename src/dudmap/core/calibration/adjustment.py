@@ -1,4 +1,4 @@
-"""Adjustment of the calibration together with the poses of the keyframes (bundle adjustment over dense pairs)."""
+"""Adjustment of the calibration and the keyframe poses (bundle adjustment over dense pairs)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 
 MAX_ANGLE, MIN_ANGLE = np.radians(30), np.radians(2)
-"""Rotation between the frames of a pair: enough to tell the cameras apart, little enough to see the same."""
+"""Limits of the rotation between the frames of a pair, radians: enough to separate both cameras, and enough overlap."""
 MIN_FASTER = 0.2
-"""Difference of velocity (m/s, rad/s) with which two views at no angle also make a pair."""
+"""Smallest velocity difference (m/s, rad/s) of a pair without rotation or translation."""
 MAX_SHIFT = 0.35
 """Largest translation between the frames of a pair over the median depth."""
 
@@ -32,19 +32,19 @@ class Pair:
 
 
 class PairSet:
-    """Pairs of F frames, whose images and points (every ``stride``-th) are stacked for the kernel.
+    """Pairs of F frames, with images and points (every ``stride``-th) stacked for the kernel.
 
     Attributes:
-        numbers: (P, 2) int64, the first and the second frame of every pair, in the order of time.
-        Ts_camera_world: (F, 4, 4) of the frames as tracked.
-        camera: Of the depth images.
+        numbers: (P, 2) int64, first and second frame of every pair, in order of time.
+        Ts_camera_world: (F, 4, 4) tracked poses.
+        camera: Camera of the depth images.
         depths: (F, h, w) float32; ``images``: (F, h, w) float32 filtered intensities per size, coarse to fine;
-            ``brightness``: (F, h, w) float32 of the smallest size, not filtered.
-        points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) where those of each begin.
-        residual_starts: (P + 1,) where the residuals of each pair begin: one per point of its first frame.
+            ``brightness``: (F, h, w) float32 unfiltered intensities of the smallest size.
+        points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) start of each frame in them.
+        residual_starts: (P + 1,) start of each pair's residuals: one per point of its first frame.
         twists: (F, 6) float32 velocities; ``color_offsets``: (F,) float32.
-        places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames;
-            ``products``: (P n n,) where their products do, by the first of the n unknowns that are wanted.
+        places: (P, 25) indices of each pair's unknowns: parameters, poses of both frames. ``products``: (P n n,) flat
+            indices of the products of n unknowns per pair, keyed by the first of these unknowns.
     """
 
     def __init__(self, pairs: Sequence[Pair], stride: int = 1) -> None:
@@ -77,13 +77,13 @@ class PairSet:
 
 
 def select_pairs(keyframes: Sequence[ColorKeyframe], count: int) -> list[Pair]:
-    """Up to ``count`` pairs of overlapping views at an angle or at different velocities, drawn evenly."""
+    """Up to ``count`` overlapping pairs at different angles, positions or velocities, drawn evenly."""
     second, first = np.tril_indices(len(keyframes), -1)
     return _drawn(keyframes, first, second, count)
 
 
 def select_across(before: Sequence[ColorKeyframe], after: Sequence[ColorKeyframe], count: int) -> list[Pair]:
-    """Up to ``count`` such pairs of one frame of each of two groups."""
+    """Up to ``count`` such pairs, each with one frame of each group."""
     second, first = np.indices((len(after), len(before))).reshape(2, -1)
     return _drawn([*before, *after], first, len(before) + second, count)
 
@@ -107,8 +107,8 @@ def _drawn(
 
 
 def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> float:
-    """That of the sum of values (P,) of pairs of frames with ``numbers`` (P, 2), where pairs that share a frame err
-    together (Aronow, Samii and Assenova 2015)."""
+    """Standard error of the sum of values (P,) over pairs of frames ``numbers`` (P, 2). The errors of pairs with a
+    common frame are correlated (Aronow, Samii and Assenova 2015)."""
     apart = values - values.mean()
     of_frames = sum(np.bincount(frames, apart, numbers.max() + 1) for frames in numbers.T)
     squares = np.square(apart).sum()
@@ -116,38 +116,36 @@ def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> f
 
 
 PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
-"""Standard deviations of a camera about which nothing is known but what is given, in the units of ``PARAMETERS``; that
-of the principal point is a share of the width. Colour cameras lie 15 to 32 mm from their depth cameras, on one board
-and mostly beside them; uncorrected focal lengths differ by up to 10 %; a lens that is not corrected bends by some per
-cent; a frame at 30 Hz takes 33 ms."""
+"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share of
+the width. Colour cameras are mounted 15 to 32 mm from depth cameras, mostly sideways. Uncorrected focal lengths differ
+by up to 10 %, uncorrected lenses bend by some per cent, and a frame at 30 Hz takes 33 ms."""
 POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
-"""Standard deviation of the tracked pose of a frame, metres and radians: it binds only directions in which the images
-say nothing."""
+"""Standard deviation of a tracked pose, metres and radians; it constrains only directions that the images do not
+observe."""
 LIGHT_SIGMA = np.array([0.3, 0.1])
 """Standard deviations of gain and offset between two images."""
 CORRELATED = 50.0
-"""Neighbouring points whose errors are correlated and which together count as one against the priors."""
+"""Number of neighbouring points with correlated errors, which count as one point against the priors."""
 COST_SCALES = (0.01, 1.0)
-"""Standard deviations of intensity (0..1) and depth differences (over sigma(z)) for the cost of a pair, fixed so that
-costs are comparable; 0.01 is the noise of common colour cameras."""
+"""Standard deviations of intensity (0..1) and depth differences (over sigma(z)) in the cost of a pair. They are fixed
+so that costs are comparable; 0.01 is the noise of common colour cameras."""
 FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
-"""Those that an adjustment, which estimates them, starts with, and the lower bound of both."""
+"""Initial standard deviations of an adjustment, which estimates them, and the lower bound of both."""
 HUBER = 1.345
 """Constant of the robust weight, standard deviations: 95 % efficiency for Gaussian errors."""
 ITERATIONS, COARSE_ITERATIONS = 6, 4
-"""Largest number of Gauss-Newton steps at the largest image size, and at each of the smaller ones."""
+"""Largest number of Gauss-Newton steps at the largest image size, and at each smaller one."""
 STEADY = 2
-"""Number of steps in a row that must be small: a single one may be before the poses have followed."""
+"""Number of consecutive small steps for convergence; a single step may be small before the poses have followed."""
 FIT_ITERATIONS = 3
-"""Steps per image size by which poses are fitted to a known calibration."""
+"""Steps per image size that fit poses to a known calibration."""
 CONVERGED, CONVERGED_COARSE = 0.01, 0.1
-"""A step below this many prior standard deviations in every parameter ends the largest image size; the smaller ones
-only lead to the next."""
+"""Convergence: step of every parameter in prior standard deviations, at the largest image size and at smaller ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """State of an adjustment, with which another may begin.
+    """State of an adjustment, from which another may start.
 
     Attributes:
         calibration: Current estimate.
@@ -163,13 +161,13 @@ class Fit:
 
     @classmethod
     def tracked(cls, pairs: PairSet, calibration: Calibration) -> "Fit":
-        """The start: poses as tracked, equal light."""
+        """Initial state: tracked poses, equal light."""
         return cls(calibration, pairs.Ts_camera_world, np.tile([1.0, 0.0], (len(pairs), 1)))
 
     def moved(
         self, pairs: PairSet, step: NDArray[np.float64], parts: "_PairSystems", scales: tuple[float, float]
     ) -> "Fit":
-        """After a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
+        """State after a step (13 + 6 F,) of parameters and poses, with the implied step of gains and offsets."""
         return Fit(
             self.calibration.retract(step[:NUM_PARAMETERS]) if step[:NUM_PARAMETERS].any() else self.calibration,
             se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
@@ -183,10 +181,9 @@ class _PairSystems:
     """Normal equations of all pairs, each with its gain and offset eliminated.
 
     Attributes:
-        H, b: (P, n, n) and (P, n) in the parameters and the poses of the first and the second frame, n = 25, or in the
-            poses of a known calibration alone, n = 12.
-        light_slope, light_step: (P, 2, n) and (P, 2), minus the step of gain and offset is light_step + light_slope
-            step.
+        H, b: (P, n, n) and (P, n) in the parameters and the poses of both frames, n = 25, or in the poses alone for a
+            known calibration, n = 12.
+        light_slope, light_step: (P, 2, n) and (P, 2): the step of gain and offset is -(light_step + light_slope step).
         residuals: (2, n) of all pairs, see ``linearize_pair``.
     """
 
@@ -198,7 +195,7 @@ class _PairSystems:
 
     @property
     def begin(self) -> int:
-        """Number of the first unknown."""
+        """Index of the first unknown."""
         return SHARED + 2 * POSE - self.b.shape[1]
 
 
@@ -211,7 +208,7 @@ class _System:
     parts: _PairSystems
 
     def step(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Gauss-Newton step (13 + 6 F,) in all poses and in the parameters that are free."""
+        """Gauss-Newton step (13 + 6 F,) in all poses and in the ``free`` parameters."""
         begin, out = self.parts.begin, np.zeros(len(self.b) + self.parts.begin)
         moves = np.concatenate([free, np.ones(len(out) - NUM_PARAMETERS, dtype=bool)])
         known = moves[begin:]
@@ -222,11 +219,10 @@ class _System:
 class Adjustment:
     """Robust Gauss-Newton over the calibration, the poses of the frames, and the light of the pairs.
 
-    The poses belong to the frames and not to the pairs: every pair of a frame bears on the same pose, which is thereby
-    known several times better than from one pair, and with it the translation between the cameras, which most looks
-    like an error of the poses.
+    Poses belong to frames, not to pairs: all pairs of a frame determine its pose, several times more accurately than
+    one pair. This also determines the translation between the cameras, which resembles a pose error most.
 
-    ``given`` is the calibration as given, the mean of the priors; ``levels`` are the halvings of the colour images,
+    ``given`` is the initial calibration, the mean of the priors. ``levels`` are the halvings of the colour images,
     coarse to fine.
     """
 
@@ -241,8 +237,8 @@ class Adjustment:
     def solve(
         self, pairs: PairSet, start: Fit, free: NDArray[np.bool_], levels: Sequence[int] = ()
     ) -> tuple[Fit, NDArray[np.float64]]:
-        """Fit from coarse to fine over the free parameters (13,) bool, and the covariance (13, 13) that all would
-        have."""
+        """Fit of the ``free`` parameters (13,) bool, coarse to fine, and the covariance (13, 13) with all parameters
+        free."""
         fit, system = start, None
         levels = levels or self.levels
         for level in levels:
@@ -259,10 +255,10 @@ class Adjustment:
         return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
     def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
-        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n).
+        """Fit of the poses alone to the calibration of ``start``, and the last residuals (2, n).
 
-        From coarse to fine, unless the poses were fitted to nearly this calibration: another delay moves what a turning
-        camera sees by more than the finer images tell.
+        ``levels``: image sizes, all by default. Fine images alone suffice if the poses were fitted to nearly this
+        calibration; another delay displaces the image of a turning camera beyond their convergence.
         """
         fit, residuals = start, np.empty((2, 0), np.float32)
         for level in levels or self.levels:
@@ -273,8 +269,8 @@ class Adjustment:
         return replace(fit, scales=new_scales(residuals, COST_SCALES)), residuals
 
     def costs(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> NDArray[np.float64]:
-        """Mean robust costs (2, P) of intensities and depths of pairs whose poses are fitted with the calibration of a
-        fit; arguments as of ``with_poses``."""
+        """Mean robust costs (2, P) of intensities and depths of all pairs, with poses fitted to the calibration of
+        ``start``; see ``with_poses``."""
         _, residuals = self.with_poses(pairs, start, levels)
         scaled = np.abs(residuals) / np.array(COST_SCALES, np.float32)[:, None]
         robust = np.where(scaled < HUBER, scaled * scaled, HUBER * (2 * scaled - HUBER))
@@ -284,9 +280,9 @@ class Adjustment:
         return sums / np.maximum(np.add.reduceat(seen, of_pair, axis=1, dtype=np.int64), 1)
 
     def _covariance(self, pairs: PairSet, system: _System, free: int) -> NDArray[np.float64]:
-        """Sandwich (13, 13) with the scores of frames as its meat."""
+        """Sandwich covariance (13, 13) with the scores of frames."""
         own, rest = slice(0, NUM_PARAMETERS), slice(NUM_PARAMETERS, None)
-        # the poses follow the parameters: Schur complement, for the curvature and for every score
+        # Schur complement of the poses, for the curvature and for every score
         across = solved(system.H[rest, rest], system.H[rest, own]).T
         bread = np.linalg.inv(system.H[own, own] - across @ system.H[rest, own])
         scores = np.zeros((len(pairs.Ts_camera_world), NUM_PARAMETERS))
@@ -302,7 +298,7 @@ class Adjustment:
     def _linearize(
         self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
     ) -> _System:
-        """Normal equations at an image size; those of a ``known`` calibration are only of the poses."""
+        """Normal equations at an image size; for a ``known`` calibration of the poses alone."""
         begin, tracked = SHARED if known else 0, pairs.Ts_camera_world
         parts = self._linearize_pairs(pairs, fit, level, scales, begin)
         places, size = pairs.places[:, begin:] - begin, NUM_PARAMETERS - begin + POSE * len(tracked)
@@ -344,9 +340,15 @@ def _without_light(
     residuals: NDArray[np.float32],
     begin: int,
 ) -> _PairSystems:
-    """Normal equations of all pairs in the parameters and the poses of the frames, of which the first ``begin`` are
-    known, from those (P, 21, 21), (P, 21) of ``linearize_pair``, gains and offsets (P, 2), and the relative poses (P,
-    4, 4) of the first to the second camera."""
+    """Normal equations of all pairs in the parameters and the poses of both frames, without gain and offset.
+
+    Args:
+        H, b: (P, 21, 21), (P, 21) of ``linearize_pair``.
+        light: (P, 2) gains and offsets.
+        Ts: (P, 4, 4) relative poses of the first to the second camera.
+        residuals: (2, n).
+        begin: First unknown; the parameters before it are known.
+    """
     known, of_light, own = slice(begin, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), SHARED - begin
     prior = CORRELATED * LIGHT_SIGMA**-2
     inverse = np.asarray(np.linalg.inv(H[:, of_light, of_light] + np.diag(prior)), np.float64)
@@ -354,7 +356,7 @@ def _without_light(
     light_slope = inverse @ H[:, of_light, known]
     reduced = H[:, known, known] - H[:, known, of_light] @ light_slope
     gradient = b[:, known] - _times(H[:, known, of_light], light_step)
-    # T exp(-d_first) = exp(-Ad(T) d_first) T: a twist of the first frame is one of the relative pose
+    # T exp(-d_first) = exp(-Ad(T) d_first) T: a twist of the first frame becomes a twist of the relative pose
     M = np.zeros((len(Ts), own + POSE, own + 2 * POSE))
     M[:, :own, :own], M[:, own:, -POSE:] = np.eye(own), np.eye(POSE)
     M[:, own:, own : own + POSE] = -se3.adjoint(Ts)
@@ -370,7 +372,7 @@ def _times(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArr
 
 
 def new_scales(residuals: NDArray[np.float32], scales: tuple[float, float]) -> tuple[float, float]:
-    """Robust standard deviations of intensity and depth differences (2, n); as before where none is known."""
+    """Robust standard deviations of intensity and depth differences (2, n); unchanged without finite differences."""
     known = (np.abs(values[np.isfinite(values)]) for values in residuals)
     new = [1.4826 * float(median(r)) if len(r) else scale for r, scale in zip(known, scales, strict=True)]
     return max(new[0], LEAST_SCALE), max(new[1], LEAST_SCALE)

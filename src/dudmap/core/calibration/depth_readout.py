@@ -1,4 +1,4 @@
-"""Rolling shutter of the depth camera: the time that it takes to read out its rows, from pairs of frames."""
+"""Rolling shutter of the depth camera: readout time of its rows, estimated from pairs of frames."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,13 +12,13 @@ from dudmap.core.frames.rolling_shutter import rectified_images
 from dudmap.core.geometry.calibration import Calibration
 
 STEP = 0.02
-"""Readouts of this size, both ways, are compared with none, seconds: sensors at 30 Hz take 10 to 33 ms."""
+"""Initial readouts of the search besides 0, in both directions, seconds: sensors at 30 Hz take 10 to 33 ms."""
 LONGEST = 0.05
-"""Longest readout that is believed where frames are rare, seconds; no image takes longer than the next one to come."""
+"""Longest plausible readout at low frame rates, seconds; at higher ones it is the interval between frames."""
 
 
 def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe:
-    """Keyframe at the time of its middle row, whose depth was read out in so many seconds."""
+    """Keyframe rectified to the time of its middle row, for a depth readout in seconds."""
     added, camera, velocity = readout - keyframe.depth_readout, keyframe.camera, keyframe.velocity
     if added == 0 or not velocity.any():
         return keyframe
@@ -32,24 +32,24 @@ def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe
 
 
 class ReadoutSearch:
-    """Mean robust cost of the pairs of frames of one half of the time, as a function of the readout of their depth.
+    """Mean robust cost of the pairs of one half of the time, as a function of the depth readout.
 
-    The colour camera's own delay and readout, which look much alike, and the poses of the frames are fitted to each
-    readout. The cost is nearly quadratic: its minimum is that of the parabola through three readouts, and then once
-    more of that through the nearest three, none longer than the interval between frames.
+    The delay and readout of the colour camera, which resemble the depth readout, and the poses are fitted to each
+    readout. The cost is nearly quadratic. Its minimum is found by a parabola through three readouts, refined by a
+    second parabola through the nearest three. No readout exceeds the interval between frames.
 
     Args:
-        pairs: Of keyframes.
+        pairs: Pairs of keyframes.
         given: Calibration of the colour camera.
         adjustment: Fits poses and parameters.
-        free: (13,) bool, the parameters of the timing.
-        stride: Every so many points of a keyframe.
+        free: (13,) bool, the timing parameters.
+        stride: Step through the points of a keyframe.
 
     Attributes:
-        given: Calibration with the readout as given, and the timing that goes with it.
-        best: That with the readout of the smallest cost.
-        sigma: Standard deviation of this readout, seconds: a sandwich of the slopes of all pairs' costs; that of any
-            readout up to the longest where the costs have no minimum.
+        given: Calibration with the given readout and its fitted timing.
+        best: Calibration with the readout of the smallest cost.
+        sigma: Standard deviation of this readout, seconds: a sandwich of the slopes of all pairs' costs. Without a
+            minimum it is the standard deviation of a uniform distribution up to the longest readout.
     """
 
     def __init__(
@@ -74,27 +74,26 @@ class ReadoutSearch:
         self.sigma = min(error / bend.sum(), unknown) if bend.sum() > 0 else unknown
 
     def _fitted(self, readout: float) -> tuple[NDArray[np.float64], Calibration]:
-        """Costs (P,) of every pair with a readout in seconds, and the calibration with the timing of the colours that
-        goes with it."""
+        """Costs (P,) of every pair for a readout in seconds, and the calibration with fitted timing."""
         pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
         fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, self._adjustment.levels[-2:])
         return self._adjustment.costs(pairs, fit).sum(axis=0), fit.calibration
 
     def costs(self, calibration: Calibration) -> NDArray[np.float64]:
-        """Costs (2, P) of intensities and depths of every pair with a calibration, such as that of other pairs."""
+        """Costs (2, P) of intensities and depths of every pair for a calibration, such as one from other pairs."""
         pairs = self._rectified(calibration.depth_readout)
         fit, _ = self._adjustment.with_poses(pairs, Fit.tracked(pairs, calibration))
         return self._adjustment.costs(pairs, fit, self._adjustment.levels[-1:])
 
     def _rectified(self, readout: float) -> PairSet:
-        """The pairs of keyframes at the times of their middle rows."""
+        """The pairs, rectified to the times of the middle rows."""
         frames = {id(frame): frame for pair in self._pairs for frame in (pair.first, pair.second)}
         moved = {key: rectified_keyframe(frame, readout) for key, frame in frames.items()}
         return PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)
 
 
 def lowest_readout(costs: dict[float, float], longest: float) -> float:
-    """Minimum, up to ``longest`` both ways, of the parabola through the three readouts around the best one."""
+    """Minimum within +-``longest`` of the parabola through the three readouts around the best one."""
     readouts = np.array(sorted(costs))
     values = np.array([costs[readout] for readout in readouts.tolist()])
     middle = min(max(int(values.argmin()), 1), len(values) - 2)

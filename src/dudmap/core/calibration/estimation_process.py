@@ -1,7 +1,7 @@
-"""Estimation of a calibration in a process of its own while frames are tracked.
+"""Estimation of a calibration in a separate process while frames are tracked.
 
-In a thread it would hold the interpreter for half of its time, and the frames would wait for it on both cores. Both
-processes exchange objects as those of ``multiprocessing`` do, which would run the user's program again in the other.
+A thread would hold the interpreter lock for half of its time and delay the frames. Objects are pickled as in
+``multiprocessing``, which itself would run the user's main module again in the child process.
 """
 
 import os
@@ -18,17 +18,17 @@ from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
 from dudmap.core.calibration.keyframes import ColorKeyframe
 
 received = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue] - typeshed leaves it out
-"""Object that another process of ours sent."""
+"""Unpickles an object from another process of this program."""
 LOWEST = 19
-"""Priority of the process, as of ``nice``, where there is no class of idle processes."""
+"""Priority of the process (``nice``) on systems without idle processes."""
 
 
 class CalibrationProcessWarning(UserWarning):
-    """The process of an estimation could not be used, and this one, whose frames then wait for it, estimates."""
+    """The separate process failed; the estimation runs in this process and delays the frames."""
 
 
 def estimate_beside(estimator: CalibrationEstimator, keyframes: Sequence[ColorKeyframe]) -> "Future[Estimate]":
-    """Result of ``estimator.estimate(keyframes)``, the same in either process."""
+    """Future of ``estimator.estimate(keyframes)``, computed in a separate process, or in a thread if that fails."""
     future: Future[Estimate] = Future()
 
     def work() -> None:
@@ -39,7 +39,7 @@ def estimate_beside(estimator: CalibrationEstimator, keyframes: Sequence[ColorKe
                 warnings.warn(said, CalibrationProcessWarning, stacklevel=1)
                 result = estimator.estimate(keyframes)
             future.set_result(result)
-        except BaseException as error:  # raised where the result is asked for
+        except BaseException as error:  # raised by ``Future.result``
             future.set_exception(error)
 
     Thread(target=work, name="dudmap-calibration", daemon=True).start()
@@ -49,7 +49,7 @@ def estimate_beside(estimator: CalibrationEstimator, keyframes: Sequence[ColorKe
 def _in_other_process(
     estimator: CalibrationEstimator, keyframes: Sequence[ColorKeyframe]
 ) -> tuple[Estimate | None, str]:
-    """The estimate, or None and why there is none."""
+    """The estimate, or None and the reason of the failure."""
     environment = os.environ | {"DUDMAP_THREADS": "1"}
     command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
     try:
@@ -57,7 +57,7 @@ def _in_other_process(
     except OSError as error:
         return None, str(error)
     assert process.stdin is not None
-    with suppress(BrokenPipeError):  # it has ended, and says why; communicate() would write in small pieces
+    with suppress(BrokenPipeError):  # the process has ended; communicate() would write in small pieces
         process.stdin.write(ForkingPickler.dumps((estimator.given, estimator.sensor, list(keyframes))))
     answer, said = process.communicate()
     if process.returncode != 0:
@@ -67,8 +67,8 @@ def _in_other_process(
 
 
 def main() -> None:
-    """Write the estimate of what is read, both as ``_in_other_process`` does."""
-    if sys.platform == "linux":  # it runs while no frame asks for its core, and leaves that at once
+    """Write the estimate for the pickled input of ``_in_other_process`` to stdout."""
+    if sys.platform == "linux":  # runs only while no frame needs its core
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     elif sys.platform != "win32":
         os.nice(LOWEST)

@@ -28,29 +28,28 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "center": ("center_x", "center_y"),
     "geometry": (*PARAMETERS[:6], "log_focal", "center_x", "center_y"),
 }
-"""Parameters that leave their given values together. A translation looks much like a rotation, but only both together
-explain the colours of the near and of the far half of a recording. The principal point, which a crop displaces, is
-tested alone as well: a few seconds prove two parameters where they do not prove nine."""
+"""Parameters that leave their given values together. A translation resembles a rotation, but only both together explain
+near and far colours. The principal point, which a crop displaces, is also tested alone, because a few seconds determine
+two parameters but not nine."""
 TESTED = GROUPS | {"vignetting": ("vignetting",)}
-"""All that is tested and reported: the vignetting changes no place, and is found once the others are."""
+"""All tested and reported groups; vignetting moves no pixel, and is estimated after the others."""
 MIN_PAIRS = 14
-"""Pairs of either half of the time without which nothing is estimated: one more than parameters."""
+"""Smallest number of pairs in each half of the time: one more than parameters."""
 PAIRS = 80
-"""Pairs that decide what is estimated; half as many more, across the halves, enter the result."""
+"""Number of pairs that decide which groups are estimated; the result uses half as many more, across the halves."""
 SHUTTER_PAIRS = 160
-"""Pairs that decide on the readout of the depth, which only turning cameras show clearly."""
+"""Number of pairs that decide on the depth readout, which only turning cameras show clearly."""
 STRIDE = 2
-"""Every so many points of a frame decide what is estimated; all of them enter the result."""
+"""Step through the points of a frame for these decisions; the result uses all points."""
 SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
-"""Group of the readout of the depth, which is estimated before all others, and the name of its parameter."""
+"""Group of the depth readout, which is estimated before all others, and the name of its parameter."""
 MATERIAL = {"timing": 0.01, "lens": 0.01, "center": 0.01, "geometry": 0.1, SHUTTER: 0.01}
-"""Share by which it must decrease: less is not worth leaving the given values, however certain it is. A depth image
-bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
-recording with such a depth (TUM fr1_xyz) the geometry gained up to 7 % and its use made the poses worse; a colour
-camera 25 mm beside gains 19 to 30 %."""
+"""Smallest relative decrease of the cost per group; below it the given values stay, even if the decrease is
+significant. A depth image bent by one or two per cent, as of a Kinect, is partly confused with a displaced colour
+camera. Measured: such depth lets the geometry gain up to 7 %, a colour camera 25 mm away 19 to 30 %."""
 EVIDENCE = 3.0
-"""Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
-pairs of the other half, in the sum of both. Chance does so once in 700 times."""
+"""Smallest decrease of the cost for a group, standard errors. The group is estimated on each half of the time and
+tested on the pairs of the other half; both are summed. Chance exceeds it once in 700 times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +57,10 @@ class Estimate:
     """Result of an estimation.
 
     Attributes:
-        calibration: What was found, with its standard deviations; as given where there is no evidence.
-        evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of pairs that were not used, in
-            standard errors; NaN where there were too few pairs.
-        gain: Share by which the cost of pairs that were not used decreased.
+        calibration: Result with standard deviations; given values for parameters without evidence.
+        evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of held-out pairs in standard
+            errors; NaN if there were too few pairs.
+        gain: Share by which the cost of held-out pairs decreased.
         pairs: Number of pairs.
     """
 
@@ -73,12 +72,12 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Fits to both halves of the time with some free parameters, and the costs of the other halves' pairs with them.
+    """Fits to both halves of the time with some free parameters, and their costs on the other halves.
 
     Attributes:
         free: (13,) bool.
         fits: One per half.
-        costs: (2, P) each, of the intensities and the depths of the pairs of the other half.
+        costs: (2, P) each, of intensities and depths of the pairs of the other half.
         halves: The pairs of either half of the time.
     """
 
@@ -88,7 +87,7 @@ class _Trial:
     halves: list[PairSet]
 
     def gains(self, other: "_Trial") -> NDArray[np.float64]:
-        """Decrease (2, P) of the costs of all pairs from another trial on."""
+        """Decrease (2, P) of the costs of all pairs relative to another trial."""
         return np.concatenate(other.costs, axis=1) - np.concatenate(self.costs, axis=1)
 
     def evidence(self, gains: NDArray[np.float64]) -> float:
@@ -98,21 +97,20 @@ class _Trial:
         return float(gains.sum() / max(error, 1e-12))
 
     def improvement(self, other: "_Trial") -> tuple[float, float]:
-        """Decrease of the cost from another trial on, in standard errors, and as a share, the smaller one of both
-        halves."""
+        """Decrease of the cost relative to another trial: standard errors, and the smaller share of both halves."""
         shares = [1 - after.sum() / before.sum() for before, after in zip(other.costs, self.costs, strict=True)]
         return self.evidence(self.gains(other).sum(axis=0)), float(min(shares))
 
     def proves(self, other: "_Trial", group: str) -> bool:
-        """Whether it explains so much more than another trial, and neither intensities nor depths worse, that a group
-        may leave its given values."""
+        """Whether this trial lets a group leave its given values: the improvement suffices and neither cost gets
+        significantly worse."""
         evidence, share = self.improvement(other)
         worse = min(self.evidence(gains) for gains in self.gains(other)) <= -EVIDENCE
         return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
 
 
 def _halves(keyframes: Sequence[ColorKeyframe], count: int) -> list[list[Pair]]:
-    """Up to ``count`` pairs, from within either half of the time."""
+    """Up to ``count`` pairs, each within one half of the time."""
     middle = len(keyframes) // 2
     return [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
 
@@ -125,21 +123,25 @@ def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
 class CalibrationEstimator:
     """Calibration from pairs of frames of a static scene, by differences of intensity and depth.
 
-    A point X of the depth image of frame i is seen by both colour cameras; with the calibration theta, the projection
-    pi(theta, xi, X) of ``Calibration`` with the camera's velocity xi, and the relative pose T of the depth cameras,
+    Both colour cameras see a point X of the depth image of frame i. With the calibration theta, the projection
+    pi(theta, xi, X) of ``Calibration`` at camera velocity xi, and the relative pose T of the depth cameras, the
+    residuals are
 
         r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
 
-    An error of theta moves the colours of both frames, but not alike: by a turn of the camera it is turned along, with
-    the velocities it changes. theta is common to all pairs, T follows from the poses of both frames, which are unknowns
-    too, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given
-    values. The covariance is a sandwich with one score per frame, the sum of those of its pairs: it admits that the
-    pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
-    for pairs counted twice). What both halves of the time differ by beyond that, such as by a bent depth image, makes
-    all standard deviations larger (Birge 1932). How far a fit of all parameters is from those in use is added: given
-    values stay until others are proven, however wrong they may be, and bend those that are estimated beside them.
+    An error of theta displaces the colours of both frames differently: it rotates with the camera and varies with its
+    velocity. theta is common to all pairs, T follows from the unknown poses of both frames, and g and o belong to the
+    pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given values.
 
-    ``given`` is the calibration as given; 2 ``workers`` (threads) do both halves of the time at once.
+    The covariance has three parts:
+
+    * A sandwich with one score per frame, the sum over its pairs, because errors within a pair and within a frame are
+      correlated (Aronow, Samii and Assenova 2015, without the correction for pairs counted twice).
+    * A factor for differences between both halves of the time beyond it, for example by a bent depth image (Birge
+      1932).
+    * The difference between a fit of all parameters and the result, because wrong given values bias the estimated ones.
+
+    ``given`` is the initial calibration; 2 ``workers`` (threads) process both halves of the time in parallel.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
@@ -149,12 +151,11 @@ class CalibrationEstimator:
         self.adjustment = Adjustment(given, sensor)
 
     def estimate(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
-        """Calibration that explains pairs of frames, which are in the order of time, as far as they prove it.
+        """Calibration from keyframes in order of time; parameters without evidence keep their given values.
 
-        Groups of parameters leave the given values one after the other, of those that prove themselves that with the
-        most evidence first: their estimate from either half of the time predicts the pairs of the other half better.
-        What merely absorbs errors of another kind, such as a bent depth image, does so differently from place to place
-        and fails.
+        Groups of parameters leave the given values one by one, most evidence first. Evidence is a better prediction of
+        one half's pairs by an estimate from the other half. A group that only absorbs other errors, such as a bent
+        depth image, varies from place to place and fails this test.
         """
         halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
@@ -173,8 +174,11 @@ class CalibrationEstimator:
         )
 
     def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
-        """Readout of the depth in seconds, as given where another one is not proven, its standard deviation, the
-        evidence for another one, and the share by which the cost decreased with it."""
+        """Depth readout in seconds, its standard deviation, the evidence for a new readout, and the relative decrease
+        of the cost.
+
+        The given readout is returned unless another one is proven.
+        """
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -188,18 +192,19 @@ class CalibrationEstimator:
         found, is_proven = np.array([one.best.depth_readout, other.best.depth_readout]), after.proves(before, SHUTTER)
         readout = float(found.mean()) if is_proven else given.depth_readout
         apart = np.sqrt(np.mean(np.square(found - readout)))
-        # of a nearly quadratic cost, a decrease by so many standard errors gives its place to half as many parts
+        # for a nearly quadratic cost, a decrease by E standard errors determines the minimum to 1 / (2 E) of its
+        # distance
         unsure = (readout - given.depth_readout) / (2 * evidence) if is_proven else np.hypot(one.sigma, other.sigma) / 2
         sigma = float(np.hypot(apart, unsure))
         return readout, sigma, evidence, gain if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
-        """Calibration of the colour camera beside a depth camera with a known readout."""
+        """Calibration of the colour camera for a known depth readout."""
         rectified = CalibrationEstimator(self.given.with_depth_readout(depth_readout), self.sensor, self.workers)
         return rectified._beside_rectified([rectified_keyframe(frame, depth_readout) for frame in keyframes])
 
     def _beside_rectified(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
-        """Calibration of the colour camera beside a depth camera whose images are rectified."""
+        """Calibration of the colour camera for rectified depth images."""
         middle = len(keyframes) // 2
         within = _halves(keyframes, PAIRS)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
@@ -230,8 +235,8 @@ class CalibrationEstimator:
         return Estimate(found, evidence, gain, len(pairs))
 
     def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
-        """Vignetting, as given where another is not proven by the other half of the time, its standard deviation, which
-        admits what both halves differ by, and the evidence for it."""
+        """Vignetting (the given value unless another is proven), its standard deviation with the difference of both
+        halves, and the evidence."""
         given = self.given.vignetting
         halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
         found = [half.fitted()[0] for half in halves]
@@ -243,8 +248,8 @@ class CalibrationEstimator:
         return vignetting if is_proven else given, sigma, evidence
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
-        """Factor (at least 1) by which standard deviations are too small: the root mean square difference between the
-        parameters from both halves of the time, in standard deviations."""
+        """Factor (at least 1) for standard deviations: rms difference of the parameters of both halves, in standard
+        deviations."""
         everything, finest = np.ones(NUM_PARAMETERS, dtype=bool), self.adjustment.levels[-1:]
         with ThreadPoolExecutor(self.workers) as pool:
             solved = pool.map(lambda n: self.adjustment.solve(halves[n], starts[n], everything, finest), (0, 1))
@@ -254,7 +259,7 @@ class CalibrationEstimator:
         return max(1.0, np.sqrt(squares / NUM_PARAMETERS))
 
     def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
-        """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
+        """Proven groups, added one by one and finally jointly, and the evidence of all groups."""
         trial, evidence = start, dict[str, float]()
         while rest := [name for name, members in GROUPS.items() if not trial.free[mask_of(members)].all()]:
             trials = {name: self._trial(halves, trial, [name]) for name in rest}
@@ -265,7 +270,7 @@ class CalibrationEstimator:
             best = max(proven, key=lambda name: evidence[name])
             trial = trials[best]
         if "geometry" in rest and "center" in rest:
-            rest.remove("center")  # which is a part of it
+            rest.remove("center")  # part of the geometry
         if len(rest) > 1:
             trial, names = self._together(halves, trial, rest)
             evidence |= names
@@ -276,10 +281,10 @@ class CalibrationEstimator:
     def _together(
         self, halves: list[PairSet], before: "_Trial", names: Sequence[str]
     ) -> tuple["_Trial", dict[str, float]]:
-        """Groups none of which explains anything without the others, and the evidence of each beside the others.
+        """Groups that explain the pairs only jointly, and the evidence of each given the others.
 
-        While the focal length is wrong, no delay explains what a delay does, and the other way round. All groups are
-        freed; those without which the others do as well are given up one by one.
+        With a wrong focal length no delay improves the cost, and vice versa. All groups are freed; groups without
+        evidence are then fixed again one by one.
         """
         trial, names = self._trial(halves, before, names), list(names)
         while len(names) > 1 and all(trial.proves(before, name) for name in names):
@@ -294,13 +299,13 @@ class CalibrationEstimator:
         return before, {}
 
     def _trial(self, halves: list[PairSet], before: "_Trial", names: Sequence[str]) -> "_Trial":
-        """Fits in which groups of parameters are free in addition to those that were."""
+        """Fits with the named groups free in addition to the free parameters of ``before``."""
         free = before.free | mask_of([member for name in names for member in GROUPS[name]])
         return self._freed(halves, before.fits, free)
 
     def _freed(self, halves: list[PairSet], starts: list[Fit], free: NDArray[np.bool_]) -> "_Trial":
-        """Fits of both halves with some free parameters, from these starts."""
-        # only the geometry can displace the colours by so much that the smallest images have to begin
+        """Fits of both halves with some free parameters, from given starts."""
+        # only the geometry can displace colours enough to need the smallest images
         levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
 
         def fitted(n: int) -> tuple[Fit, NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Frames from which the calibration is estimated."""
+"""Frames for the estimation of the calibration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,27 +17,27 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful
 
 GEOMETRY_WIDTH = 160
-"""Width of the depth images that are compared, pixels."""
+"""Width of the compared depth images, pixels."""
 COLOR_WIDTHS = (80, 160, 320)
-"""Widths of the colour images that are compared, coarse to fine, pixels."""
+"""Widths of the compared colour images, coarse to fine, pixels."""
 POINT_STRIDE = 3
-"""Every so many pixels, across and down, are points that are compared."""
+"""Step between the compared points, across and down, pixels."""
 SAME_SURFACE = 0.03
-"""Depth differences below this share of the depth belong to one surface."""
+"""Largest depth difference on one surface, as a share of the depth."""
 
 
 BAND = 1.0, 4.0
-"""Standard deviations of the Gaussians whose difference filters the intensities, pixels. Vignetting, shading and
-exposure change slowly over the image and stay with the camera, which would look like a displacement of the colours;
-noise and detail of single pixels differ from view to view and spoil the derivatives."""
+"""Standard deviations of the two Gaussians of the intensity filter (difference of Gaussians), pixels. Vignetting,
+shading and exposure vary slowly and stay with the camera, which resembles a displacement of the colours. Noise and
+single-pixel detail differ between views and spoil the derivatives."""
 BESIDE = 2
-"""Pixels beside what moves that are taken for it, since its outline is known no better."""
+"""Dilation of moving pixels, because their outline is uncertain, pixels."""
 INTERVAL = 0.1
-"""Time between two keyframes at the start, seconds."""
+"""Initial time between two keyframes, seconds."""
 MAX_KEYFRAMES = 60
 """Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
 MAX_GAP = 0.45
-"""Largest time between the neighbours of a keyframe for its velocity to be known, seconds: two intervals at 5 Hz."""
+"""Largest time between the neighbours of a keyframe for a known velocity, seconds: two intervals at 5 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,18 +46,18 @@ class ColorKeyframe:
 
     Attributes:
         timestamp: Of the depth image, s.
-        color_offset: Time stamp of the colour image minus that of the depth image, s.
-        camera: Of ``depth``.
-        depth: (h, w) float32, metres, 0 where there is no reading or something moves.
+        color_offset: Time stamp of the colour image minus time stamp of the depth image, s.
+        camera: Camera of ``depth``.
+        depth: (h, w) float32, metres, 0 = moving or no measurement.
         points: (n, 3) float32 in the camera frame, away from depth edges.
         tangents: (n, 6) float32, two directions of the surface at each point.
-        intensities: (h, w) float32 of the colour image as recorded, filtered with ``BAND``, coarse to fine; NaN where
-            something moves.
-        brightness: (h, w) float32 of the smallest of them, not filtered.
+        intensities: (h, w) float32 of the recorded colour image, filtered with ``BAND``, coarse to fine; NaN at moving
+            pixels.
+        brightness: (h, w) float32, unfiltered intensities of the smallest size.
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
-        depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
-        interval: Mean time from one to the next of the three frames that give the velocity, seconds.
+        depth_readout: Rolling-shutter readout for which the depth was rectified, seconds.
+        interval: Mean interval between the three frames that give the velocity, seconds.
     """
 
     timestamp: float
@@ -75,18 +75,20 @@ class ColorKeyframe:
 
 
 def halvings_to(width: int, camera: Camera) -> int:
-    """Number of halvings after which an image is about so wide."""
+    """Number of halvings that give about this width."""
     return max(0, round(np.log2(camera.width / width)))
 
 
 def color_levels(camera: Camera) -> list[int]:
-    """Halvings of the colour images that are compared, coarse to fine; fewer for small images."""
+    """Halvings of the compared colour images, coarse to fine; fewer for small images."""
     return sorted({halvings_to(width, camera) for width in COLOR_WIDTHS}, reverse=True)
 
 
 def levels_of(observation: Observation, given: Calibration) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
-    """Depth (h, w) of the observation that is compared, and its recorded intensities (h, w), coarse to fine; ``given``
-    is the calibration of the colour images."""
+    """Compared depth (h, w) of an observation, and its recorded intensities (h, w), coarse to fine.
+
+    ``given`` is the calibration of the colour images.
+    """
     depth, _ = observation.halved(halvings_to(GEOMETRY_WIDTH, observation.camera))
     return depth, [recorded_intensity(observation, number) for number in color_levels(given.camera)]
 
@@ -99,9 +101,11 @@ def keyframe(
     dynamic_mask: NDArray[np.bool_],
     interval: float = MAX_GAP / 2,
 ) -> ColorKeyframe:
-    """Keyframe of a preprocessed frame at a pose (4, 4) with a velocity (6,), twist per second in camera axes, without
-    the pixels (H, W) that move, in either image; ``given`` is the calibration of the colour images as recorded, and
-    ``interval`` as of ``ColorKeyframe``."""
+    """Keyframe of a preprocessed frame, without the moving pixels of either image.
+
+    ``T_world_camera``: (4, 4). ``velocity``: (6,) twist per second, camera axes. ``dynamic_mask``: (H, W). ``given``:
+    calibration of the recorded colour images. ``interval``: see ``ColorKeyframe``.
+    """
     import cv2
 
     camera = observation.camera.scaled(halvings_to(GEOMETRY_WIDTH, observation.camera))
@@ -131,8 +135,8 @@ def keyframe(
 def _seen_moving(
     moving: NDArray[np.bool_], distance: float, camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of a colour image beside which, or where, it shows the ``moving`` pixels of the depth image, which
-    are ``distance`` metres away."""
+    """Pixels (h, w) of a colour image that show the ``moving`` depth pixels at ``distance`` metres, dilated by
+    ``BESIDE``."""
     import cv2
 
     plane = T_color_depth[:3, :3] + np.outer(T_color_depth[:3, 3], (0, 0, 1 / distance))
@@ -142,7 +146,7 @@ def _seen_moving(
 
 
 def _filtered(image: NDArray[np.float32], moving: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Intensities (h, w) filtered with ``BAND``, into which nothing of the ``moving`` pixels enters, which are NaN."""
+    """Intensities (h, w) filtered with ``BAND`` without the ``moving`` pixels, which become NaN."""
     import cv2
 
     still = (~moving).astype(np.float32)
@@ -154,7 +158,7 @@ def _filtered(image: NDArray[np.float32], moving: NDArray[np.bool_]) -> NDArray[
 
 
 def _off_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose eight neighbours are readings of the same surface."""
+    """Pixels (h, w) whose 3x3 neighbourhood has depth on one surface."""
     import cv2
 
     window = np.ones((3, 3), np.uint8)
@@ -172,9 +176,11 @@ def central_velocity(
 
 
 class KeyframeCollector(Stateful):
-    """Collects keyframes, in the order of time, evenly over the time since tracking began; ``given`` is the calibration
-    of the colour images. ``max_gap`` is the largest time between the two neighbours of a keyframe, seconds, if less
-    than ``MAX_GAP``."""
+    """Collects keyframes in order of time, evenly since tracking began.
+
+    ``given`` is the calibration of the colour images. ``max_gap`` limits the time between the two neighbours of a
+    keyframe, seconds, below ``MAX_GAP``.
+    """
 
     _taken: Remembered[list[Callable[[], ColorKeyframe]]]
     _interval: Remembered[float]
@@ -190,14 +196,14 @@ class KeyframeCollector(Stateful):
 
     @property
     def keyframes(self) -> list[ColorKeyframe]:
-        """The keyframes so far; those that another thread is making are waited for."""
+        """The keyframes so far; waits for keyframes that another thread computes."""
         return [taken() for taken in self._taken]
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
     ) -> None:
-        """Take note of a tracked frame, its pose (4, 4) and the pixels (H, W) that move; the one before may become a
-        keyframe, since its velocity is now known."""
+        """Add a tracked frame, its pose (4, 4) and its moving pixels (H, W). The previous frame may become a keyframe,
+        because its velocity is now known."""
         now = observation.timestamp
         if observation.ignored is not None:
             dynamic_mask = dynamic_mask | observation.ignored
@@ -206,7 +212,7 @@ class KeyframeCollector(Stateful):
             before, due = self._before, self._latest + self._interval - 1e-3
             if before is not None and now - before[0] <= self.max_gap and middle.timestamp >= due:
                 velocity, interval = central_velocity(before, (now, T_world_camera)), (now - before[0]) / 2
-                levels_of(middle, self.given)  # cached there by this thread, which may use them in the meantime
+                levels_of(middle, self.given)  # fill the observation's cache in this thread, which may use it meanwhile
                 self._taken.append(submit(partial(keyframe, middle, self.given, T, velocity, mask, interval)))
                 self._latest = middle.timestamp
                 if len(self._taken) > MAX_KEYFRAMES:
@@ -216,11 +222,11 @@ class KeyframeCollector(Stateful):
         self._pending = observation, T_world_camera, dynamic_mask
 
     def interrupt(self) -> None:
-        """Tracking was lost, or the poses jumped: the velocity across is not known."""
+        """Forget the neighbours after a lost frame or a jump of the pose, because the velocity across it is unknown."""
         self._before = self._pending = None
 
     def clear(self) -> None:
-        """Another map has begun, whose poses cannot be compared."""
+        """Forget all keyframes when another map begins, because their poses are not comparable."""
         self.interrupt()
         self._taken.clear()
         self._interval, self._latest = INTERVAL, -np.inf

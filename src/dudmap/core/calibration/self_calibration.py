@@ -1,4 +1,4 @@
-"""Calibration of the colour camera while it moves, and what changes when a better one is found."""
+"""Calibration of the colour camera during tracking, and the switch to a better one."""
 
 from concurrent.futures import Future
 
@@ -19,28 +19,27 @@ from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.frame_view import FrameView
 
 ATTEMPTS = (120, 240, 480, 960)
-"""Numbers of tracked frames after which the calibration is estimated from the keyframes so far: after the four seconds
-of hand-held motion that show every fault, and each time after twice as long, as more was seen."""
+"""Numbers of tracked frames after which the calibration is estimated. Four seconds of hand-held motion show every
+error; later estimates use twice as many frames each."""
 USED_AFTER = 60
-"""Tracked frames between the beginning of an estimation and the use of its result: two seconds at 30 Hz, in which a
-process of its own on a second core has estimated."""
+"""Tracked frames between start and use of an estimate: two seconds at 30 Hz, enough for a process on a second core."""
 
 
 class SelfCalibration(Stateful):
-    """Estimates the calibration from time to time while frames are tracked.
+    """Estimates the calibration repeatedly during tracking.
 
-    Each estimate starts from the calibration as given. It takes all keyframes of the current submap, with their colours
-    as recorded, so that it does not depend on the calibration they were tracked with. It runs in another process.
+    Each estimate starts from the given calibration. It uses all keyframes of the current submap with recorded colours,
+    so that it does not depend on the calibration at tracking time. It runs in another process.
 
     Args:
-        given: The calibration to begin with.
+        given: The initial calibration.
         sensor: Noise of the sensor.
-        live: Use a result as soon as it exists. Otherwise it is used ``USED_AFTER`` frames later, on every machine; a
-            frame waits there only for a result that is late.
+        live: Use a result as soon as it exists. Otherwise it is used ``USED_AFTER`` frames later, on every machine;
+            only a late result makes a frame wait.
 
     Attributes:
         estimate: The last finished estimate; None before.
-        waits: Frames that waited for a result.
+        waits: Number of frames that waited for a result.
     """
 
     estimate: Remembered[Estimate | None] = None
@@ -71,8 +70,8 @@ class SelfCalibration(Stateful):
         dynamic_mask: NDArray[np.bool_],
         submap: int,
     ) -> None:
-        """Take note of a tracked frame at a pose (4, 4) in the world of a submap, of which the pixels ``dynamic_mask``
-        (H, W) move, and begin an estimation if it is time."""
+        """Add a tracked frame with its pose (4, 4) in the world of a submap and moving pixels (H, W); start an
+        estimation if due."""
         self._frames += 1
         if not self._attempts:
             return
@@ -88,13 +87,13 @@ class SelfCalibration(Stateful):
                 self._collector.clear()
 
     def interrupt(self, *, moved: bool = False) -> None:
-        """A frame was not tracked; or ``moved``, the poses so far were corrected and those to come do not fit them."""
+        """Handle a lost frame, or (``moved``) a correction of past poses, which later poses do not fit."""
         if moved:
             self._collector.clear()
         self._collector.interrupt()
 
     def found(self) -> Calibration | None:
-        """A calibration that is to be used from the next frame on; None if the one in use stays."""
+        """A calibration for all frames after this one; None to keep the present one."""
         if self._running is None or not (self._running.done() if self.live else self._frames >= self._used_from):
             return None
         self.waits += not self._running.done()
@@ -103,13 +102,13 @@ class SelfCalibration(Stateful):
 
 
 class ColorCalibration(Stateful):
-    """Calibrates the colour camera while frames are tracked, and repaints the maps with what is found.
+    """Calibrates the colour camera during tracking, and repaints the maps with the result.
 
     Args:
         config: Whether to calibrate, and the noise of the sensor.
-        camera: Of the depth images, without lens distortion.
-        start: The calibration to begin with; None for colour that is registered to depth. One that was estimated, whose
-            standard deviations are known, is kept.
+        camera: Camera of the depth images, without lens distortion.
+        start: The initial calibration; None for colour registered to depth. An estimated one with known standard
+            deviations is kept.
         atlas: The maps and the stored frames.
         color_motion: Registers the colours of the frames.
         live: Use a calibration as soon as it is estimated.
@@ -134,7 +133,7 @@ class ColorCalibration(Stateful):
         self._color_motion = color_motion
         self._estimation = None
         atlas.depth_late = self._start.depth_late
-        if atlas.history is None:  # nothing to repaint with
+        if atlas.history is None:  # no frames for repainting
             return
         atlas.history.registered = self._registered
         if config.sensor.self_calibration and not np.isfinite(self._start.sigma).any():
@@ -142,7 +141,7 @@ class ColorCalibration(Stateful):
 
     @property
     def waits(self) -> int:
-        """Frames that waited for a calibration."""
+        """Number of frames that waited for a calibration."""
         return 0 if self._estimation is None else self._estimation.waits
 
     @property
@@ -162,7 +161,7 @@ class ColorCalibration(Stateful):
             corrected: A loop was closed with the frame.
 
         Returns:
-            Whether the next frame is the first with a new calibration: the maps have been repainted with it.
+            Whether the next frame is the first with a new calibration; the maps have been repainted with it.
         """
         if self._estimation is None or (self._estimation.finished and self._next is None):
             return False
@@ -181,12 +180,12 @@ class ColorCalibration(Stateful):
             return True
 
     def interrupt(self) -> None:
-        """A frame was not tracked."""
+        """Handle a lost frame."""
         if self._estimation is not None:
             self._estimation.interrupt()
 
     def _registered(self, stored: Frame) -> Frame:
-        """A stored frame with its colours registered with the newest calibration."""
+        """A stored frame with colours registered by the newest calibration."""
         velocity = self._atlas.velocity_at(stored.timestamp)
         calibration = self._next or self._color_motion.calibration
         return self._color_motion.frame_with_colors(stored, self._camera, velocity, calibration)

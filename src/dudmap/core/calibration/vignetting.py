@@ -1,4 +1,4 @@
-"""Estimation of the vignetting of a colour camera from the brightness of pairs of frames."""
+"""Estimation of a colour camera's vignetting from the brightness of pairs of frames."""
 
 from dataclasses import dataclass
 
@@ -12,26 +12,26 @@ from dudmap.core.geometry.camera import Camera
 
 Values = NDArray[np.float64]
 EXPOSED = 0.06, 0.94
-"""Intensities that are compared: darker ones have an unknown black level, brighter ones are saturated."""
+"""Range of compared intensities: darker ones have an unknown black level, brighter ones are saturated."""
 SCALE = 0.02
 """Scale of the robust weights: the noise of common colour cameras, 0.01, at half of the full brightness."""
 ITERATIONS = 8
-"""Steps of the reweighted least squares, which then changes by less than a thousandth."""
+"""Iterations of the reweighted least squares, after which the result changes by less than a thousandth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Brightness:
-    """Brightness of the same surfaces in both frames of P pairs.
+    """Brightness of common surfaces in both frames of P pairs.
 
-    Where a surface reflects alike to both sides, the logarithm of the ratio of both brightnesses is that of the two
-    exposures, less the vignetting times the difference of the squared distances to the middle of the image. This holds
-    for a wall without texture even where the pose of the pair is wrong.
+    For a surface that reflects equally to both sides, the log ratio of both brightnesses equals the log ratio of the
+    exposures, minus the vignetting times the difference of the squared distances to the image centre. On an untextured
+    wall this holds even for wrong poses.
 
     Attributes:
         numbers: (P, 2) int64, the frames of every pair.
         pair: (n,) int64, the pair of every point.
-        ratio: (n,) logarithm of the brightness in the second frame over that in the first.
-        outwards: (n,) squared distance to the middle in the second frame less that in the first; 1 at the corners.
+        ratio: (n,) logarithm of the brightness in the second frame over the first.
+        outwards: (n,) squared distance to the centre in the second frame minus the first; 1 at the corners.
     """
 
     numbers: NDArray[np.int64]
@@ -41,7 +41,7 @@ class Brightness:
 
     @classmethod
     def of(cls, pairs: PairSet, fit: Fit) -> "Brightness":
-        """Of pairs of frames with the poses and the calibration of a fit."""
+        """Brightness of pairs of frames with the poses and the calibration of a fit."""
         calibration = fit.calibration
         places = se3.inverse(fit.Ts_camera_world)
         camera = calibration.camera.resized(*pairs.brightness.shape[:0:-1])
@@ -62,7 +62,7 @@ class Brightness:
         return cls(pairs.numbers, *(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def fitted(self) -> tuple[float, float]:
-        """Vignetting, and its standard deviation, for which the points of a frame err together; NaN for none."""
+        """Vignetting and its standard deviation with correlated errors per frame; NaN without data."""
         weights, residual, outwards, found = np.ones(len(self.ratio)), self.ratio, self.outwards, 0.0
         for _ in range(ITERATIONS):
             outwards, ratio = self._centred(self.outwards, weights), self._centred(self.ratio, weights)
@@ -83,7 +83,7 @@ class Brightness:
         return np.bincount(self.pair, -np.log(weights), len(self.numbers)) / count
 
     def _centred(self, values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (n,) less the weighted mean of their pair, the difference of its exposures."""
+        """Values (n,) minus the weighted mean of their pair, which is the difference of its exposures."""
         total = np.maximum(np.bincount(self.pair, weights, len(self.numbers)), 1e-12)
         return values - (np.bincount(self.pair, weights * values, len(self.numbers)) / total)[self.pair]
 
@@ -99,15 +99,15 @@ def _moved(T: Values, points: Values) -> Values:
 
 
 def _seen(brightness: NDArray[np.float32], camera: Camera, points: Values) -> tuple[Values, Values]:
-    """Brightness at points (n, 3) in the frame of a colour camera, NaN where there is none, and their squared distance
-    to the middle of the image, 1 at the corners."""
+    """Brightness at points (n, 3) in the frame of a colour camera, NaN outside the image, and their squared distance to
+    the image centre, 1 at the corners."""
     pixels = camera.project(points)
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     return _sampled(brightness, pixels), np.sum((pixels - middle) ** 2, axis=1) / np.sum(middle**2)
 
 
 def _sampled(image: NDArray[np.float32], pixels: Values) -> Values:
-    """Values between the pixels of an image at places (n, 2), NaN outside of it."""
+    """Bilinear samples of an image at pixels (n, 2), NaN outside."""
     import cv2
 
     u, v = np.nan_to_num(pixels, nan=-1e3).astype(np.float32).T.copy()
