@@ -47,7 +47,7 @@ class Named(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> "Named":
-        """Estimate of ``NAME=PATH``, or of a path, whose last part without an ending is the name."""
+        """Parse ``NAME=PATH``, or a path, whose last part without its ending becomes the name."""
         name, equals, path = text.partition("=")
         if equals and name and path and not Path(text).exists():
             return cls(name, Path(path))
@@ -56,14 +56,14 @@ class Named(NamedTuple):
 
 
 class Manner(NamedTuple):
-    """How estimates are compared with the reference: options of ``dudmap evaluate trajectory``.
+    """Comparison of estimates with the reference: options of ``dudmap evaluate trajectory``.
 
     Attributes:
-        formats: Of estimate and reference; None: recognised.
-        clock: Times of poses that have none.
+        formats: Formats of estimate and reference; None: recognised.
+        clock: Times of poses without times.
         align: As for ``ate``.
         max_difference: Largest time difference of associated poses, seconds.
-        seconds: Added to the times of the estimate; None: the best agreement.
+        seconds: Offset added to the times of the estimate; None: the best agreement.
         scale: Whether to fit the scale of the estimate first.
     """
 
@@ -80,13 +80,13 @@ class Score:
     """An estimate and its errors.
 
     Attributes:
-        name: Of its method.
+        name: Name of its method.
         file: Its trajectory.
         run: Its run folder; None if the trajectory was named directly.
-        figures: By name and unit, for tables and JSON.
-        found: The estimate with offset and scale taken out.
-        true: The reference; None if there is none.
-        manner: How both were compared.
+        figures: Metrics by name and unit, for tables and JSON.
+        found: The estimate after correction of time offset and scale.
+        true: The reference, or None.
+        manner: Options of the comparison.
         remarks: Sentences on how the files were read.
     """
 
@@ -114,7 +114,7 @@ class Score:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Figures for one row of a table."""
+        """Metrics for one row of a table."""
         return {"name": self.name} | {k: v for k, v in self.figures.items() if not isinstance(v, list)}
 
     @property
@@ -124,7 +124,7 @@ class Score:
 
 
 def score(estimate: Path, name: str, reference: Path | None, manner: Manner) -> Score:
-    """Score of a run folder or a file of poses against the reference, or of its path alone if there is none."""
+    """Score of a run folder or a file of poses against the reference; without one, metrics of the path alone."""
     file, run = find_trajectory(estimate)
     truth = find_reference(reference, run)
     estimated, known = load_trajectories(file, truth, manner.formats, manner.clock)
@@ -169,5 +169,5 @@ def compare(estimates: list[Named], reference: Path, manner: Manner) -> list[Sco
 
 
 def rounded(value: float, digits: int = 9) -> float | None:
-    """Figure for JSON: None if it is not finite."""
+    """Rounded metric for JSON: None if it is not finite."""
     return round(float(value), digits) if isfinite(value) else None

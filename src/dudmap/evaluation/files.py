@@ -1,6 +1,6 @@
 """Input files of an evaluation: trajectory, mesh and reference of a run folder, a recording, or named directly.
 
-What is missing or malformed is a ``DatasetError``, and a ``MapError`` if it is a mesh.
+Missing or malformed files raise ``DatasetError``, meshes ``MapError``.
 """
 
 from pathlib import Path
@@ -42,7 +42,7 @@ def find_reference(reference: Path | None, run: Path | None) -> Path | None:
     """True trajectory: a file, a recording, or without ``reference`` the groundtruth.txt of the run folder.
 
     Returns:
-        A file, or the folder or archive of a recording whose format knows its truth by other files.
+        A file, or the folder or archive of a recording whose format has its ground truth in other files.
     """
     if reference is not None:
         path = reference / "groundtruth.txt" if reference.is_dir() else reference
@@ -56,28 +56,28 @@ def find_reference(reference: Path | None, run: Path | None) -> Path | None:
 
 
 class Loaded(NamedTuple):
-    """A trajectory, and the format it was read in, for people."""
+    """A trajectory, and the name of its format for messages."""
 
     trajectory: Trajectory
     format: str
 
 
 class Clock(NamedTuple):
-    """Times of poses that have none: a file with a time in each row or a recording, or a rate in 1/s."""
+    """Times of poses without times: a file with a time in each row or a recording, or a rate in 1/s."""
 
     times: Path | None = None
     fps: float | None = None
 
 
 BONN = "bonn"
-"""Name of the format of Bonn's groundtruth.txt, a further one besides ``pose_files.FORMATS``."""
+"""Name of the format of Bonn's groundtruth.txt, in addition to ``pose_files.FORMATS``."""
 
 
 def load_reference(path: Path) -> Trajectory:
-    """True camera poses of a path that ``find_reference`` returned.
+    """True camera poses of a path from ``find_reference``.
 
-    The groundtruth.txt of a recording is read as its format wants it: some data sets store the poses of markers, of a
-    robot, or with other axes.
+    The groundtruth.txt of a recording is read by its format, because some data sets store marker poses, robot poses or
+    other axes.
     """
     return _with_times(path, _read_reference(path, None), None, Clock()).trajectory
 
@@ -88,16 +88,16 @@ def load_trajectories(
     formats: tuple[str | None, str | None],
     clock: Clock,
 ) -> tuple[Loaded, Loaded | None]:
-    """Estimate, and true camera poses of a path that ``find_reference`` returned.
+    """Estimate, and true camera poses of a path from ``find_reference``.
 
-    Poses without times (KITTI) take the times of ``clock``. Without it they take the times of the frames of the
-    reference's recording, or else of the other trajectory, if there are as many.
+    Poses without times (KITTI) take the times of ``clock``. Without it, they take the frame times of the reference's
+    recording, or else the times of the other trajectory, if the numbers match.
 
     Args:
         estimate: A file.
-        reference: A file or a recording, if there is one.
-        formats: Names of the formats of both, of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
-        clock: Times of poses that have none.
+        reference: A file or a recording, or None.
+        formats: Names of both formats, of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
+        clock: Times of poses without times.
 
     Raises:
         ConfigError: The name of a format is unknown, or ``clock`` has two sources or is not needed.
@@ -117,7 +117,7 @@ def load_trajectories(
 
 
 class _Read(NamedTuple):
-    """Poses as read, their format for people, and the recording that they belong to, if there is one."""
+    """Poses as read, the name of their format, and their recording, if any."""
 
     file: PoseFile
     format: str
@@ -127,13 +127,13 @@ class _Read(NamedTuple):
         """Times of the frames of the recording, and of the poses."""
         try:
             frames = None if self.recording is None else open_sequence(self.recording).timestamps
-        except DatasetError:  # its poses were read, and the frames are but one source of times
+        except DatasetError:  # the frames are only one source of times
             frames = None
         return [times for times in (frames, self.file.timestamps) if times is not None]
 
 
 def _poses(path: Path, name: str | None, option: str) -> tuple[PoseFile, str]:
-    """Poses of a file without rows that are none, and their format; marker poses of Bonn become camera poses."""
+    """Poses of a file, skipping rows without a pose, and their format; Bonn's marker poses become camera poses."""
     file = read_poses(path, "tum" if name == BONN else name, optional=True, option=option)
     if name != BONN:
         return file, file.format.name
@@ -157,7 +157,7 @@ def _read_reference(path: Path, name: str | None) -> _Read:
 
 
 def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> Loaded:
-    """Trajectory of poses with their own times, or with the times that ``load_trajectories`` names."""
+    """Trajectory of poses with their own times, or with the times of ``load_trajectories``."""
     file, count = read.file, len(read.file.Ts_world_camera)
     if file.timestamps is not None:
         return Loaded(_trajectory(path, file.timestamps, file), read.format)
@@ -205,10 +205,10 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | None:
-    """Rigid motion (4, 4) of a run's first pose onto the true one; None unless both folders hold a trajectory.
+    """Rigid motion (4, 4) of a run's first pose onto the true one; None unless both folders have a trajectory.
 
-    The world frame of a run is its first camera. An alignment of all positions would rotate the map: on a short path
-    they hardly determine the rotation.
+    The world frame of a run is its first camera. An alignment of all positions would rotate the map, because the
+    positions of a short path hardly determine the rotation.
     """
     estimate, reference = run / "trajectory.txt", recording / "groundtruth.txt"
     if not (estimate.is_file() and reference.is_file()):
@@ -217,9 +217,9 @@ def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | No
 
 
 def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float | None:
-    """Share of the recording's frames that have a pose; None where the number of frames is unknown.
+    """Share of the recording's frames that have a pose; None if the number of frames is unknown.
 
-    The number of frames is that of the run's metrics.json, or else of the image lists beside the true trajectory.
+    The number of frames comes from the run's metrics.json, or else from the image lists next to the true trajectory.
     """
     frames = _num_frames(run, reference)
     return round(poses / frames, 6) if frames else None

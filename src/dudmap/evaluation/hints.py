@@ -9,7 +9,7 @@ from dudmap.evaluation.time_offset import LARGEST_HINT, MotionComparison
 from dudmap.evaluation.trajectory import adjusted, ate, body_rotation
 
 EXPLAINED = 0.5
-"""Largest remaining share of an error that a cause explains. Noise does not halve by chance: the causes have one and
+"""Largest remaining share of an error that a cause explains. Noise is not halved by chance: the causes have one and
 three degrees of freedom, the errors as many as the trajectory has seconds."""
 
 
@@ -25,7 +25,7 @@ def _of_time(estimate: Trajectory, reference: Trajectory, max_difference: float)
         motions = MotionComparison(estimate, reference)
         best = motions.best(LARGEST_HINT)
         after = ate(adjusted(estimate, best.seconds), reference, max_difference=max_difference)
-    except DatasetError:  # no other offset can be compared, hence none explains the error
+    except DatasetError:  # no other offset can be compared, so none explains the error
         return ""
     if best.unexplained > EXPLAINED**2 * motions.at(0.0) or after.rmse >= before.rmse:
         return ""

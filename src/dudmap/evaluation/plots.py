@@ -1,6 +1,6 @@
-"""Plots of trajectory, surface and mask errors. Each function writes one file: PNG, PDF or SVG, as its name ends.
+"""Plots of trajectory, surface and mask errors. Each function writes one file: PNG, PDF or SVG, by its ending.
 
-A plot that cannot be written is a ``DudmapError``.
+A failed write raises ``DudmapError``.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
 COLORS = ESTIMATE, SECOND, "#2e8b57", "#d98a00", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5"
 """Colours of several estimates."""
 LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2, "frameon": False}
-"""Place of a legend: above the axes on the right, where it covers no curve; titles stand on the left."""
+"""Place of a legend: above the axes on the right, off the curves; titles are on the left."""
 
 
 def plot_trajectories(path: Path, scores: list[Score]) -> None:
@@ -66,7 +66,7 @@ def plot_errors(path: Path, scores: list[Score]) -> None:
 
 
 def plot_relative_errors(path: Path, scores: list[Score]) -> bool:
-    """Relative errors over time of the estimates that have them; whether there is one."""
+    """Plot relative errors over time of the estimates that have them; returns whether there are any."""
     found = [(score.name, score.relative) for score in scores if score.relative is not None]
     labels = "translation, mm over 1 s", "rotation, deg over 1 s", "time of the first pose, s"
     if found:
@@ -125,7 +125,7 @@ def _plot_errors(
 
 
 def _compared_reference(scores: list[Score]) -> tuple[Trajectory, float]:
-    """The reference during the compared part, and the time at which this begins."""
+    """The reference within the compared part, and the start of this part."""
     start, end = (f(g(score.absolute.timestamps) for score in scores) for f, g in ((min, np.min), (max, np.max)))
     true = scores[0].true
     assert true is not None
@@ -156,9 +156,10 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
     """Histogram of the registration residuals with the fitted mixture.
 
     Args:
-        axes: Where to draw.
-        residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the reading and ``counts``
-            (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,), ``sigma`` (2,).
+        axes: Axes for the plot.
+        residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the measurement and
+            ``counts`` (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,),
+            ``sigma`` (2,).
     """
     try:
         with open_arrays(residuals) as data:
@@ -237,7 +238,7 @@ def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Fig
 
 
 def _figure_of(mosaic: Any, size: tuple[float, float], **options: Any) -> "tuple[Figure, dict[str, Axes]]":  # noqa: ANN401
-    """Figure with axes by name, arranged and with the options as ``Figure.subplot_mosaic`` has them."""
+    """Figure with axes by name; mosaic and options as in ``Figure.subplot_mosaic``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -250,7 +251,7 @@ def _figure_of(mosaic: Any, size: tuple[float, float], **options: Any) -> "tuple
 
 
 def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, color: str, label: str) -> None:
-    """Plot a line that is interrupted where frames are missing."""
+    """Plot a line with gaps at missing frames."""
     breaks = gaps(stamps)
     axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=color, linewidth=1.2, label=label)
 

@@ -3,8 +3,8 @@
 Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
 comparison of vertices would weight a mesh by its triangle density.
 
-A mesh without faces (unless point clouds are accepted) or with NaN is a ``MapError``, a distance or a number of samples
-that is not positive a ``ConfigError``.
+Errors: ``MapError`` for a mesh with NaN or without faces (unless point clouds are accepted); ``ConfigError`` for a
+distance or number of samples that is not positive.
 """
 
 from collections.abc import Iterable
@@ -24,10 +24,10 @@ Distances = NDArray[np.float32]
 THRESHOLDS = (0.01, 0.02, 0.05)
 """Default distances of precision and recall, metres."""
 GHOST_DISTANCE = 0.05
-"""Estimated surface farther than this from the true one is a ghost, metres. This is more than the error that noise and
-a truncation band of a few voxels cause on a good surface, and less than the thickness of an arm."""
+"""Distance from the true surface beyond which estimated surface is a ghost, metres. It exceeds the error by noise and a
+truncation band of a few voxels, and is smaller than the thickness of an arm."""
 SAMPLES = 300_000
-"""Points sampled on each surface; the standard error of a share of 1 % is then at most 0.02 %."""
+"""Number of points sampled on each surface; the standard error of a share of 1 % is then at most 0.02 %."""
 HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
 """Histogram of the distances: bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
 
@@ -83,7 +83,7 @@ class SurfaceResult:
     num_samples: int
 
     def figures(self) -> dict[str, float | int | None]:
-        """All numbers by name and unit, for tables and JSON."""
+        """All metrics by name and unit, for tables and JSON."""
         out: dict[str, float | int | None] = {}
         for name, statistics in (("accuracy", self.accuracy), ("completeness", self.completeness)):
             for key in ("mean", "median", "rmse", "p95", "max"):
@@ -112,10 +112,10 @@ def compare_surfaces(
 
     Args:
         estimate: The reconstruction, in the reference's frame.
-        reference: The true static surface, which accuracy and ghosts are measured to.
-        observed: The part of it that the camera saw, on which completeness is measured; None for all of it.
+        reference: The true static surface, for accuracy and ghosts.
+        observed: The part of it that the camera saw, for completeness; None for all of it.
         thresholds: Distances in metres for precision, recall and F-score.
-        ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
+        ghost_distance: Distance from the true surface beyond which estimated surface is a ghost, metres.
         samples: Number of points sampled on each surface.
         points: Accept point clouds, whose points serve as samples and which have no area.
     """

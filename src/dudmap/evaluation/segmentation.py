@@ -19,8 +19,8 @@ Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCORED_COVERAGE = 0.05
-"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio of two
-small numbers is not significant."""
+"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio of two small
+numbers is not significant."""
 
 
 class MaskPair(NamedTuple):
@@ -74,7 +74,7 @@ def mask_iou(estimate: Mask, reference: Mask) -> float:
 def compare_masks(pairs: Iterable[MaskPair], num_missing: int = 0) -> MaskResult:
     """Precision, recall and intersection over union, per frame and over all frames.
 
-    Every pixel counts, whether it has a depth reading or not.
+    Every pixel counts, with or without depth.
 
     Args:
         pairs: Estimated and true masks of the same frames.
@@ -144,7 +144,7 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
 
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of the true masks; the depth timestamps where associations.txt gives them."""
+    """Timestamps and files of the true masks, with the depth timestamps if there is an associations.txt."""
     if not (folder / "mask.txt").is_file():
         return _estimated_masks(folder)
     masks = read_list(folder / "mask.txt")
@@ -157,7 +157,7 @@ def _true_masks(folder: Path) -> list[tuple[float, Path]]:
 
 
 def _numbered_masks(folder: Path, run: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of masks that are named by the numbers of the images of a run's recording."""
+    """Timestamps and files of masks named by image numbers of a run's recording."""
     try:
         recording = open_sequence(**read_json(run / "metrics.json")["recording"])
     except (DudmapError, *DAMAGE) as error:

@@ -1,4 +1,4 @@
-"""Surfaces that points are sampled on and measured to, and the rigid registration of two of them."""
+"""Surfaces for sampling of points and measurement of distances, and the rigid registration of two surfaces."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,16 +19,16 @@ Points = NDArray[np.float32]
 CANDIDATES = 4
 """Number of nearest anchors whose triangles are measured exactly."""
 ANCHORS = 400_000
-"""Number of additional anchors that large triangles get, over the whole surface."""
+"""Number of additional anchors on large triangles, over the whole surface."""
 BATCH = 200_000
 """Points measured at a time; bounds the memory."""
 OVERLAP, REACH, ITERATIONS = 0.8, 0.3, 60
-"""Of a registration: share of the estimate that has a counterpart, largest distance of a pair in metres, and largest
-number of iterations."""
+"""Registration: share of the estimate that has a counterpart, largest distance of a pair in metres, and largest number
+of iterations."""
 
 
 class Surface:
-    """A triangle mesh or, where allowed, a point cloud that points can be sampled on and measured to.
+    """A triangle mesh, or point cloud if allowed, for sampling of points and measurement of distances.
 
     Args:
         mesh: The mesh; faces without area are ignored.
@@ -39,7 +39,7 @@ class Surface:
         area: Square metres; None for a point cloud.
 
     Raises:
-        MapError: The mesh is empty, holds NaN, or has no faces and ``points`` is not set.
+        MapError: The mesh is empty, has NaN, or has no faces and ``points`` is not set.
     """
 
     def __init__(self, mesh: Mesh, name: str, *, points: bool = False) -> None:
@@ -72,8 +72,8 @@ class Surface:
     def samples(self, count: int, seed: int = 0) -> Points:
         """Points (count, 3) distributed uniformly over the area; of a point cloud, ``count`` of its points.
 
-        Stratified: one point per equal share of the area. ``trimesh.sample`` draws independently, which has more
-        variance, and took ten times as long (0.27 s for 100,000 points).
+        Stratified: one point per equal share of the area. ``trimesh.sample`` draws independently: more variance, and
+        ten times slower (0.27 s for 100,000 points).
         """
         random = np.random.default_rng(seed)
         if self.is_cloud:
@@ -87,9 +87,9 @@ class Surface:
     def distances(self, points: Points) -> NDArray[np.float32]:
         """Distances (N,) of points (N, 3) to the surface, metres.
 
-        Exact for the triangles of the nearest anchors. Every triangle has an anchor at its centroid, and large ones
-        have more, at the spacing at which ``ANCHORS`` of them cover the surface. A nearer triangle is missed only
-        where all the nearest anchors lie on its neighbours, and then by less than the spacing of the anchors.
+        Exact for the triangles of the nearest anchors. Every triangle has an anchor at its centroid. Large triangles
+        have more, spaced so that ``ANCHORS`` of them cover the surface. A nearer triangle is missed only if all nearest
+        anchors lie on its neighbours, and then by less than the anchor spacing.
         """
         out = np.empty(len(points), np.float32)
         for start in range(0, len(points), BATCH):
@@ -171,12 +171,12 @@ def register(
 ) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 
-    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, none farther than ``REACH``,
-    so that ghosts and missing parts have no influence.
+    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``.
+    Ghosts and missing parts thus have no influence.
 
     Args:
         estimate: Mesh to be moved.
-        reference: Triangle mesh it is moved onto.
+        reference: Triangle mesh, the target.
         T_reference_estimate: (4, 4) initial motion; None is the identity.
         samples: Number of points sampled on the estimate.
 

@@ -1,4 +1,4 @@
-"""Tables of figures: Markdown, CSV, and LaTeX with the rules of the package booktabs."""
+"""Tables of metrics: Markdown, CSV, and LaTeX with the rules of the package booktabs."""
 
 import csv
 import io
@@ -15,7 +15,7 @@ Cells = list[str] | tuple[str, ...]
 
 
 class Column(NamedTuple):
-    """Format of one figure: heading with unit, factor from the stored unit, number of decimals."""
+    """Format of one metric: heading with unit, factor from the stored unit, number of decimals."""
 
     key: str
     heading: str
@@ -61,9 +61,9 @@ def _in_latex(text: str) -> str:
 
 
 def table(rows: list[dict[str, Any]], columns: Iterable[Column], kind: str, words: int = 1) -> str:
-    """Table of rows in a format of ``FORMATS``; of its columns, the ones with values.
+    """Table of rows in a format of ``FORMATS``, without empty columns.
 
-    CSV holds every figure under its key, in stored units.
+    CSV has every metric under its key, in stored units.
     """
     if kind not in FORMATS:
         raise ConfigError(f"found --table-format {kind}; expected {', '.join(FORMATS)}")

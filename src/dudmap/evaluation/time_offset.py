@@ -13,13 +13,13 @@ from dudmap.errors import DatasetError
 Numbers = NDArray[np.float64]
 
 STEP = LARGEST_STEP / 3
-"""Step between the offsets that are compared first, seconds: three within a time of steady motion."""
+"""Step between the offsets of the first search, seconds: three within a time of steady motion."""
 GRID = STEP / 5
-"""Step between the times at which the turns of the reference are computed, seconds: the rate of motion capture."""
+"""Step between the times of the reference's rotations, seconds: the rate of motion capture."""
 WINDOW = 2 * LARGEST_STEP
 """Time over which rotations are compared, seconds: two times of steady motion."""
 SAMPLES = 300
-"""Largest number of compared poses of the estimate: neighbours in time are no independent measurements."""
+"""Largest number of compared poses of the estimate; temporal neighbours are not independent."""
 SMALLEST_OVERLAP = 0.5
 """Smallest share of the estimate within the time of the reference. Short parts of two paths agree by chance."""
 CHUNK = 1000
@@ -58,10 +58,10 @@ class MotionComparison:
         self.grid_turns = _turns(reference, self.grid)
 
     def best(self, largest: float = np.inf) -> TimeOffset:
-        """Best offset of at most ``largest`` seconds at which half of the estimate lies within the reference's time.
+        """Best offset of at most ``largest`` seconds that leaves half of the estimate within the reference's time.
 
         Raises:
-            DatasetError: There is no such offset, or one of the two does not move.
+            DatasetError: There is no such offset, or one of the trajectories does not move.
         """
         start, stop = self.reference.timestamps[0] - self.times[-1], self.reference.timestamps[-1] - self.times[0]
         offsets = np.arange(max(start, -largest), min(stop, largest) + STEP, STEP)
@@ -110,7 +110,7 @@ def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
     if H.shape[-1] == 3:
         singular[:, 2] *= np.sign(np.linalg.det(H))  # -1 if the best orthogonal matrix is a reflection
     else:
-        singular = H[..., 0]  # numbers are not turned: their correlation keeps its sign
+        singular = H[..., 0]  # no rotation of scalars: their correlation keeps its sign
     spreads = (a**2).sum(axis=(1, 2)) * (b**2).sum(axis=(1, 2))
     r = np.maximum(singular.sum(axis=1), 0) / np.sqrt(np.where(spreads > 0, spreads, np.nan))
     return 1 - r**2

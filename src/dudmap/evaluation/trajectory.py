@@ -1,8 +1,8 @@
 """Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V).
 
-Poses are camera to world, of the ``estimate`` and of the true ``reference``; they are pairs up to ``max_difference``
-seconds apart. Trajectories that cannot be compared (no overlap in time, or fewer than three pairs) are a
-``DatasetError``, arguments that are not acceptable a ``ConfigError``.
+Poses of the ``estimate`` and the true ``reference`` map the camera to the world. They are paired up to
+``max_difference`` seconds apart. Errors: ``DatasetError`` for no overlap in time or fewer than three pairs;
+``ConfigError`` for invalid arguments.
 """
 
 import math
@@ -25,18 +25,18 @@ Unit = Literal["s", "m"]
 
 FEWEST_PAIRS = 3
 SMALLEST_SHARE = 0.1
-"""Smallest share of the poses of the shorter trajectory with a partner: errors over fewer do not describe its path."""
+"""Smallest share of the shorter trajectory's poses with a partner; fewer do not describe its path."""
 SMALLEST_SPREAD = 1e-3
-"""Positions that spread less than this across their principal direction (metres, and as a share of the spread along
-it) do not determine a rotation."""
+"""Smallest spread of positions across their principal direction (metres, and as a share of the spread along it) that
+determines a rotation."""
 LONGEST_STEP = 3.0
-"""Poses that follow each other after more than this many median steps in time enclose a gap of lost frames."""
+"""Number of median time steps between consecutive poses beyond which they enclose a gap of lost frames."""
 PATH_TOLERANCE = 0.1
 """Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
 
 STATISTICS = "rmse", "mean", "median", "max"
-"""Statistics that figures of trajectories give."""
+"""Statistics of trajectory errors in metrics."""
 
 
 class Statistics(NamedTuple):
@@ -61,7 +61,7 @@ class PoseErrors:
     """Errors of N poses, or of the motions between N pairs of poses.
 
     Attributes:
-        timestamps: (N,) seconds, of the estimate; of a motion that of its first pose.
+        timestamps: (N,) seconds, of the estimate; for a motion, of its first pose.
         trans_errors: (N,) lengths of the translations of the errors, metres.
         rot_errors_deg: (N,) angles of their rotations, degrees.
     """
@@ -72,7 +72,7 @@ class PoseErrors:
 
     @classmethod
     def of(cls, timestamps: Numbers, E: Numbers, *more: Any) -> Self:  # noqa: ANN401
-        """Result of the rigid motions E (N, 4, 4) that are the errors; ``more`` are the fields of the class itself."""
+        """Errors from rigid motions E (N, 4, 4); ``more`` are the fields of the class itself."""
         return cls(timestamps, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(se3.rotation_angles(E)), *more)
 
     @property
@@ -102,8 +102,8 @@ class AteResult(PoseErrors):
 
     Attributes:
         T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
-        alignment: How this motion was computed: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3``
-            was requested but the positions (all equal, or collinear) do not determine the rotation.
+        alignment: Method of this motion: ``se3``, ``origin``, ``none``, or ``se3-orientations``. The last replaces
+            ``se3`` if the positions (all equal, or collinear) do not determine the rotation.
     """
 
     T_reference_estimate: Numbers
@@ -145,7 +145,7 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
 
 
 def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_difference: float) -> str:
-    """Sentence on trajectories of which too few poses match in time, with the option that the times suggest."""
+    """Sentence on too few poses that match in time, with the option that the times suggest."""
     shortest = min(len(estimate), len(reference))
     if shortest < FEWEST_PAIRS:
         mend = f"give a trajectory of at least {FEWEST_PAIRS} poses"
@@ -178,7 +178,7 @@ def fit_scale(estimate: Trajectory, reference: Trajectory, max_difference: float
 
 
 def adjusted(estimate: Trajectory, seconds: float = 0.0, scale: float = 1.0) -> Trajectory:
-    """Trajectory with ``seconds`` added to its times and its positions times ``scale``."""
+    """Trajectory with ``seconds`` added to its times and its positions multiplied by ``scale``."""
     Ts = estimate.Ts_world_camera.copy()
     Ts[:, :3, 3] *= scale
     return Trajectory(estimate.timestamps + seconds, Ts)
@@ -192,10 +192,10 @@ def ate(
     The errors are the norm of E_i's translation and the angle of its rotation.
 
     Args:
-        align: ``se3``: A brings the positions closest to each other in the least-squares sense, without scale (Umeyama
-            1991, as in the TUM script); where the positions do not determine its rotation it is the mean of the
-            rotations that align the orientations. ``origin``: A maps the first pose onto its partner, so that the
-            error of a fixed camera is its drift from the start. ``none``: A is the identity.
+        align: ``se3``: A minimises the squared distances of the positions, without scale (Umeyama 1991, as in the TUM
+            script). If the positions do not determine its rotation, it is the mean of the rotations that align the
+            orientations. ``origin``: A maps the first pose onto its partner, so that the error of a fixed camera is its
+            drift from the start. ``none``: A is the identity.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -220,10 +220,10 @@ def rpe(
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
     Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``: j is
-    the pose nearest to that distance. A pair is dropped if it misses ``delta`` by more than half the median time
-    between two poses (at least ``max_difference``) for ``s``, or by more than a tenth for ``m``. (The script pairs
-    across gaps where tracking was lost, and leaves out all pairs that end at the last pose.) Metres are counted along
-    the reference path.
+    the pose nearest to that distance. A pair is dropped if it misses ``delta`` by too much: more than half the median
+    time between two poses (at least ``max_difference``) for ``s``, more than a tenth for ``m``. Metres are measured
+    along the reference path. The script differs: it pairs across gaps of lost frames, and drops all pairs that end at
+    the last pose.
     """
     times, motion_estimate, motion_reference = _motions(estimate, reference, delta, unit, max_difference)
     return RpeResult.of(times, se3.inverse(motion_reference) @ motion_estimate, delta, unit)
@@ -234,8 +234,8 @@ def body_rotation(
 ) -> tuple[Numbers, float, float]:
     """Rotation between the reference's body and the camera, if the reference has poses of another body on the camera.
 
-    Rotations of two bodies on one camera are ``R_body_camera`` apart: ``r_camera = R_camera_body r_body`` for the
-    rotation vectors of their motions in one second.
+    Two bodies on one camera differ by ``R_body_camera``: ``r_camera = R_camera_body r_body`` for the rotation vectors
+    of their motions in one second.
 
     Returns:
         R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976). Root mean square of the rotational
@@ -277,12 +277,14 @@ def _motions(
 def trajectory_figures(
     estimate: Trajectory, reference: Trajectory, align: Align = "se3", max_difference: float = LARGEST_GAP
 ) -> dict[str, float | int | str | None]:
-    """All figures of a trajectory by name and unit, for tables and JSON.
+    """All metrics of a trajectory by name and unit, for tables and JSON.
 
-    ``covered_share``, the share of the reference's duration between consecutive pairs without a gap; ATE;
-    ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
-    first pose only, by which a fixed or merely rotating camera is judged; RPE per second and per metre. A relative
-    error is None where the recording is too short for it; ``rpe_per_s_missing`` or ``rpe_per_m_missing`` is the reason.
+    * ``covered_share``: share of the reference's duration between consecutive pairs without a gap
+    * ATE
+    * ``drift_rmse_m`` and ``rotation_rmse_deg``: root mean squares of distance and angle after aligning the first pose
+      only, for a fixed or merely rotating camera
+    * RPE per second and per metre: None if the recording is too short, for the reason in ``rpe_per_s_missing`` or
+      ``rpe_per_m_missing``
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)
@@ -303,7 +305,7 @@ def trajectory_figures(
 
 
 def gaps(timestamps: Numbers) -> NDArray[np.intp]:
-    """Indices of the poses that follow a gap of lost frames."""
+    """Indices of the poses after a gap of lost frames."""
     steps = np.diff(timestamps)
     return np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1 if len(steps) else np.array([], np.intp)
 
@@ -315,7 +317,7 @@ def covered_time(timestamps: Numbers) -> float:
 
 
 def _figures(errors: PoseErrors, trans: str, rot: str) -> dict[str, float]:
-    """Statistics of translations and rotations by names that are made of theirs."""
+    """Statistics of translations and rotations, by the name patterns ``trans`` and ``rot``."""
     return {name.format(key): getattr(statistics, key)
             for name, statistics in ((trans, errors.trans), (rot, errors.rot_deg)) for key in STATISTICS}  # fmt: skip
 
@@ -328,7 +330,7 @@ def path_figures(estimate: Trajectory) -> dict[str, float]:
 
 
 RUN_FIGURES = "ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
-"""Trajectory figures of a run's metrics.json."""
+"""Trajectory metrics in a run's metrics.json."""
 
 
 def accuracy(
@@ -336,7 +338,7 @@ def accuracy(
 ) -> dict[str, float | str | None]:
     """Selected ``trajectory_figures``, rounded to six digits.
 
-    Where the trajectories cannot be compared the figures are None and ``accuracy_missing`` gives the reason.
+    If the trajectories cannot be compared, the metrics are None and ``accuracy_missing`` is the reason.
     """
     out: dict[str, float | str | None] = dict.fromkeys(keys)
     try:
@@ -352,9 +354,9 @@ def accuracy(
 
 
 def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
-    """Rigid motion of the estimate onto the reference from the positions, or from the orientations where they must.
+    """Rigid motion of the estimate onto the reference from the positions, or from the orientations if necessary.
 
-    The square roots of the singular values of the cross-covariance are how far both sets of positions extend along
+    The square roots of the singular values of the cross-covariance measure the extent of both sets of positions along
     their common principal directions, metres. The rotation is determined only if the second one is not zero.
     """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
@@ -368,7 +370,7 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
 
 
 def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices i and, for each, the j > i whose position is nearest to that of i plus delta; positions increase."""
+    """Indices i, and for each the j > i with the position nearest to position i plus delta; positions increase."""
     wanted = position + delta
     after = np.clip(np.searchsorted(position, wanted), 1, len(position) - 1)
     before = after - 1
