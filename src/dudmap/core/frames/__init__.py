@@ -1,1 +1,1 @@
-"""From a camera frame to the image pyramid that is registered and labelled."""
+"""Preparation of a camera frame, up to the image pyramid that is registered and labelled."""

@@ -1,4 +1,4 @@
-"""Colour image registered to the depth image of the same frame: seen from the depth camera, at the depth's time."""
+"""Registration of the colour image to the depth image of the same frame: depth viewpoint, depth time."""
 
 from functools import lru_cache
 from typing import TypeVar
@@ -18,19 +18,21 @@ from dudmap.core.geometry.se3 import hat
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 MEDIAN_STRIDE = 8
-"""Every so many pixels, across and down, enter the median depth."""
+"""Stride in rows and columns of the pixels that enter the median depth."""
 BAND_ROWS = 60
 """Rows that a thread registers at a time."""
 
 
 def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:
-    """How points of the depth camera reach the colour image.
+    """Projection of points of the depth camera into the colour image.
 
-    The motion T exp(-tau xi) X is expanded to the second order in tau: with a = v + omega x X it is
-    T X - tau R a + tau^2 / 2 R (omega x a). At 3 rad/s and 30 ms the third order is below 0.1 pixels.
+    The motion T exp(-tau xi) X is expanded to the second order in tau: with a = v + omega x X it is T X - tau R a +
+    tau^2 / 2 R (omega x a). At 3 rad/s and 30 ms the third order is below 0.1 pixels.
 
-    ``twist`` (6,) is the motion of the depth camera per second, its own axes, ``offset`` the time stamp of the colour
-    image minus that of the depth image, s.
+    Args:
+        calibration: Colour camera relative to the depth camera.
+        twist: (6,) motion of the depth camera per second, its own axes.
+        offset: Time stamp of the colour image minus time stamp of the depth image, s.
     """
     T, R, W = calibration.T_color_depth, calibration.T_color_depth[:3, :3], hat(twist[3:])
     speed = np.column_stack([W, twist[:3]])
@@ -48,7 +50,7 @@ def color_projection(calibration: Calibration, twist: NDArray[np.float64], offse
 
 
 def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.float32]:
-    """Intensity (h, w) in 0..1 of the colour image as it was recorded, after so many halvings by 2x2 blocks."""
+    """Intensity (h, w) in 0..1 of the recorded colour image, halved by 2x2 blocks."""
     import cv2
 
     known = observation._recorded_halvings
@@ -63,7 +65,7 @@ def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.fl
 
 
 def typical_depth(depth: NDArray[np.float32]) -> float:
-    """Median of some readings of an image (H, W), metres; 1 where it has none."""
+    """Median of sampled depths of an image (H, W), metres; 1 for an image without depth."""
     readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
     readings = readings[readings > 0]
     return float(median(readings)) if len(readings) else 1.0
@@ -75,11 +77,11 @@ def register_color(
     camera: Camera,
     projection: ColorProjection,
 ) -> NDArray[Pixel]:
-    """Colour (H, W[, 3]) of each depth pixel, interpolated; outside the colour image that of its nearest pixel.
+    """Colour (H, W[, 3]) of each depth pixel, interpolated; the nearest colour pixel outside the colour image.
 
-    Occlusion is not resolved: a surface that only the depth camera sees has the colour of what hides it.
+    Occlusion is not resolved: a surface hidden from the colour camera takes the colour of the occluding surface.
 
-    ``color`` (h, w[, 3]) is as the colour camera recorded it, ``depth`` (H, W) without distortion, metres, 0 = none.
+    ``color`` (h, w[, 3]) is the recorded image, ``depth`` (H, W) has no lens distortion, metres, 0 = none.
     """
     import cv2
 
@@ -100,7 +102,7 @@ def register_color(
 
 
 def _is_in_place(projection: ColorProjection, camera: Camera) -> bool:
-    """Whether the colours of all pixels of a camera are where they were recorded, and only their brightness changes."""
+    """Whether the registration moves no pixel and changes only its brightness."""
     still = projection.offset == 0 and projection.readout == 0 and not projection.distortion.any()
     same = still and np.array_equal(projection.intrinsics, camera.intrinsics)
     return bool(same and np.array_equal(projection.place, np.eye(3, 4, dtype=np.float32)))
@@ -108,7 +110,7 @@ def _is_in_place(projection: ColorProjection, camera: Camera) -> bool:
 
 @lru_cache(maxsize=8)
 def _inverse_vignetting(height: int, width: int, channels: int = 1, *, vignetting: float) -> NDArray[np.float32]:
-    """Gains (height, width[, channels]) that give back the brightness lost by vignetting, see ``color_places``."""
+    """Gains (height, width[, channels]) that compensate vignetting, see ``color_places``."""
     v, u = np.mgrid[:height, :width]
     middle = (height - 1) / 2, (width - 1) / 2
     loss = vignetting * ((v - middle[0]) ** 2 + (u - middle[1]) ** 2) / (middle[0] ** 2 + middle[1] ** 2)

@@ -21,20 +21,21 @@ NO_COLOR = (
     "{} has the shape {} and the type {}; expected (H, W, 3) uint8, red green blue; 16-bit values are depth, which "
     "needs no colour"
 )
-"""Sentence on an array that is no colour image."""
+"""Message for an array that is not a colour image."""
 GREY = 192
-"""Value of all colours of a frame without colour: light, so that shading shows on it."""
+"""Grey value of all pixels of a frame without colour: light, so that shading is visible."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Depth and colour image of about one instant. They are not copied here; ``Slam`` copies the arrays that it keeps.
+    """Depth and colour image of about one instant. The constructor copies nothing; ``Slam`` copies the arrays that it
+    keeps.
 
     Attributes:
         timestamp: Seconds, of the depth image.
         depth: (H, W) float32, metres along the optical axis, 0 = no measurement.
         color: (H, W, 3) uint8, red green blue; a separate colour camera may have another size. None for depth without
-            colour, which is registered by its distances alone.
+            colour, which is registered by distances alone.
         color_timestamp: Seconds, of the colour image; None if unknown. Used with a calibration of the colour camera.
     """
 
@@ -44,12 +45,12 @@ class Frame:
     color_timestamp: float | None = None
 
     def __repr__(self) -> str:
-        """The sizes without the images."""
+        """Sizes without the images."""
         color = "no colour" if self.color is None else f"colour {self.color.shape}"
         return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
 
     def copy(self) -> "Frame":
-        """The frame with copies of its images, so that the caller may change the originals."""
+        """Copy of the frame and its images, so that the caller may change the originals."""
         return replace(self, depth=np.array(self.depth), color=None if self.color is None else np.array(self.color))
 
     @property
@@ -65,17 +66,17 @@ class Frame:
         timestamp: float = np.nan,
         depth_scale: float = 1000.0,
     ) -> "Frame":
-        """Frame of copies of two images from a sensor, a file or another program.
+        """Frame of copies of two images.
 
         Args:
-            depth: (H, W), along the optical axis, registered to colour. Floating point is metres; 0 and values that are
-                not finite mean no measurement. uint16 is in units of ``depth_scale``; 0 means no measurement.
+            depth: (H, W), along the optical axis, registered to colour. Floating point is metres; 0 and non-finite
+                values mean no measurement. uint16 is in units of ``depth_scale``; 0 means no measurement.
             rgb: (H, W, 3) uint8, red green blue; None for depth without colour.
             timestamp: Seconds.
             depth_scale: Units of uint16 depth per metre; 1000 = millimetres. Not used for floating point.
 
         Raises:
-            FrameError: An argument is no array, or one of another shape or type; the time is not a finite number.
+            FrameError: An argument is not an array or has the wrong shape or type, or the time is not finite.
         """
         for name, image in (("depth", depth), ("rgb", rgb)):
             if not (hasattr(image, "__array__") or (name == "rgb" and image is None)):

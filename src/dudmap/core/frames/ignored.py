@@ -1,4 +1,4 @@
-"""Pixels that never count because they move with the camera: a robot's arm, a bonnet, a vignette."""
+"""Pixels that never count because they show parts fixed to the camera: a robot arm, a bonnet, a vignette."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 
 DISTANCES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
-"""Distances at which a pixel of one camera is projected into the image of another one, metres. They start at the
-nearest surface that a depth camera measures. Each is twice the one before, which halves the shift by the baseline."""
+"""Distances at which pixels of one camera are projected into the other image, metres. They start at the nearest
+measurable surface and double, because each doubling halves the shift by the baseline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +30,13 @@ class IgnoredRegion:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], camera: Camera, calibration: Calibration | None) -> "IgnoredRegion":
-        """Region of a mask, which has the size of the depth image or of a colour image of another size.
+        """Region of a mask, which has the size of the depth image or of the colour image.
 
-        If the colour camera is a separate one (``calibration``), the region is projected into the other image at all
+        For a separate colour camera (``calibration``), the region is projected into the other image at all
         ``DISTANCES``.
 
         Raises:
-            ConfigError: The mask has the size of neither image, another type, or covers all of one.
+            ConfigError: The mask has the size of neither image or the wrong type, or covers a whole image.
         """
         mask = np.asarray(mask)
         sizes = [camera.shape] if calibration is None else [camera.shape, calibration.camera.shape]
@@ -60,9 +60,9 @@ class IgnoredRegion:
         return cls(depth.copy(), color, _nearest(color))
 
     def filled(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colour image (h, w, 3) whose ignored pixels have the colours at their border.
+        """Colour image (h, w, 3) with ignored pixels filled from their border.
 
-        The region then has no feature and no edge that moves with the camera.
+        The region then has no features or edges that move with the camera.
         """
         out = color.copy()
         out[self.color] = color.reshape(-1, 3)[self.nearest]
@@ -106,7 +106,7 @@ def _shown(mask: NDArray[np.bool_], places: list[NDArray[np.int64]], shape: tupl
     for found in places:
         u, v = found[mask & _within(found, shape)].T
         out[v, u] = 1
-    side = 2 * -(-shape[1] // mask.shape[1]) + 1  # the colour image may have several pixels for one of depth
+    side = 2 * -(-shape[1] // mask.shape[1]) + 1  # the colour image may have several pixels per depth pixel
     return np.asarray(cv2.morphologyEx(out, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))) > 0
 
 

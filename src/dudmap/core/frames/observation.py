@@ -1,4 +1,4 @@
-"""A preprocessed frame, its image pyramid and corners, and their exposure to the intensities of the map."""
+"""A preprocessed frame, its image pyramid and corners, and exposure compensation to the intensities of the map."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,8 +14,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
 CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
-"""Sampling of the saturation limit: the step across and down, and a share of the pixels with a saturated channel. The
-limit is the largest intensity of this darkest share."""
+"""Stride in rows and columns, and quantile, for the saturation limit. The limit is this quantile of the intensities
+of pixels with a saturated channel."""
 HALVING_BAND = 0.02
 """Largest distance between measurements of one surface in a 2x2 block, as a share of the depth. Below the reference
 depth it is a share of that."""
@@ -40,11 +40,11 @@ class Observation:
             are registered once the camera's motion is known (``core/tracking/color_motion.py``).
         recorded_rgb: (h, w, 3) uint8 of a separate colour camera, not registered; None if equal to ``rgb``.
         color_offset: Time stamp of the colour image minus time stamp of the depth image, seconds; 0 if unknown.
-        depth_readout: Readout of a rolling shutter that was taken out of the depth, seconds.
-        has_color: Whether the frame has a colour image; ``rgb`` and ``intensity`` are of one grey otherwise.
-        ignored: (H, W) bool, pixels that never count, which have no depth; None for none.
+        depth_readout: Rolling-shutter readout that was removed from the depth, seconds.
+        has_color: Whether the frame has a colour image; otherwise ``rgb`` and ``intensity`` are uniform grey.
+        ignored: (H, W) bool, pixels that never count and have no depth; None for none.
         reference_depth: Reference depth of the sensor, metres.
-        sources: (H, W) int32, index of the recorded pixel that each pixel shows after this; None for its own.
+        sources: (H, W) int32, index of the recorded pixel that each pixel shows; None if unchanged.
     """
 
     timestamp: float
@@ -85,8 +85,8 @@ class Observation:
     def halved(self, times: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H >> times, W >> times) of ``camera.scaled(times)``, halved by 2x2 blocks.
 
-        Intensity is the mean of a block; depth the mean of its readings on the nearest surface. Each halving is
-        computed once.
+        Intensity is the mean of a block; depth is the mean of its measurements on the nearest surface. Each halving is
+        cached.
         """
         halvings = self._halvings
         while len(halvings) < times:
@@ -131,8 +131,10 @@ class Level:
 
     @cached_property
     def foreground(self) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the nearest surface in the window of a corner: a window across a depth edge follows the
-        foreground, not the surface behind it."""
+        """Pixels (h, w) on the nearest surface in their corner window.
+
+        A window across a depth edge follows the foreground, not the background.
+        """
         import cv2
 
         side = scaled_window(WINDOW, self.camera.width)
@@ -154,10 +156,10 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
 
 
 def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.0) -> tuple[float, float]:
-    """Range of the map's intensities that are saturated neither in the map nor in an image of this gain and offset.
+    """Range of map intensities that are saturated neither in the map nor in an image with this gain and offset.
 
     The saturation limit of the image is ``ceiling``, of the map ``other``. The range is infinite if the exposures
-    hardly differ, since the same pixels are saturated in both.
+    hardly differ, because both then saturate at the same pixels.
     """
     gain, offset = exposure
     if 1 / LARGE_GAIN < gain < LARGE_GAIN:
@@ -168,8 +170,10 @@ def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.
 def saturated(
     level: Level, exposure: tuple[float, float], difference: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_] | None:
-    """Saturated pixels (h, w) bool of the image, and of the map if ``difference`` (map minus image) is given; None if
-    the exposures hardly differ."""
+    """Saturated pixels (h, w) bool of the image; None if the exposures hardly differ.
+
+    With ``difference`` (map minus image), pixels saturated in the map are included.
+    """
     darkest, brightest = shown_range(exposure, level.ceiling)
     if brightest == np.inf:
         return None
@@ -202,15 +206,17 @@ def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[floa
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Image pyramid of an observation, each level the camera's image halved several times: those of the registration,
-    coarse to fine, and that of the dynamic labels."""
+    """Image pyramid of an observation: levels of the registration, coarse to fine, and level of the dynamic labels.
+
+    Each is the image halved several times.
+    """
 
     tracked: list[Level]
     labelled: Level
 
     @classmethod
     def of(cls, observation: Observation, camera: Camera, config: Config) -> "Pyramid":
-        """The levels whose widths are nearest to those configured."""
+        """The levels with widths nearest to the configured ones."""
         widths = *config.tracker.widths, config.dynamics.width
         halvings = [max(0, round(np.log2(camera.width / width))) for width in widths]
         levels = {
@@ -242,7 +248,7 @@ class Pyramid:
 
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Mask (H, W) at the size of a level: a pixel is set if any part of it lies in the mask."""
+    """Mask (H, W) at the size of a level; a pixel is set if any part of it lies in the mask."""
     import cv2
 
     size = level.depth.shape[::-1]
@@ -250,12 +256,12 @@ def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether more than half of the readings of a level are marked as moving (h, w) bool."""
+    """Whether more than half of the depth pixels of a level are marked as moving (h, w) bool."""
     return bool(2 * np.count_nonzero(moving) > level.num_readings)
 
 
 def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
-    """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
+    """Odd window edge in an image of some width that covers the same view as ``edge`` at ``reference_width``."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 
 

@@ -13,9 +13,9 @@ Number = TypeVar("Number", np.float32, np.float64)
 SIMILAR = 1.5
 """A match is as good as another if the mean grey difference of its windows is at most this multiple of the other's."""
 RETURN_PX = 0.5
-"""Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
+"""Largest forward-backward error of a corner, pixels of an image 320 wide."""
 FEWEST = 128
-"""Fewest pixels whose flow is worth another thread."""
+"""Smallest number of pixels for which another thread pays off."""
 
 
 def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
@@ -25,8 +25,11 @@ def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
 
 
 def equally_exposed(before: Pyramid, after: Pyramid) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Grey values (h, w) of two images for matching corners. If the light has changed, the darker image gets the
-    exposure of the brighter one, and both are clipped to their common unsaturated range."""
+    """Grey values (h, w) of two images for matching corners.
+
+    If the light changed, the darker image gets the exposure of the brighter one, and both are clipped to their common
+    unsaturated range.
+    """
     pair = [before, after]
     dark, bright = sorted(pair, key=lambda pyramid: float(pyramid.coarse.intensity.mean()))
     darker, brighter = dark.coarse.intensity, bright.coarse.intensity
@@ -48,12 +51,18 @@ def lucas_kanade(
     window: int,
     halvings: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """Pyramidal Lucas-Kanade flow of pixels (n, 2) u, v of the first image (h, w), searched from a guess (n, 2) with a
-    window of so many pixels, in copies of the images halved up to ``halvings`` times before the images themselves.
+    """Pyramidal Lucas-Kanade flow of pixels (n, 2) u, v of the first image (h, w).
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2), u, v in the first image.
+        guess: (n, 2) positions in the second image at which the search starts.
+        window: Edge of the window, pixels.
+        halvings: Number of halvings up to the coarsest pyramid level.
 
     Returns:
-        Positions (n, 2) in the second image, arbitrary where not found; whether each was found (n,); mean absolute
-        difference (n,) of the grey values of the two windows.
+        Positions (n, 2) in the second image, arbitrary if not found; whether each was found (n,); mean absolute grey
+        difference (n,) of the two windows.
     """
     import cv2
 
@@ -63,7 +72,7 @@ def lucas_kanade(
         first,
         second,
         np.ascontiguousarray(pixels, np.float32),
-        np.array(guess, np.float32, order="C"),  # a copy: it is overwritten with the result
+        np.array(guess, np.float32, order="C"),  # a copy, because it is overwritten with the result
         winSize=(window, window),
         maxLevel=halvings,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -80,19 +89,18 @@ def track_forward_backward(
     halvings: int,
     limit: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Pixels of an image that pass the forward-backward check: tracked back from where they were found in the images
-    themselves, they return.
+    """Track pixels into a second image, with the forward-backward check at full resolution.
 
     Args:
         first, second: (h, w) uint8 images.
-        pixels: (n, 2) int, pixels u, v of the first.
-        expected: (n, 2) predicted positions in the second, from which the search starts.
-        window, halvings: As of ``lucas_kanade``, of the search forward.
-        limit: Smallest error of a pixel that does not return, pixels.
+        pixels: (n, 2) int, u, v in the first image.
+        expected: (n, 2) predicted positions in the second image, at which the search starts.
+        window, halvings: As for ``lucas_kanade``, for the forward search.
+        limit: Forward-backward error at which a pixel fails, pixels.
 
     Returns:
-        Positions (n, 2) in the second image and the mean differences (n,) of the grey values of the windows, arbitrary
-        for those that do not pass; whether each passes (n,).
+        Positions (n, 2) in the second image and mean grey differences (n,) of the windows, arbitrary for failed pixels;
+        whether each pixel passes (n,).
     """
     n = len(pixels)
 
@@ -115,13 +123,17 @@ def consistent_with_static(
     allowed: NDArray[np.float64],
     difference: NDArray[np.floating],
 ) -> NDArray[np.bool_]:
-    """Whether corners (n,) that were found elsewhere match as well at the position of a static point.
+    """Whether corners (n,) found elsewhere match as well at the position of a static point.
 
-    The coarse levels of the search see more than the window and may follow a nearer surface, and textures repeat.
-    Therefore the search is repeated from the position of a static point, at full resolution alone.
+    The coarse levels of the search see more than the window and may follow a nearer surface. Textures may repeat.
+    Therefore the search is repeated from the static position at full resolution alone.
 
-    ``expected`` (n, 2) are these positions, ``allowed`` (n,) the largest distances of a match from there, pixels, and
-    ``difference`` (n,) those of ``lucas_kanade`` for the matches found elsewhere.
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) corners in the first image.
+        expected: (n, 2) positions of static points in the second image.
+        allowed: (n,) largest distances of a match from these positions, pixels.
+        difference: (n,) grey differences of the matches found elsewhere, see ``lucas_kanade``.
     """
     guess = expected.astype(np.float32)
     positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)

@@ -17,32 +17,35 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError
 
 HOLE_NOISE = 0.01
-"""Readings around a small hole may always differ by this much, reference depths."""
+"""Largest depth difference around a small hole that is always allowed, reference depths."""
 STEEPEST = 9.5
 """Tangent of the largest angle of incidence that sensors measure, 84 degrees."""
 BORDER = 0.02
-"""Share of its width by which the colour image is continued at its borders; readings beyond have no colour."""
+"""Share of its width by which the colour image is extended at its borders; depth pixels beyond have no colour."""
 TYPICAL_DEPTH = 2.0
 """Distance for the test which pixels the colour camera sees, reference depths."""
 DEPTH_MIN = 1e-3
-"""Smallest lower limit of the depth, metres: 0 means no reading."""
+"""Smallest lower depth limit, metres; 0 means no measurement."""
 
 
 class Preprocessor:
     """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
-    The bilateral filter is separable (columns, then rows), which the exact one is not. It was measured on 640x480 depth
-    of two Kinect-type recordings, with radius 6 and one thread. It takes 1.2 ms against 7 ms for all 169 taps, with an
-    rms difference of 0.7-1.2 mm on a desk at 1 m. The error was measured against the temporal mean of a fixed camera's
-    static pixels, over squared depth. Its median is 1.52 against 1.50 mm, its 95 % quantile 7.07 against 7.05 mm
-    (unfiltered 1.65 and 7.32).
+    The bilateral filter is separable (columns, then rows), an approximation of the exact filter. It was measured on
+    640x480 depth of two Kinect-type recordings, with radius 6 and one thread. It takes 1.2 ms against 7 ms for all 169
+    taps, with an rms difference of 0.7-1.2 mm on a desk at 1 m. The error was measured against the temporal mean of a
+    fixed camera's static pixels, divided by squared depth. Its median is 1.52 against 1.50 mm, its 95 % quantile 7.07
+    against 7.05 mm (unfiltered 1.65 and 7.32).
 
-    ``camera`` is the camera of the depth images, and without a ``calibration`` also of the colour images. Colour images
-    of other times than the depth stay unregistered, scaled to the size of the depth image. Pixels that the colour
-    camera does not see are left out, since a map is registered by both.
-
-    ``ignore`` is a mask (H, W) bool of pixels that never count, see ``IgnoredRegion``. They get no depth, not even from
-    hole filling, and the colours at their border.
+    Args:
+        camera: Camera of the depth images, and without a ``calibration`` also of the colour images.
+        config: Limits and filters.
+        calibration: Separate colour camera. Colour taken at another time than the depth is only scaled to its size, not
+            registered. Pixels that the colour camera does not see are dropped, because the registration uses both
+            images.
+        ignore: (H, W) bool, pixels that never count, see ``IgnoredRegion``. They get no depth, and the colours at their
+            border.
+        sensor: Reference depth of the depth camera.
     """
 
     def __init__(
@@ -77,14 +80,14 @@ class Preprocessor:
         )
 
     def __call__(self, frame: Frame) -> Observation:
-        """The preprocessed frame.
+        """Preprocess a frame.
 
         Raises:
-            FrameError: Depth or colour do not have the camera's size, or the wrong type.
+            FrameError: Depth or colour has the wrong size or type.
         """
         self._check(frame)
         depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
-        rgb = np.array(frame.rgb, order="C")  # a copy: the caller may fill one image again and again
+        rgb = np.array(frame.rgb, order="C")  # a copy, because the caller may reuse the image
         if self._ignored is not None:
             depth = np.where(self._ignored.depth, np.float32(0), depth)
             rgb = rgb if frame.color is None else self._ignored.filled(rgb)
@@ -93,7 +96,7 @@ class Preprocessor:
         if self._unseen is not None and frame.color is not None:
             depth = np.where(self._unseen, np.float32(0), depth)
         depth = filter_depth(depth, self._parameters)
-        if self._ignored_depth is not None:  # holes are filled from their neighbours
+        if self._ignored_depth is not None:  # hole filling may have filled them
             depth[self._ignored_depth] = 0
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
@@ -109,7 +112,7 @@ class Preprocessor:
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
     ) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) registered to the depth as far as is possible without the camera's motion."""
+        """Colours (H, W, 3) registered to the depth, as far as possible without the camera's motion."""
         if calibration.is_instant(offset):
             projection = color_projection(calibration, np.zeros(6), offset)
             return register_color(recorded, depth, self.camera, projection)
@@ -120,7 +123,7 @@ class Preprocessor:
         return np.asarray(cv2.resize(recorded, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Undistorted mask (H, W) bool of a frame, in memory of its own.
+        """Undistorted copy of a mask (H, W) bool of a frame.
 
         Raises:
             FrameError: The mask does not have the camera's size, or is not boolean.
@@ -139,7 +142,7 @@ class Preprocessor:
     def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask (H, W) bool of an observation in the geometry of the recorded image: the inverse of ``mask``.
 
-        Pixels of the recorded image outside the observation, and ignored ones, are False.
+        Ignored pixels, and pixels outside the observation, are False.
         """
         if self._ignored is not None and self._ignored_depth is not None:
             mask = mask & ~self._ignored_depth
@@ -178,7 +181,7 @@ class Preprocessor:
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Both images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel.
 
-        Colour of a camera with a calibration stays as it is: its registration includes the distortion.
+        Colour of a separate camera is unchanged, because its registration includes the distortion.
         """
         import cv2
 
@@ -192,8 +195,8 @@ class Preprocessor:
 
 
 def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray[np.bool_] | None:
-    """Pixels (H, W) of the depth image whose surface, at a ``typical`` depth (m), the colour camera does not see; None
-    if it sees all."""
+    """Pixels (H, W) of the depth image that the colour camera does not see at a ``typical`` depth (m); None if it
+    sees all."""
     import cv2
 
     points = camera.backproject(np.full(camera.shape, typical, np.float32)).reshape(-1, 3).astype(np.float64)
@@ -207,7 +210,7 @@ def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
     """Map pairs of cv2.remap from the undistorted image into the distorted one: nearest pixel, and interpolated.
 
-    The fixed-point map of the interpolation cannot serve both: without its fractions it rounds down, half a pixel off.
+    They differ because the fixed-point map of the interpolation rounds down without its fractions, half a pixel off.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Images whose rows are taken one after the other, as a global shutter would have taken them."""
+"""Rectification of rolling-shutter images to the time of the middle row."""
 
 from dataclasses import replace
 
@@ -22,18 +22,18 @@ def rectified_images(
     velocity: NDArray[np.float64],
     color: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
-    """Depth (H, W) and colour (H, W, 3; empty without one) at the time of the middle row, and the numbers (H, W) of the
-    recorded pixels that they show.
+    """Depth (H, W) and colour (H, W, 3; empty without one) at the time of the middle row, and the indices (H, W) of the
+    recorded pixels.
 
-    A point that the camera sees at X in the middle of the readout is recorded in row v at exp(-tau xi) X with
-    tau = readout ((v + 1/2) / H - 1/2).
+    A point that the camera sees at X in the middle of the readout is recorded in row v at exp(-tau xi) X with tau =
+    readout ((v + 1/2) / H - 1/2).
 
     Args:
         depth: (H, W), metres, 0 = none.
-        camera: Of both images, without distortion.
+        camera: Camera of both images, without distortion.
         readout: Time from the first to the last row, seconds.
         velocity: (6,) twist xi of the camera per second, its own axes.
-        color: (H, W, 3), whose rows are taken together with those of the depth.
+        color: (H, W, 3), with the row times of the depth.
     """
     projection = color_projection(Calibration(camera, depth_readout=readout), velocity, 0.0)
     h, w = depth.shape
@@ -56,10 +56,10 @@ def rectified(
 
     Args:
         observation: As recorded.
-        readout: Of the depth image, seconds.
+        readout: Readout of the depth image, seconds.
         velocity: (6,) twist of the camera per second, its own axes.
-        with_color: The colours are those of the same pixels at the same time; else they stay as they are, and are
-            registered afterwards.
+        with_color: Whether colour has the row times of the depth and is rectified with it. Otherwise colour stays as
+            recorded and is registered afterwards.
     """
     color = observation.rgb if with_color else None
     depth, rgb, sources = rectified_images(observation.depth, observation.camera, readout, velocity, color)
@@ -71,7 +71,7 @@ def rectified(
 
 
 def recorded_mask(mask: NDArray[np.bool_], observation: Observation) -> NDArray[np.bool_]:
-    """Mask (H, W) of an observation in the geometry in which it was recorded."""
+    """Mask (H, W) of an observation in the geometry of the recorded image."""
     if observation.sources is None or not mask.any():
         return mask
     out = np.empty_like(mask)

@@ -1,4 +1,4 @@
-"""Recognition of frames that a sensor or a driver has spoilt or repeated: wrong stamps, old images, a changed unit."""
+"""Detection of faulty frames in a stream: wrong stamps, repeated images, a changed depth unit."""
 
 import statistics
 from collections import deque
@@ -12,33 +12,34 @@ from dudmap.core.frames.observation import Observation
 from dudmap.core.state import Remembered, Stateful
 
 INTERVALS = 30
-"""Intervals between stamps that the usual one, their median, is taken from."""
+"""Number of recent intervals between stamps; their median is the usual interval."""
 BURST_SHARE = 0.1
-"""Share of the usual interval below which two stamps cannot be those of two exposures: frames that waited somewhere and
+"""Share of the usual interval below which two stamps cannot belong to two exposures, but to delayed frames that
 arrived at once. Late frames of real sensors leave more than a third."""
 FURTHEST_STEP = 60.0
-"""Step of the stamps that is believed at once, seconds; a longer one may be a single wrong stamp."""
+"""Largest step of the stamps that is accepted at once, seconds; a longer one may be a single wrong stamp."""
 AGREEING = 5
-"""Frames in a row whose stamps agree, and contradict the last one used, from which on the clock counts as set."""
+"""Number of consecutive frames with consistent stamps, contradicting the last used one, after which the clock counts
+as reset."""
 STRIDE = 4
-"""Every so many pixels, across and down, are compared for a change of the unit."""
+"""Stride in rows and columns of the pixels compared for a change of the unit."""
 MIN_PIXELS = 100
-"""Readings that both images must have at the same pixels for their ratio to be judged."""
+"""Smallest number of pixels with depth in both images for a comparison."""
 SMALLEST_FACTOR = 1.5
 """Smallest change of the unit: units differ by more (0.2 mm, 1/4 mm, 1 mm, 1 m)."""
 SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
 """A change of the unit multiplies the depth by one factor, with this relative tolerance, at this share of pixels."""
 LONGEST_MEMORY = 1.0
-"""Longest time between two images whose depths are compared, seconds; the camera may look elsewhere then."""
+"""Longest time between two compared depth images, seconds; after longer times the view may differ."""
 
 Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 """Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""
 Repeats = Literal["", "frame", "depth", "color"]
-"""The part of a frame that equals the frame before bit for bit."""
+"""The part of a frame that equals the previous frame bit for bit."""
 
 
 class Rejection(NamedTuple):
-    """Why a frame is not used: the key under which it is counted (``duplicate``, ``order``, ``burst``, ``clock`` or
+    """Reason why a frame is not used: the key of its counter (``duplicate``, ``order``, ``burst``, ``clock`` or
     ``unit``), and a sentence."""
 
     kind: str
@@ -46,18 +47,21 @@ class Rejection(NamedTuple):
 
 
 class StreamCheck(Stateful):
-    """Judges every frame before it is registered, by its stamp and by the frame before.
+    """Checks the stamp and the images of every frame against the previous frames, before registration.
 
-    Stamps must increase. If AGREEING frames in a row increase among themselves but not after the last one used, the
-    clock has been set: the stamps from there on are continued from the last one used, by the usual interval.
+    Stamps must increase. The clock counts as reset if ``AGREEING`` consecutive frames increase among themselves but not
+    after the last used one. Their stamps are then shifted to follow the last used one by the usual interval.
 
-    An image that is bit for bit that of the frame before is the same one, since the noise of a sensor never repeats: a
-    stream is slower than the other, or a driver hands out the last image again where it has lost one. A
-    unit that changes multiplies all depths by one factor from one image to the next, faster than the fastest camera
-    explains; frames are then rejected until the factor is taken back.
+    An image that equals the previous one bit for bit is a repetition, because sensor noise never repeats. It occurs if
+    one stream is slower than the other, or if a driver repeats an image in place of a lost one.
 
-    ``max_speed`` is the largest speed of the camera, m/s; ``clock_offset`` what is added to the stamps of the stream
-    since its clock was set back, s; ``repeats`` what the last frame judged repeats of the frame before.
+    A change of the depth unit multiplies all depths by one factor between two images, faster than any camera motion.
+    Frames are then rejected until the factor is reversed.
+
+    Attributes:
+        max_speed: Largest speed of the camera, m/s.
+        clock_offset: Time added to the stamps since the clock was reset, s.
+        repeats: Part of the last frame that repeats the previous frame.
     """
 
     clock_offset: Remembered[float] = 0.0
@@ -67,7 +71,7 @@ class StreamCheck(Stateful):
     _intervals: Remembered[deque[float]]
     _arrived: Remembered[float | None] = None  # stamp of the last frame, valid or not
     _before: Remembered[Images | None] = None  # of the last frame
-    _compared: Remembered[tuple[float, NDArray[np.float32]] | None] = None  # stamp and depth of the last with readings
+    _compared: Remembered[tuple[float, NDArray[np.float32]] | None] = None  # stamp and depth of the last with depth
     _unit: Remembered[float] = 0.0  # logarithm of the factor by which the unit has changed
 
     def __init__(self, max_speed: float) -> None:
@@ -82,9 +86,9 @@ class StreamCheck(Stateful):
         return replace(observation, timestamp=observation.timestamp + self.clock_offset)
 
     def rejection(self, observation: Observation) -> Rejection | None:
-        """Why a frame cannot be used, None if it can; each frame is to be judged once, in order of arrival.
+        """Reason why a frame cannot be used, None if it can. Each frame must be checked once, in order of arrival.
 
-        A frame that is used because the clock was found to be set changes ``clock_offset``: it is to be restamped.
+        A frame that proves a clock reset is accepted and changes ``clock_offset``; the caller then calls ``restamped``.
         """
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
         self.repeats = "" if before is None else repeated(before, self._before)
@@ -115,7 +119,7 @@ class StreamCheck(Stateful):
         return None
 
     def _contradiction(self, stamp: float) -> Rejection | None:
-        """Why a stamp cannot follow the last one that was used."""
+        """Reason why a stamp cannot follow the last used one."""
         if self._last_stamp is None:
             return None
         step = stamp - self._last_stamp
@@ -145,7 +149,7 @@ class StreamCheck(Stateful):
             factor = sudden_factor(compared[1], depth, self.max_speed * (stamp - compared[0]))
             self._unit += np.log(factor)
         elif compared is not None and np.count_nonzero(depth) >= MIN_PIXELS:
-            self._unit = 0.0  # after a pause nothing is known of the unit
+            self._unit = 0.0  # after a pause the unit is unknown
         if abs(self._unit) < np.log(SMALLEST_FACTOR):
             self._unit = 0.0
             return None
@@ -153,8 +157,10 @@ class StreamCheck(Stateful):
 
 
 def repeated(before: Images, after: Images) -> Repeats:
-    """The part of a frame that repeats the frame before. Empty depth images do not repeat. Repeated depth without
-    colour is a repeated ``frame``."""
+    """The part of a frame that repeats the previous frame.
+
+    Empty depth images do not repeat. Repeated depth without colour is a repeated ``frame``.
+    """
     depth = _equal(before[0], after[0]) and bool(after[0].any())
     if before[1] is None or after[1] is None:
         return "frame" if depth and before[1] is after[1] else "depth" if depth else ""
@@ -163,18 +169,18 @@ def repeated(before: Images, after: Images) -> Repeats:
 
 
 def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach: float) -> float:
-    """Factor by which all depths have changed, 1 where it may have been the camera or something in view.
+    """Factor by which all depths have changed, 1 if camera or scene motion may explain the change.
 
     Args:
-        before, after: (h, w) metres, 0 = no reading.
-        reach: How far the camera may have moved in between, metres.
+        before, after: (h, w) metres, 0 = none.
+        reach: Largest camera motion between the images, metres.
     """
     both = (before > 0) & (after > 0)
     count, most = np.count_nonzero(both), np.float32(SMALLEST_FACTOR)
     if count < MIN_PIXELS:
         return 1.0
     usual = np.count_nonzero(both & (after < most * before) & (before < most * after))
-    if 2 * usual > count:  # so is the median, which takes longer
+    if 2 * usual > count:  # then so is the median, which takes longer
         return 1.0
     before, after = before[both], after[both]
     ratios = after / before
@@ -187,6 +193,6 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
 
 
 def _equal(a: NDArray, b: NDArray) -> bool:
-    """Whether two images are equal; of most that are not, the middle row tells."""
+    """Whether two images are equal; the middle row alone reveals most differences."""
     middle = a.shape[0] // 2
     return a.shape == b.shape and a[middle].tobytes() == b[middle].tobytes() and np.array_equal(a, b)

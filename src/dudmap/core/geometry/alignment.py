@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 SUCCESS = 0.9999
-"""Probability with which at least one sample of the RANSAC consists of inliers."""
+"""Probability with which at least one RANSAC sample consists of inliers."""
 MIN_SIDE = 0.1
-"""Samples with a shorter side define the rotation poorly, metres."""
+"""Shortest side of a sample, metres; shorter sides define the rotation poorly."""
 REFINEMENTS = 3
-"""Least-squares fits to the inliers, each followed by a new choice of the inliers."""
+"""Number of least-squares fits to the inliers; the inliers are selected again after each."""
 
 
 def rigid_ransac(
@@ -19,15 +19,18 @@ def rigid_ransac(
     tolerance: NDArray[np.float64],
     inlier_share: float = 0.25,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Rigid motion T_a_b that the most pairs of points agree with (RANSAC); the same input gives the same answer.
+    """Rigid motion T_a_b with the most inliers among pairs of points (RANSAC); deterministic.
 
-    ``a`` and ``b`` (m, 3) are the same points in two frames, ``tolerance`` (m,) is the largest distance between ``a``
-    and ``T_a_b b`` of an inlier, metres. ``inlier_share`` is the smallest share w of inliers at which the motion is to
-    be found, at least 0.1; with a probability p that takes ``log(1 - p) / log(1 - w^3)`` samples of three pairs.
+    RANSAC draws ``log(1 - p) / log(1 - w^3)`` samples of three pairs for a success probability p = ``SUCCESS``.
+
+    Args:
+        a, b: (m, 3) the same points in two frames, metres.
+        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of an inlier, metres.
+        inlier_share: Smallest inlier share w at which the motion is found, at least 0.1.
 
     Returns:
-        T_a_b (4, 4), the least-squares fit to all inliers, and the inliers (m,) bool. If no motion was found the
-        identity and no inliers.
+        T_a_b (4, 4), the least-squares fit to all inliers, and the inliers (m,) bool. The identity and no inliers if no
+        motion was found.
     """
     no_motion = np.eye(4), np.zeros(len(a), dtype=bool)
     if len(a) < 3:
@@ -60,13 +63,13 @@ def umeyama(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.
     """Least-squares rigid alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42).
 
     Returns:
-        T_a_b (..., 4, 4), metres, and the extent (..., 3) of the two sets together along the principal directions,
-        metres: the square roots of the singular values of their cross-covariance. The rotation is determined only if
-        the second is not zero.
+        T_a_b (..., 4, 4), metres, and the joint extent (..., 3) of both sets along the principal directions, metres.
+        The extents are the square roots of the singular values of the cross-covariance. The rotation is determined only
+        if the second extent is not zero.
     """
     a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
     U, singular, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
-    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # -1 where the best orthogonal matrix is a reflection
+    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # -1 if the best orthogonal matrix is a reflection
     T = np.zeros((*a.shape[:-2], 4, 4))
     T[..., :3, :3] = U @ V_t
     T[..., :3, 3] = (a_mean - b_mean @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]

@@ -1,4 +1,4 @@
-"""Lists of timed files and their association by time."""
+"""Lists of timed files, and their association by time."""
 
 import os
 import re
@@ -14,11 +14,11 @@ from dudmap.errors import DatasetError
 from dudmap.input_files import read_text
 
 LARGEST_GAP = 0.02
-"""Largest time difference of an associated pair, seconds (that of the TUM benchmark's script)."""
+"""Largest time difference of an associated pair, seconds (default of the TUM benchmark's script)."""
 
 
 class TimedFile(NamedTuple):
-    """One line of a list: seconds and place of the file, and the unit in which the list gives the time."""
+    """One line of a list: time in seconds, place of the file, and the time unit of the list."""
 
     timestamp: float
     place: str | Path
@@ -26,12 +26,12 @@ class TimedFile(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Path of the file, made when it is needed: a list may have a million lines."""
+        """Path of the file, built on access because a list may have a million lines."""
         return Path(self.place)
 
 
 FIELD = re.compile(r""""[^"]*"|'[^']*'|[^\s,]+""")
-"""A field of a list, with the quotes around it if there are any; blanks and commas separate fields."""
+"""A field of a list, including quotes; blanks and commas separate fields."""
 PLAIN = re.compile(r"""[^\s,"']+\s+[^\s,"']+""")
 """A row of a time and a name without blanks, commas and quotes."""
 
@@ -43,7 +43,7 @@ def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[in
 
     Args:
         path: The list.
-        columns: Names of the fields, blank between them, e.g. ``timestamp file``.
+        columns: Names of the fields, separated by blanks, e.g. ``timestamp file``.
         short: Whether lines with fewer fields are returned, too.
 
     Raises:
@@ -72,7 +72,8 @@ def _lines(path: Path, columns: str, *, short: bool = False) -> Iterator[tuple[i
 
 
 def read_list(path: Path) -> list[TimedFile]:
-    """Files of a list ``timestamp file``, paths relative to the list's folder, times in any unit of ``time_unit``.
+    """Files of a list ``timestamp file``, with paths relative to the list's folder and times in any unit of
+    ``time_unit``.
 
     Raises:
         DatasetError: The list is unreadable, or its times are not finite and strictly increasing.
@@ -80,7 +81,7 @@ def read_list(path: Path) -> list[TimedFile]:
     numbers, stamps, names = [], [], []
     for number, line in _lines(path, "timestamp file"):
         numbers.append(number)
-        if PLAIN.fullmatch(line):  # as in nearly all lists, and ten times as fast
+        if PLAIN.fullmatch(line):  # nearly all lists, and ten times as fast
             stamp, name = line.split()
         else:
             first, *rest = FIELD.finditer(line)
@@ -115,7 +116,7 @@ def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
 
 
 def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> int:
-    """Place of the second time in a row of two times and two files, whose names may hold blanks."""
+    """Index of the second time in a row of two times and two files, whose names may contain blanks."""
     if len(fields) == 4:
         return 2
     places = [place for place in range(2, len(fields) - 1) if re.fullmatch(r"[-+.\deE]+", fields[place].group())]
@@ -126,7 +127,7 @@ def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]
 
 
 def _name(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> str:
-    """Name of a file in a row: the first of some fields, or all of them if it holds blanks."""
+    """Name of a file in a row: the first field, or all fields if the name contains blanks."""
     if not fields:
         raise DatasetError(f"{path}, line {number}: expected the name of a file after its time, found {line!r}")
     name = fields[0].group()
@@ -143,10 +144,10 @@ def _in_seconds(path: Path, stamps: list[float], names: list[str]) -> list[Timed
 
 
 def parse_stamp(path: Path, number: int, text: str) -> float:
-    """A finite time in seconds.
+    """A finite time, as written.
 
     Raises:
-        DatasetError: The text is no number, NaN or infinite.
+        DatasetError: The text is not a finite number.
     """
     try:
         stamp = float(text.strip("\"'"))
@@ -176,7 +177,7 @@ def check_increasing(path: Path, numbers: list[int], stamps: list[float]) -> Non
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], largest_gap: float = LARGEST_GAP
 ) -> list[tuple[int, int]]:
-    """One-to-one pairs of nearest times, chosen greedily by increasing time difference.
+    """One-to-one pairs of nearest times, selected greedily by increasing time difference.
 
     Returns indices into the increasing times (N,) and (M,), seconds, in the order of ``second``.
     """

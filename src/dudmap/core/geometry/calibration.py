@@ -1,4 +1,4 @@
-"""Calibration of a colour camera against the depth camera: geometry and timing."""
+"""Calibration of a colour camera relative to the depth camera: geometry and timing."""
 
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
@@ -20,39 +20,41 @@ PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
     "center_x", "center_y", "k1", "k2", "delay", "readout",
 )  # fmt: skip
-"""Parameters that can be estimated, in the order of a step (13,): metres, radians, logarithm of the focal lengths,
-pixels of the colour image, the first two coefficients of radial lens distortion (thesis eq. 3.88), seconds."""
+"""Parameters that can be estimated, in the order of a step (13,). Units are metres, radians, logarithm of the focal
+lengths, and pixels of the colour image. k1 and k2 are the first coefficients of radial lens distortion (thesis eq.
+3.88); times are seconds."""
 NUM_PARAMETERS = len(PARAMETERS)
 MAX_VIGNETTING = 2.0
-"""Largest vignetting: no camera whose colours are of use loses seven eighths of the light in its corners."""
+"""Largest vignetting: exp(-2) is a loss of seven eighths of the light in the corners, beyond any usable camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Where and when the colour image was taken, relative to the depth image of the same frame.
+    """Pose, lens and timing of the colour camera relative to the depth image of the same frame.
 
-    A point X of the depth camera at the time of the depth image is seen by the colour camera at
-    ``T_color_depth exp(-tau xi) X``, with the twist xi of the depth camera's motion (its own axes, per second) and
-    tau = difference of the two time stamps + ``delay`` + (``depth_readout`` + ``readout``) (row / height - 1/2),
-    seconds. The rows of the depth image are taken one after the other as well, ``depth_readout`` (row / height - 1/2)
-    after its middle row, at whose time it is rectified before anything else (``core/frames/rolling_shutter.py``).
+    The colour camera sees a point X of the depth camera, at the time of the depth image, at ``T_color_depth exp(-tau
+    xi) X``. xi is the twist of the depth camera's motion (its own axes, per second). tau, in seconds, is the difference
+    of the two time stamps + ``delay`` + (``depth_readout`` + ``readout``) (row / height - 1/2).
+
+    Depth images have a rolling shutter as well: a row is taken ``depth_readout`` (row / height - 1/2) after the middle
+    row. They are first rectified to the time of the middle row (``core/frames/rolling_shutter.py``).
 
     Attributes:
         camera: Intrinsics of the colour camera; its ``depth_scale`` has no meaning.
-        T_color_depth: (4, 4) points of the depth camera into the colour camera.
-        delay: Time of the middle row of the colour image minus that of the depth image, beyond the time stamps, s.
-        readout: Time from the first to the last row of the colour image (rolling shutter) beyond that of the depth
-            image, s: 0 where both rows of a pixel are taken together.
-        sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
-        estimated: Names of the parameters that were estimated; the others are as given.
+        T_color_depth: (4, 4) maps points of the depth camera into the colour camera.
+        delay: Time of the middle row of the colour image minus time of the middle row of the depth image, beyond the
+            time stamps, s.
+        readout: Time from the first to the last row of the colour image (rolling shutter) minus the readout of the
+            depth image, s. 0 if both rows of a pixel are taken together.
+        sigma: (13,) standard deviations of ``PARAMETERS``, NaN if unknown.
+        estimated: Names of the estimated parameters; the others are given.
         depth_readout: Time from the first to the last row of the depth image (rolling shutter), s.
-        depth_late: Time by which the stamps of the depth images are later than the images, s: no image is stamped
-            before it is taken, so that where both have stamps of their own and the colours were found to be taken later
-            by a ``delay``, it is the depth that is stamped too late.
-        vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners; it grows
-            with the squared distance to the middle.
-        vignetting_sigma: Its standard deviation, NaN where unknown.
-        depth_readout_sigma: That of the depth's readout, s.
+        depth_late: Time by which the stamps of depth images are too late, s. An image is never stamped before it is
+            taken. Therefore a positive ``delay`` of independent stamps means late depth stamps.
+        vignetting: Logarithm of the brightness in the middle of the colour image over the brightness in its corners. It
+            grows with the squared distance to the middle.
+        vignetting_sigma: Standard deviation of the vignetting, NaN if unknown.
+        depth_readout_sigma: Standard deviation of ``depth_readout``, s.
     """
 
     camera: Camera
@@ -89,21 +91,21 @@ class Calibration:
 
     @classmethod
     def registered(cls, camera: Camera) -> "Calibration":
-        """Colour that is registered to depth and taken at the same time: nothing has to be done."""
+        """Calibration of colour that is registered to depth and taken at the same time; it changes nothing."""
         return cls(replace(camera, distortion=()))
 
     def is_registered(self, depth_camera: Camera) -> bool:
-        """Whether the pixels of both images correspond, as bright as they are, time stamps aside."""
+        """Whether the pixels of both images correspond with equal brightness, apart from time stamps."""
         one, other = self.camera, depth_camera
         same = (one.fx, one.fy, one.cx, one.cy, one.shape) == (other.fx, other.fy, other.cx, other.cy, other.shape)
         plain = self.delay == 0 and self.readout == 0 and self.vignetting == 0
         return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
     def time_sigma(self, assumed: float) -> float:
-        """Standard deviation of the time between the colour and the depth of a pixel, seconds.
+        """Standard deviation of the time between colour and depth of a pixel, seconds.
 
-        Where the timing was estimated that of the delay and of the row times (sigma / sqrt 12) of the colours and of
-        the depth, whose images are bent by a readout that they do not show clearly enough; else ``assumed``.
+        If the timing was estimated: root of the sum of the variances of the delay and of both row times (sigma / sqrt
+        12). Otherwise ``assumed``.
         """
         if not {"delay", "depth_readout"} & set(self.estimated) or np.isnan(self.depth_readout_sigma):
             return assumed
@@ -122,8 +124,11 @@ class Calibration:
         return out
 
     def with_depth_readout(self, depth_readout: float) -> "Calibration":
-        """The same colour camera beside a depth camera of another readout, seconds: the rows of the colour image keep
-        their times where these were estimated, else their times relative to those of the depth image."""
+        """The same colour camera with another readout of the depth camera, seconds.
+
+        If the colour readout was estimated, its rows keep their absolute times, else their times relative to the rows
+        of the depth image.
+        """
         known = "readout" in self.estimated
         readout = self.readout + self.depth_readout - depth_readout if known else self.readout
         return replace(self, readout=readout, depth_readout=depth_readout)
@@ -165,12 +170,12 @@ class Calibration:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Standard deviations by name, NaN where unknown."""
+        """Standard deviations by name, NaN if unknown."""
         others = {"vignetting": self.vignetting_sigma, "depth_readout": self.depth_readout_sigma}
         return dict(zip(PARAMETERS, self.sigma.tolist(), strict=True)) | others
 
     def tree(self) -> dict[str, Any]:
-        """Nested dictionary of numbers, lists and words, as in the file and in metrics.json; NaN is left out."""
+        """Nested dictionary of numbers, lists and words, as in the file and in metrics.json, without NaN."""
         sigma = {name: value for name, value in self.sigmas.items() if np.isfinite(value)}
         camera = asdict(self.camera) | {"distortion": list(self.camera.distortion)}
         del camera["depth_scale"]
@@ -193,10 +198,10 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path) -> "Calibration":
-        """Calibration of a TOML file as ``save`` writes it.
+        """Read a TOML file that ``save`` wrote.
 
         Raises:
-            DatasetError: The file is missing, not TOML, or lacks a value or holds an invalid one.
+            DatasetError: The file is missing or not TOML, or a value is missing or invalid.
         """
         try:
             tree = read_toml(path)

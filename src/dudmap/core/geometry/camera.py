@@ -11,12 +11,12 @@ from dudmap.errors import DatasetError
 
 Scalar = TypeVar("Scalar", bound=np.floating)
 LARGEST_PIXELS = 2**26
-"""Largest number of pixels of an image, 8192x8192; the images of phones have up to 50 million."""
+"""Largest number of pixels of an image, 8192x8192; phone images have up to 50 million."""
 SMALLEST_FOCAL, LARGEST_COORDINATE = 1e-2, 1e6
-"""Least focal length, and largest focal length and place of the principal point, pixels: views of all but 180 degrees
-and of a thousandth of a degree. Beyond, rays have no distinct 32-bit directions."""
+"""Smallest focal length, and largest focal length and principal point, pixels. They correspond to a view of almost
+180 degrees and of a thousandth of a degree. Beyond, rays have no distinct 32-bit directions."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e9
-"""Units of depth per metre: a unit is a kilometre or less and a nanometre or more. 16-bit values stay finite then."""
+"""Units of depth per metre, from kilometres to nanometres. 16-bit values stay finite in this range."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Camera:
 
     @cached_property
     def intrinsics(self) -> NDArray[np.float32]:
-        """(4,) float32 fx, fy, cx, cy in pixels, the form that kernels use."""
+        """(4,) float32 fx, fy, cx, cy in pixels, for kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float32)
 
     @cached_property
@@ -112,14 +112,14 @@ class Camera:
         )
 
     def backproject(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); the origin where there is no reading."""
+        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); the origin for pixels without depth."""
         u = (np.arange(depth.shape[1], dtype=np.float32) - np.float32(self.cx)) / np.float32(self.fx)
         v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
         z = depth.astype(np.float32)
         return np.stack([z * u[None, :], z * v[:, None], z], axis=-1).astype(np.float32, copy=False)
 
     def points(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Points (n, 3) in metres, camera frame, at pixels u, v (n,) with depths z (n,), in the precision of these."""
+        """Points (n, 3) in metres, camera frame, at pixels u, v (n,) with depths z (n,), in the precision of ``z``."""
         out = np.empty((len(z), 3), z.dtype)
         out[:, 0], out[:, 1], out[:, 2] = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z
         return out
@@ -136,7 +136,7 @@ class Camera:
     def nearest_pixels(
         self, points: NDArray[np.floating], border: int = 0
     ) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of the points (n, 3) in the camera frame that lie in the image, not on its border of so many pixels, and
+        """Indices of the points (n, 3), camera frame, that project into the image inside ``border`` pixels, and
         their nearest pixels u, v."""
         pixels = np.rint(self.project(points))
         inside = np.all((pixels >= border) & (pixels < (self.width - border, self.height - border)), axis=1)
@@ -144,7 +144,7 @@ class Camera:
         return np.flatnonzero(inside), u, v
 
 
-@lru_cache(maxsize=32)  # asked for in every frame
+@lru_cache(maxsize=32)  # used in every frame
 def _scaled(camera: Camera, level: int) -> Camera:
     """See ``Camera.scaled``."""
     factor = 1.0 / (1 << level)

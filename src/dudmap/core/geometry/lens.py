@@ -1,4 +1,4 @@
-"""Images with and without lens distortion, and as a second camera beside the first sees them."""
+"""Lens distortion of rendered images, and reprojection of depth and masks into a second camera."""
 
 from dataclasses import replace
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 
 BEHIND = 0.03
-"""A reading hides another one that is farther by this share: two standard deviations of a depth camera at 4 m, and as
-much again for the pixels of one camera that lie between those of the other."""
+"""Share by which a surface must be nearer to hide another one. It is two standard deviations of a depth camera at 4
+m, doubled for pixels of one camera that lie between pixels of the other."""
 
 
 class Lens:
-    """Geometry of the recorded images of a camera; ``straight`` is the same camera without distortion, which rendered
-    images have."""
+    """Geometry of the recorded images of a camera; ``straight`` is the same camera without distortion, used for
+    rendered images."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -45,7 +45,7 @@ class Lens:
         return self.camera.points(u, v, z)
 
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Recorded pixels (n, 2) and depths (n,) of points (n, 3); behind the camera the pixels are (-1, -1)."""
+        """Recorded pixels (n, 2) and depths (n,) of points (n, 3); (-1, -1) for points behind the camera."""
         z = points[:, 2]
         if self.camera.distortion:
             import cv2
@@ -59,7 +59,7 @@ class Lens:
 
 
 class OtherView:
-    """From the depth camera to a second camera."""
+    """Reprojection from the depth camera into a second camera."""
 
     def __init__(self, depth_lens: Lens, color_lens: Lens) -> None:
         self.depth_lens, self.color_lens = depth_lens, color_lens
@@ -67,18 +67,21 @@ class OtherView:
         self._spread = max(1, int(np.ceil(max(other.fx / one.fx, other.fy / one.fy))))
 
     def depth(self, depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (h, w), metres along the axis of the second camera, of a depth image (H, W); 0 where no reading falls.
-        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera, each at its own time."""
+        """Depth (h, w), metres, of a depth image (H, W) in the second camera; 0 for pixels without a projected
+        measurement.
+
+        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera, each at its own time.
+        """
         rows, columns = np.nonzero(depth > 0)
         return self._splatted(rows, columns, depth[rows, columns], T_color_depth)
 
     def mask(
         self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the second camera that show what the mask (H, W) marks in the depth camera's image.
+        """Pixels (h, w) of the second camera that show the surface marked by a mask (H, W) of the depth camera.
 
-        Marked pixels without a reading have that of the nearest marked pixel with one; what the other readings hide
-        from the second camera is left out.
+        Marked pixels without depth take the depth of the nearest marked pixel. Surfaces that other pixels hide from the
+        second camera are left out.
         """
         from scipy.ndimage import binary_closing, distance_transform_edt
 
@@ -96,7 +99,9 @@ class OtherView:
     def _splatted(
         self, rows: NDArray[np.intp], columns: NDArray[np.intp], z: NDArray[np.float32], T: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Nearest depths (h, w) of pixels (n,) with depths (n,); each covers as many pixels as its own is wide."""
+        """Nearest depths (h, w) of pixels (n,) with depths (n,); each pixel covers its own width in the second
+        camera.
+        """
         points = self.depth_lens.points(rows, columns, z.astype(np.float64))
         uv, depths = self.color_lens.project(points @ T[:3, :3].T + T[:3, 3])
         order = np.argsort(-depths)  # the nearest is written last

@@ -40,16 +40,16 @@ class Mesh:
             object.__setattr__(self, name, copied(getattr(self, name), f"{name} of a mesh", dtype=None))
 
     def __repr__(self) -> str:
-        """The sizes without the arrays."""
+        """Sizes without the arrays."""
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles)"
 
     def area(self) -> float:
-        """Surface in square metres."""
+        """Surface area in square metres."""
         a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
     def save(self, path: str | Path) -> None:
-        """Write the mesh in the format that the file's ending names: .ply (binary), .obj, .glb or .stl.
+        """Write the mesh; the file's ending selects the format: .ply (binary), .obj, .glb or .stl.
 
         Raises:
             MapError: The ending is none of these, or the file cannot be written.
@@ -101,14 +101,14 @@ class Mesh:
             raise MapError(f"cannot read the mesh {path}: {error}") from error
         if own is not None and len(own.vertices) > 0:
             return own
-        if path.suffix.lower() not in FORMATS:  # others may be archives, or name further files
+        if path.suffix.lower() not in FORMATS:  # other formats may be archives or refer to further files
             raise MapError(f"cannot read the mesh {path}; the ending must be one of {', '.join(FORMATS)}")
         with foreign(MapError, f"the mesh {path}"):
             return cls._load_foreign(path)
 
     @classmethod
     def _load_foreign(cls, path: Path) -> "Mesh":
-        """Read a file that another program wrote; materials, which name further files, are left out."""
+        """Read a file of another program, without materials, because they refer to further files."""
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
@@ -137,7 +137,7 @@ class Mesh:
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Meshes as one, which shares no vertices between them."""
+    """Concatenate meshes without sharing vertices between them."""
     if not parts:
         empty = np.zeros((0, 3), dtype=np.float32)
         return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)
@@ -152,7 +152,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def component_of_vertices(mesh: Mesh) -> NDArray[np.int32]:
-    """Number (V,) of the connected component that each vertex belongs to."""
+    """Number (V,) of the connected component of each vertex."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -163,7 +163,7 @@ def component_of_vertices(mesh: Mesh) -> NDArray[np.int32]:
 
 
 def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
-    """Mesh of some of the triangles (F,) and the vertices that they need."""
+    """Mesh of some of the triangles (F,) and the vertices that they use."""
     faces = mesh.faces[kept]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True
@@ -172,7 +172,7 @@ def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
 
 
 def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
-    """Vertices and faces as they stand in a PLY file, in which the vertices of this mesh begin at number ``first``."""
+    """Vertices and faces in the layout of a PLY file, in which the vertices of this mesh begin at number ``first``."""
     vertex = np.empty(len(mesh.vertices), _PLY_VERTEX)
     vertex["xyz"], vertex["normal"], vertex["rgb"] = mesh.vertices, mesh.normals, mesh.colors
     face = np.empty(len(mesh.faces), _PLY_FACE)
@@ -205,7 +205,7 @@ def ply_layout(path: Path) -> tuple[NDArray, NDArray] | None:
 
 
 def ply_header(vertices: int, faces: int) -> str:
-    """Header of a binary PLY file as ``Mesh.save`` writes it; a point cloud has no element ``face``."""
+    """Header of a binary PLY file of ``Mesh.save``; a point cloud has no element ``face``."""
     lines = ["ply", "format binary_little_endian 1.0", "comment dudmap", f"element vertex {vertices}"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]

@@ -1,4 +1,4 @@
-"""Meshes that do not fit into the memory: written and read piece by piece."""
+"""Meshes larger than the memory: written and read in parts."""
 
 import shutil
 import tempfile
@@ -17,7 +17,7 @@ FACES_AT_ONCE = 500_000
 
 
 def save_pieces(pieces: Iterable[Mesh], path: str | Path) -> tuple[int, int]:
-    """Write the union of meshes that share no vertices as a binary PLY file, holding one of them at a time.
+    """Write the union of meshes that share no vertices as a binary PLY file, with one mesh in memory at a time.
 
     Returns:
         Numbers of vertices and faces.
@@ -45,9 +45,9 @@ def save_pieces(pieces: Iterable[Mesh], path: str | Path) -> tuple[int, int]:
 
 
 def load_simplified(path: str | Path, max_triangles: int) -> Mesh:
-    """A mesh of at most ``max_triangles`` made from a PLY file that this package wrote, which is read in pieces.
+    """Read a PLY file of this package in parts, as a mesh of at most ``max_triangles``.
 
-    Each piece is simplified by vertex clustering to four times its share of the triangles, then their union is.
+    Vertex clustering first reduces each part to four times its share of the triangles, then their union.
 
     Raises:
         MapError: The file is missing, or not a PLY file of this package.
@@ -58,14 +58,16 @@ def load_simplified(path: str | Path, max_triangles: int) -> Mesh:
         share = min(1.0, 4 * max_triangles / count)
         parts.append(simplified(piece, max(int(share * len(piece.faces)), 1)))
     whole = joined(parts)
-    if share < 1 and len(whole.faces):  # the pieces meet in vertices that are not shared: merge them first
+    if share < 1 and len(whole.faces):  # the parts share no vertices: merge them first
         whole = clustered(whole, mean_edge(whole) / 2)
     return simplified(whole, max_triangles)
 
 
 def _read_pieces(path: Path) -> Iterator[tuple[Mesh, int]]:
-    """Parts of a mesh file with at most ``FACES_AT_ONCE`` faces, each with the vertices between its first and its last,
-    and the number of all faces."""
+    """Parts of a mesh file with at most ``FACES_AT_ONCE`` faces, and the number of all faces.
+
+    A part contains the range of vertices that its faces use.
+    """
     try:
         layout = ply_layout(path)
     except OSError as error:

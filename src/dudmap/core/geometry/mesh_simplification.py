@@ -1,7 +1,7 @@
-"""Coarser meshes: the vertices in each cell of a grid become one (vertex clustering, Rossignac and Borrel 1993).
+"""Mesh simplification by vertex clustering (Rossignac and Borrel 1993): the vertices of each grid cell become one.
 
-The colours of a mesh are those of its vertices, so that simplification by quadrics, which leaves few vertices on a flat
-wall, would lose the picture on it; clustering keeps vertices evenly spaced.
+Colours belong to vertices. Simplification by quadrics leaves few vertices on a flat wall and would lose its texture;
+clustering keeps vertices evenly spaced.
 """
 
 import numpy as np
@@ -11,10 +11,10 @@ from dudmap.core.geometry.mesh import Mesh
 
 
 def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
-    """The mesh itself if it has at most ``max_triangles``, else a coarser one that has."""
+    """The mesh itself if it has at most ``max_triangles``, else a coarser mesh with at most as many."""
     count, cell, out = len(mesh.faces), mean_edge(mesh), mesh
     while count > max_triangles:
-        # the number of triangles of a surface falls with the square of the cells' edge; 2 % in case it falls short
+        # the number of triangles of a surface falls with the square of the cell size; 2 % as a margin
         cell *= 1.02 * np.sqrt(count / max_triangles)
         out = clustered(mesh, cell)
         count = len(out.faces)
@@ -22,10 +22,10 @@ def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
 
 
 def clustered(mesh: Mesh, cell: float) -> Mesh:
-    """Mesh in which all vertices in one cube of edge ``cell`` (metres) that face the same octant are one vertex.
+    """Mesh in which all vertices in one cube of edge ``cell`` (metres) with normals in the same octant are merged.
 
-    The new vertex has the mean position, colour and normal of the old ones. The octant of the normal keeps the two
-    sides of a thin wall apart. Triangles of which two corners fall together are dropped.
+    The merged vertex has their mean position, colour and normal. The octant of the normal keeps the two sides of a thin
+    wall apart. Triangles with two equal corners are dropped.
     """
     lowest = mesh.vertices.min(axis=0, initial=np.inf)
     cells = np.floor((mesh.vertices - lowest) / cell).astype(np.int64)
@@ -39,7 +39,7 @@ def clustered(mesh: Mesh, cell: float) -> Mesh:
 
     faces = cluster.reshape(-1)[mesh.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    turned = (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3  # smallest corner first, to find doubles
+    turned = (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3  # smallest corner first, to find duplicates
     faces = np.take_along_axis(faces, turned, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
     faces = faces[np.any(np.diff(faces, axis=0, prepend=-1) != 0, axis=1)]

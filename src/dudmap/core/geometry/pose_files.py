@@ -26,7 +26,7 @@ SAMPLED = 1000
 
 
 class PoseFormat(NamedTuple):
-    """A format: its name, the columns of a row, and the places of ``timestamp x y z qx qy qz qw`` among them.
+    """A format: its name, the columns of a row, and the indices of ``timestamp x y z qx qy qz qw`` among them.
 
     ``places`` is empty for matrices without times.
     """
@@ -58,8 +58,10 @@ class PoseFile(NamedTuple):
 def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     """Format of a file.
 
-    The header decides if it names the columns. Without such a header, lines of 12 or 16 numbers that hold a rotation
-    are KITTI. Numbers between blanks are TUM. Numbers between commas with times in nanoseconds are EuRoC.
+    The header decides if it names the columns. Without such a header:
+    - Lines of 12 or 16 numbers that contain a rotation are KITTI.
+    - Numbers separated by blanks are TUM.
+    - Numbers separated by commas with times in nanoseconds are EuRoC.
 
     Args:
         path: The file.
@@ -78,7 +80,7 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     lines = [line for line in lines if not line.startswith("#")]
     rows = list(islice((row for row in map(_numbers, lines) if any(row[4:8])), SAMPLED))
     if not rows:
-        return FORMATS["tum"]  # whose reader names the line at fault
+        return FORMATS["tum"]  # whose reader reports the faulty line
     row, commas = rows[0], "," in "".join(lines)
     if len(row) in (12, 16) and _holds_rotation(row):
         return FORMATS["kitti"]
@@ -98,19 +100,19 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
 
 
 def read_poses(path: Path, name: str | None = None, *, optional: bool = False, option: str = "--format") -> PoseFile:
-    """Poses of a file in the named format, or else in the recognised one.
+    """Poses of a file in the named or recognised format.
 
-    Comments and a header are left out, and times in another unit than seconds are converted.
+    Comments and a header are skipped; times in another unit than seconds are converted.
 
     Args:
         path: The file.
-        name: One of ``FORMATS``.
-        optional: Leave out rows of timed formats that hold no pose or do not increase in time; the remarks count them.
+        name: One of ``FORMATS``; None recognises the format.
+        optional: Skip rows of timed formats that are not a pose or do not increase in time; the remarks count them.
         option: As for ``pose_format``.
 
     Raises:
         ConfigError: The name is unknown.
-        DatasetError: The file is missing, has no clear format, holds no pose, or holds a row that is no pose.
+        DatasetError: The file is missing, has no clear format, has no pose, or has a row that is not a pose.
     """
     if name is not None and name not in FORMATS:
         raise ConfigError(f"the format of a trajectory is {name!r}; expected one of {', '.join(FORMATS)}")
@@ -168,12 +170,12 @@ def _matrix(path: Path, number: int, fields: list[str]) -> NDArray[np.float64]:
 
 
 def _numbers(line: str) -> list[float]:
-    """Numbers of a row; none if there is a field that is no finite number."""
+    """Numbers of a row; none if a field is not a finite number."""
     return _finite(line.replace(",", " ").split())
 
 
 def _finite(fields: list[str]) -> list[float]:
-    """Numbers of fields; none if one is no finite number."""
+    """Numbers of fields; none if one is not a finite number."""
     try:
         numbers = list(map(float, fields))
     except ValueError:

@@ -1,7 +1,7 @@
 """Rigid motions as 4x4 float64 matrices.
 
-``T_a_b`` maps points of frame b into frame a: ``p_a = T_a_b @ p_b``. A twist is ``xi = (v, omega)``, translation
-first, in metres and radians; updates are applied on the left, ``exp(xi) @ T``.
+``T_a_b`` maps points of frame b into frame a: ``p_a = T_a_b @ p_b``. A twist is ``xi = (v, omega)``, translation first,
+in metres and radians. Updates are applied on the left, ``exp(xi) @ T``.
 """
 
 import math
@@ -14,7 +14,7 @@ from dudmap.errors import FrameError
 Matrix = NDArray[np.float64]
 IDENTITY = np.eye(3)
 SMALL = 1e-8
-"""Squared angle below which a rotation is that of the Taylor series."""
+"""Squared angle below which a rotation is computed by the Taylor series."""
 
 
 def hat(omega: Matrix) -> Matrix:
@@ -26,7 +26,7 @@ def hat(omega: Matrix) -> Matrix:
 
 
 def exp(xi: Matrix) -> Matrix:
-    """Matrix exponential of a twist (6,): the rigid motion (4, 4) reached after unit time (thesis eq. 4.30).
+    """Matrix exponential of a twist (6,): the rigid motion (4, 4) after unit time (thesis eq. 4.30).
 
     Satisfies ``exp(log(T)) == T`` and ``exp(0) == identity``.
     """
@@ -49,7 +49,7 @@ def exp(xi: Matrix) -> Matrix:
 
 
 def exp_all(twists: Matrix) -> Matrix:
-    """Rigid motions (n, 4, 4) of twists (n, 6), each as by ``exp``."""
+    """Rigid motions (n, 4, 4) of twists (n, 6), see ``exp``."""
     v, omega = twists[:, :3, None], twists[:, 3:]
     theta_squared = np.sum(omega * omega, axis=1)[:, None, None]
     W = hat(omega)
@@ -101,10 +101,10 @@ def log(T: Matrix) -> Matrix:
 
 
 def log_all(Ts: Matrix) -> Matrix:
-    """Twists (n, 6) of rigid motions (n, 4, 4), each as by ``log``."""
+    """Twists (n, 6) of rigid motions (n, 4, 4), see ``log``."""
     omega, sine, cosine = _turns(Ts[:, :3, :3])
     omega *= np.where(sine < 1e-12, 0.5, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None]
-    for n in np.flatnonzero(cosine < 0).tolist():  # at half a turn the sine says nothing
+    for n in np.flatnonzero(cosine < 0).tolist():  # near half a turn the sine vanishes
         omega[n] = log_rotation(Ts[n, :3, :3])
     theta_squared = np.sum(omega * omega, axis=1)
     small = theta_squared < 1e-8
@@ -151,7 +151,7 @@ def rotation_angles(Ts: Matrix) -> Matrix:
 
 
 def _turns(R: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Axes (n, 3) of rotations times twice the sines of their angles, and twice the sines and cosines (n,)."""
+    """Rotation axes (n, 3) times twice the sine of the angle, and twice the sines and cosines (n,)."""
     axes = R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]
     return axes, np.linalg.norm(axes, axis=1), np.trace(R, axis1=1, axis2=2) - 1
 
@@ -193,7 +193,7 @@ def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
 
 
 def nearest_rotation(R: Matrix) -> Matrix:
-    """Rotations closest to ``R`` (..., 3, 3) in the Frobenius norm: removes the drift of repeated products."""
+    """Closest rotations to ``R`` (..., 3, 3) in the Frobenius norm; removes the drift of repeated products."""
     U, _, V_t = np.linalg.svd(R)
     U[..., 2] *= np.sign(np.linalg.det(U @ V_t))[..., None]
     return U @ V_t
@@ -224,7 +224,7 @@ def small_adjoint(xi: Matrix) -> Matrix:
 
 
 def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Matrix:
-    """Motion (4, 4) at a time, on the screw between the two neighbours in time; outside the range the nearest.
+    """Motion (4, 4) at a time, on the screw between its two temporal neighbours; the nearest motion outside the range.
 
     Args:
         timestamps: (n,) increasing, n > 0.
@@ -241,7 +241,7 @@ def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Mat
 
 
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
-    """Whether two poses (4, 4) are closer than a distance (m) and an angle (deg)."""
+    """Whether two poses (4, 4) differ by less than a distance (m) and an angle (deg)."""
     apart = T_a[:3, 3] - T_b[:3, 3]
     if math.sqrt(apart @ apart) >= distance:
         return False
@@ -249,14 +249,14 @@ def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, a
 
 
 LARGEST_SKEW = 0.02
-"""Largest difference of the products of a rotation's rows from 0 and 1 that roundings of two digits explain."""
+"""Largest difference of the products of a rotation's rows from 0 and 1 that rounding to two digits explains."""
 
 
 def checked_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pose (4, 4) from elsewhere as a rigid motion.
+    """Check that a given pose (4, 4) is a rigid motion, and orthonormalise its rotation.
 
     Raises:
-        FrameError: It is none.
+        FrameError: It is not a rigid motion.
     """
     T = np.array(T, dtype=np.float64)
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):

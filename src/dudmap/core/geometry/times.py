@@ -1,4 +1,4 @@
-"""Units of time stamps: exports of ROS and of cameras give nanoseconds, microseconds or milliseconds."""
+"""Units of time stamps: exports of ROS and of cameras use nanoseconds, microseconds or milliseconds."""
 
 from typing import NamedTuple
 
@@ -10,12 +10,12 @@ CENTURY = (1e9, 4.1e9)
 LONGEST_STEP = 1000.0
 """Largest plausible median time between two rows, seconds."""
 SLOWEST_COUNT = 10.0
-"""Largest median step of stamps that are seconds or count frames. As milliseconds it would be 100 images a second, more
-than depth cameras deliver at full size."""
+"""Largest median step of stamps in seconds or of frame counters. In milliseconds such a step would be 100 images a
+second, more than depth cameras deliver at full size."""
 
 
 class TimeUnit(NamedTuple):
-    """Unit of time stamps: its name, and how many make a second."""
+    """Unit of time stamps: its name, and its number per second."""
 
     name: str
     per_second: float
@@ -28,7 +28,7 @@ UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), 
 def time_unit(stamps: ArrayLike) -> TimeUnit:
     """Unit of time stamps (N,), in any order.
 
-    If all stamps lie in this century in one of the units, that is the unit. Otherwise the median step decides. At 1 to
+    If all stamps in one of the units lie in this century, it is the unit. Otherwise the median step decides. At 1 to
     1000 images a second it is at most 1 s, 10^3 ms, 10^6 us or 10^9 ns.
     """
     values = np.sort(np.asarray(stamps, dtype=np.float64))

@@ -15,7 +15,7 @@ from dudmap.errors import DatasetError
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw"
 LARGEST_STEP = 0.15
-"""Largest time between two poses, seconds, between which a camera is taken to move steadily."""
+"""Largest time between two poses for which constant velocity is assumed, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Trajectory:
     Attributes:
         timestamps: (N,) float64, seconds, strictly increasing.
         Ts_world_camera: (N, 4, 4) float64.
-        remarks: Sentences on the assumed unit of time and on rows that were left out.
+        remarks: Sentences on the assumed unit of time and on skipped rows.
     """
 
     timestamps: NDArray[np.float64]
@@ -72,10 +72,10 @@ class Trajectory:
         return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
 
     def after(self, seconds: float | NDArray[np.float64]) -> "Trajectory":
-        """Poses so many seconds, one number or (N,), after those of the same time stamps, or before where negative.
+        """Poses ``seconds`` (a number or (N,)) after the time stamps, or before them for negative numbers.
 
-        They lie on the screw to the next pose, or the one before; beside a gap longer than ``LARGEST_STEP`` and at the
-        ends on that through the two on the other side, if these are near enough.
+        They lie on the screw to the neighbouring pose in that direction. At the ends and at gaps longer than
+        ``LARGEST_STEP`` they use the screw of the opposite side. Without a near neighbour the pose does not move.
         """
         seconds = np.broadcast_to(seconds, len(self))[:, None]
         if not seconds.any() or len(self) < 2:
@@ -107,17 +107,17 @@ class Trajectory:
         timestamps: NDArray[np.float64] | None = None,
         optional: bool = False,
     ) -> "Trajectory":
-        """Read a text file in the format of TUM, EuRoC or KITTI, as ``pose_files.pose_format`` recognises it.
+        """Read a text file in the format of TUM, EuRoC or KITTI.
 
         Args:
             path: The file.
-            format: ``tum``, ``euroc`` or ``kitti``; None recognises it.
+            format: ``tum``, ``euroc`` or ``kitti``; None recognises it (``pose_files.pose_format``).
             timestamps: (N,) seconds of the poses of a file without times (KITTI).
-            optional: Leave out rows that are no pose, and count them in ``remarks``.
+            optional: Skip rows that are not a pose, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing or its format is not clear. It holds no pose, no times, or, unless
-                ``optional``, a row that is no pose.
+            DatasetError: The file is missing, or its format is not clear. It has no pose, no times, or, unless
+                ``optional``, a row that is not a pose.
         """
         path = Path(path)
         found = read_poses(path, format, optional=optional)

@@ -46,13 +46,13 @@ from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import MapError
 
 DEPTH_MIN = 0.05
-"""Blocks nearer to the camera than this are not updated, metres."""
+"""Smallest depth of a block that is updated, metres."""
 MIN_LIMIT = 0.3
 """Smallest limit of the distances that voxels can store, reference depths."""
 
 
 def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
-    """Parameters of a map whose readings end at ``depth_max`` metres."""
+    """Parameters of a map whose depth measurements end at ``depth_max`` metres."""
     front = config.truncation_voxels * config.voxel_size
     behind = config.truncation_behind_voxels * config.voxel_size
     limit = max(MIN_LIMIT * sensor.reference_depth, front, behind)
@@ -74,33 +74,33 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 NO_WEIGHTS = np.empty((0, 0), np.float32)
-"""Weights of an image that is only sampled."""
+"""Empty weights of an image that is only sampled."""
 MAX_JUMP = 5.0
-"""Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
-one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
+"""Largest change of the distance within one cell that is still a surface, voxels. A projective distance grows with
+one over the cosine of the angle of incidence. A steeper change is the border between a band and free space."""
 MAX_WINDOW = 288
 """Largest number of blocks along the edge of the window; its cells then take 96 MB."""
 
 
 class TsdfVolume(PagedMap):
-    """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
+    """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of known free space.
 
     Args:
         camera: Camera of the frames that will be integrated.
         config: Voxel size, truncation, weights.
-        sensor: Noise of the depth readings.
-        depth_max: Farthest reading that will be integrated, metres.
-        backend: Compute device, of this map alone; None takes the CPU.
+        sensor: Noise of the depth measurements.
+        depth_max: Largest depth that will be integrated, metres.
+        backend: Compute device, used by this map alone; None takes the CPU.
         max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process. The farthest
-            blocks wait on disk. None keeps all in memory.
+            blocks are paged to disk. None keeps all in memory.
         extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
         blocks: The blocks of the map that are in memory.
-        pager: Moves the others; None if all are in memory.
-        window: Those around the view.
+        pager: Moves blocks between memory and disk; None if all are in memory.
+        window: Dense array of the blocks around the view.
         voxel_size, block_size: Edge of a voxel and of a block, metres.
-        band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
+        band: Truncation band around a surface; ``truncation``, ``truncation_behind``: its smallest widths, metres.
         sdf_unit: Metres per step of a stored distance.
         map_id: Number of the map in this process; ``clear`` gives a new one.
         num_frames: Number of integrated frames, each counted ``count`` times; 0 if unknown.
@@ -136,7 +136,7 @@ class TsdfVolume(PagedMap):
         extent = depth_max if extent is None else extent
         self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
         cells = np.ceil(2 * (self._reach + self.band.limit) / self.block_size) + 8
-        if not cells <= MAX_WINDOW:  # also where a field of view of almost 180 degrees makes it infinite
+        if not cells <= MAX_WINDOW:  # also if a field of view of almost 180 degrees makes it infinite
             longest = extent * (MAX_WINDOW - 8) / cells
             raise MapError(
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
@@ -146,7 +146,7 @@ class TsdfVolume(PagedMap):
         self.clear()
 
     def clear(self) -> None:
-        """Remove everything that was integrated."""
+        """Remove all integrated frames."""
         self._empty()
         if self.pager is not None:
             self.pager.clear()
@@ -163,13 +163,13 @@ class TsdfVolume(PagedMap):
         static_mask: NDArray[np.bool_] | None = None,
         count: int = 1,
     ) -> None:
-        """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
+        """Fuse a frame at a known pose: allocate, average (eq. 4.18-4.23), carve, update free space.
 
         Args:
-            frame: Depth (m) of the volume's camera, and colour, if there is any.
+            frame: Depth (m) of the volume's camera, and optional colour.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
+            count: Number of equal frames that this frame stands for: weights and observations of emptiness add up.
 
         Raises:
             MapError: The images do not have the camera's size.
@@ -189,7 +189,7 @@ class TsdfVolume(PagedMap):
         self._fuse(self._view(replace(frame, color=rgb), used, T), count)
 
     def _view(self, frame: Frame, used: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> DepthView:
-        """A frame at a pose (4, 4), of which the readings ``used`` (H, W) are fused, for the back end."""
+        """A frame at a pose (4, 4) in the form of the back end; only the pixels ``used`` (H, W) are fused."""
         T_camera_local = se3.inverse(T_world_camera)
         T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (self.window.local_origin * self.block_size)
         constant = self.config.weighting == "constant"
@@ -200,11 +200,10 @@ class TsdfVolume(PagedMap):
         )  # fmt: skip
 
     def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
-        """Fuse an image which the window covers ``count`` times.
+        """Fuse an image inside the window, ``count`` times.
 
         Returns:
-            (n,) int32 slots that it was averaged into, those that it shows to be empty have been released; and the
-            prepared image.
+            (n,) int32 slots that it was averaged into; empty ones have been released. And the prepared image.
         """
         blocks, window, number, free_after = self.blocks, self.window, self._frame_number, self.config.free_after
         touched = self.backend.touch(self.grid, view, window.stamps, free_after, number, self.parameters)
@@ -224,7 +223,7 @@ class TsdfVolume(PagedMap):
         return slots, touched
 
     def take_over(self, other: "TsdfVolume") -> None:
-        """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
+        """Replace the content by the content of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
@@ -233,15 +232,14 @@ class TsdfVolume(PagedMap):
     def for_camera(
         self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
     ) -> "TsdfVolume":
-        """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
-        volume must not be used afterwards."""
+        """This map for another camera and device. It takes over the blocks: do not use this volume afterwards."""
         other = type(self)(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.pager, other._frame_number = self.pager or other.pager, self._frame_number
         other.blocks, other.levels, other.num_frames = self.blocks, self.levels, self.num_frames
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
-        """Move the window so that it covers what a camera at this pose can see."""
+        """Move the window to cover the view of a camera at this pose."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
         origin = self.window.moved(middle, self._left)
         if origin is not None:
@@ -252,7 +250,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def grid(self) -> VoxelGrid:
-        """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
+        """The blocks around the view for the back end; valid until the next ``integrate``."""
         window, blocks = self.window, self.blocks
         assert window.origin is not None
         return VoxelGrid(
@@ -262,7 +260,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def _local_grid(self) -> VoxelGrid:
-        """Blocks with coordinates from the window's local origin, near to which 32-bit arithmetic is precise."""
+        """The blocks with coordinates relative to the window's local origin, where 32-bit arithmetic is precise."""
         grid, origin = self.grid, self.window.local_origin
         if not origin.any():
             return grid
@@ -289,11 +287,11 @@ class TsdfVolume(PagedMap):
     def known_share(
         self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share of the information on the surface at each reading (h, w) of a camera that the map has without it.
+        """Share of the surface information at each depth pixel (h, w) that the map already has.
 
-        Weights are information: the running average of readings of weight g has the variance 1 / w where w is the sum
-        of their weights (eq. 4.19), and one more reading brings it to 1 / (w + g). The share is w / (w + g), n / (n +
-        1) after n equal readings; 0 where the map has no surface or there is no reading.
+        Weights are information: the average of measurements with total weight w has a variance proportional to 1 / w
+        (eq. 4.19). One more measurement of weight g reduces it to 1 / (w + g). The share is w / (w + g), that is n / (n
+        + 1) after n equal measurements. It is 0 at pixels without depth or without surface in the map.
         """
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
@@ -309,7 +307,7 @@ class TsdfVolume(PagedMap):
         return out
 
     def extend_range(self, depth: float) -> None:
-        """Let views reach ``depth`` metres, or as far as the largest window permits; for maps only looked at."""
+        """Extend views to ``depth`` metres, or to the range of the largest window; for maps that are only viewed."""
         spread = 2 * self._reach / self.depth_max  # the window covers depth_max
         longest = ((MAX_WINDOW - 8) * self.block_size - 2 * self.band.limit) / spread
         self.depth_max = min(max(depth, self.depth_max), longest)
@@ -318,7 +316,7 @@ class TsdfVolume(PagedMap):
         self.window = BlockWindow(self.block_size, self._window_cells)
 
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
-        """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
+        """Render the map for ``camera`` (default: the volume's own) at a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera
         T_world_camera = copied(T_world_camera, "pose of a view", shape=(4, 4))
         self.look_at(T_world_camera)
@@ -327,7 +325,7 @@ class TsdfVolume(PagedMap):
         return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, finer)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
-        """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
+        """Triangles of the zero level by marching cubes, where each corner has ``min_weight`` observations.
 
         Raises:
             MapError: The map is empty.
@@ -340,9 +338,9 @@ class TsdfVolume(PagedMap):
         return joined(self.extract_chunks(slots, np.zeros(len(slots), np.int64), min_weight))
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
-        """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
+        """The mesh region by region, in Morton order; each region has its own copies of the vertices at its borders.
 
-        Blocks that are not in memory come and go meanwhile; frames must not be integrated until the end.
+        Blocks are paged meanwhile. Frames must not be integrated until the end.
         """
         reach = np.arange(-1, REGION + 1, dtype=np.int32)
         offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -355,8 +353,10 @@ class TsdfVolume(PagedMap):
 
     @property
     def min_weight(self) -> int:
-        """Smallest weight of a voxel for mesh and views: the configured one. In a map of few frames it is half their
-        number, since every measurement has at least weight 1."""
+        """Smallest weight of a voxel for mesh and views: the configured one.
+
+        In a map of few frames it is half the number of frames, because every measurement has at least weight 1.
+        """
         return min(self.config.min_weight, (self.num_frames + 1) // 2 or self.config.min_weight)
 
     def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
@@ -368,8 +368,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        ``slots`` (n,) are the blocks to mesh and all that touch one of them, ``chunks`` (n,) the group of each, counted
-        from 0; -1 for blocks that only lend their voxels.
+        ``slots`` (n,) are the blocks to mesh and all blocks that touch them. ``chunks`` (n,) is the group of each,
+        counted from 0; -1 for blocks that only provide voxels at the border.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbourhood(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(
@@ -379,7 +379,7 @@ class TsdfVolume(PagedMap):
     # -- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write the map as NumPy archive, replacing an older file at the end; ``load`` gives an equal volume.
+        """Write the map as NumPy archive, replacing an older file at completion; ``load`` gives an equal volume.
 
         Raises:
             MapError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
+"""Blocks of 8x8x8 voxels: hash table and voxel memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,30 +15,30 @@ from dudmap.core.state import Remembered, Stateful
 __all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
 COORDINATE_BITS = 18
-"""Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
+"""Bits of a block coordinate: three coordinates and the number of one of 512 maps form a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
 NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
-"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
+"""Offset (27, 3) of a block's neighbours and, in the middle, of the block; number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
 LARGEST_TABLE = 2**26
-"""Largest number of places of the hash table of a stored map: that of 50 million blocks."""
+"""Largest number of places in the hash table of a stored map, enough for 50 million blocks."""
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlockRecords:
-    """Blocks taken out of a map.
+    """Copies of blocks of a map.
 
     Attributes:
         coords: (n, 3) int32 block coordinates.
         free_count: (n,) uint8 observations of emptiness.
-        owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
+        owners: (m,) int32 rows of ``coords`` of the blocks with voxels.
         geometry, colors: (m, 512) int32 packed voxels.
-        fused: (m,) uint8 frames that were fused into a block, 255 or more.
-        finer: Of each finer level, the blocks inside these (``FineBlocks.records``).
+        fused: (m,) uint8 frames fused into each block, saturated at 255.
+        finer: Per finer level, the blocks inside these (``FineBlocks.records``).
     """
 
     coords: NDArray[np.int32]
@@ -51,7 +51,7 @@ class BlockRecords:
 
 
 COLUMNS = tuple(field.name for field in fields(BlockRecords) if field.name != "finer")
-"""Arrays of a row: of the blocks of one level of a region, 0 is the coarsest."""
+"""Arrays of a stored row: the blocks of one level (0 = coarsest) of a region."""
 _TYPES = {
     "coords": (np.int32, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
     "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),
@@ -59,22 +59,21 @@ _TYPES = {
 
 
 class VoxelBlocks(Stateful):
-    """The map's content, block by block.
+    """The blocks of a map.
 
-    An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
-    than their content and grow by factors; ``slots`` are provided at the start, and take no memory while they are not
-    used.
+    An entry is an observed block; an entry near a surface owns a slot of 512 voxels. Arrays are larger than their
+    content and grow by factors. The constructor reserves ``slots``, which take no memory while unused.
 
     Attributes:
         table: Hash table of entry numbers (``core/backends/cpu/hashing.py``).
-        coords, slot_of, free_count: Of each of the ``num_entries`` entries: (3,) int32 block coordinates, int32 slot,
-            -1 = no voxels, and uint8 observations of emptiness.
+        coords, slot_of, free_count: Per entry (``num_entries``): (3,) int32 block coordinates; int32 slot, -1 = no
+            voxels; uint8 observations of emptiness.
         geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
-        geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
-        entry_of, slot_coords, written, fused: Of each of the ``num_slots`` slots in use or released: int32 entry, -1 =
-            unused, (3,) int32 block coordinates, int32 number of the frame that last wrote to it, and uint8 frames that
-            were fused into it, 255 or more.
-        table_size: Number of places of the hash table of stored blocks.
+        geometry_mirror, colors_mirror: The same for back ends, which may hold copies on a device.
+        entry_of, slot_coords, written, fused: Per slot (``num_slots``, in use or released): int32 entry, -1 = unused;
+            (3,) int32 block coordinates; int32 number of the last frame that wrote it; uint8 frames fused into it,
+            saturated at 255.
+        table_size: Number of places in the hash table of stored blocks.
     """
 
     coords: Remembered[NDArray[np.int32]]
@@ -103,14 +102,14 @@ class VoxelBlocks(Stateful):
         self._released = np.empty(0, dtype=np.int32)
 
     def state(self) -> dict[str, Any]:
-        """The index, without spare room; voxels are stored block by block (``app/state``)."""
+        """The index without spare capacity; voxels are stored block by block (``app/state``)."""
         self.table_size = len(self.table)
         state, n, m = super().state(), self.num_entries, self.num_slots
         state |= {name: state[name][:n] for name in ("coords", "slot_of", "free_count")}
         return state | {name: state[name][:m] for name in ("entry_of", "slot_coords", "written", "fused")}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the index of other blocks; the voxels are empty. A ``ValueError`` if its parts do not fit each other."""
+        """Restore the index, without voxels; a ``ValueError`` if its parts do not fit each other."""
         room = max(len(self.entry_of), len(state["entry_of"]))
         super().restore(state)
         n, m, owned = len(self.coords), len(self.entry_of), np.flatnonzero(self.entry_of >= 0)
@@ -128,7 +127,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def geometry(self) -> NDArray[np.int32]:
-        """Packed voxels (slots, 512) int32 in the host's memory, up to date."""
+        """Packed voxels (slots, 512) int32 in host memory, up to date."""
         return self.geometry_mirror.host
 
     @geometry.setter
@@ -137,7 +136,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def colors(self) -> NDArray[np.int32]:
-        """Packed colours (slots, 512) int32 in the host's memory, up to date."""
+        """Packed colours (slots, 512) int32 in host memory, up to date."""
         return self.colors_mirror.host
 
     @colors.setter
@@ -151,7 +150,7 @@ class VoxelBlocks(Stateful):
         self.colors_mirror.wrote(slots)
 
     def take_colors(self, slots: NDArray[np.integer], other: "VoxelBlocks") -> None:
-        """Give slots (n,) the colours and intensities that their blocks have in another map; 0 where it has none."""
+        """Give slots (n,) the colours and intensities of their blocks in another map; 0 for unknown blocks."""
         there = other.slots_at(self.slot_coords[slots].astype(np.int32))
         known = there >= 0
         intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
@@ -161,19 +160,19 @@ class VoxelBlocks(Stateful):
 
     @property
     def num_voxel_blocks(self) -> int:
-        """Blocks that own voxels."""
+        """Number of blocks with voxels."""
         return self.num_slots - len(self._released)
 
     def num_free(self, observations: int) -> int:
-        """Blocks without voxels that have at least so many observations of emptiness."""
+        """Number of blocks without voxels that have at least this many observations of emptiness."""
         n = self.num_entries
         return int(np.count_nonzero((self.free_count[:n] >= observations) & (self.slot_of[:n] < 0)))
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all slots, also the released ones, of all entries and of the hash table.
+        """Memory of all slots (used or released), all entries and the hash table.
 
-        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
+        Spare capacity is not counted: it is address space without physical memory.
         """
         return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
 
@@ -194,17 +193,17 @@ class VoxelBlocks(Stateful):
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        """Slots (n,) int32 of all blocks with voxels, ascending."""
         return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
 
     def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
-        """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
+        """Entries (n,) int32 of blocks at coordinates (n, 3); at most ``unknown`` entries are new."""
         self.reserve_entries(self.num_entries + unknown)
         entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
         return entries
 
     def reserve_entries(self, needed: int) -> None:
-        """Have room for so many entries."""
+        """Grow the arrays to at least ``needed`` entries."""
         if needed > len(self.coords):
             capacity = max(needed, 2 * len(self.coords))
             self.coords = grown(self.coords, capacity, 0)
@@ -216,7 +215,7 @@ class VoxelBlocks(Stateful):
             hashing.rebuild(self.table, self.coords, self.num_entries)
 
     def reserve_slots(self, needed: int) -> None:
-        """Have room for so many slots."""
+        """Grow the arrays to at least ``needed`` slots."""
         if needed > len(self.entry_of):
             capacity = max(needed, len(self.entry_of) * 3 // 2)
             self.geometry_mirror.grow(capacity)
@@ -227,7 +226,7 @@ class VoxelBlocks(Stateful):
             self.fused = grown(self.fused, capacity, 0)
 
     def allocate(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
-        """New slots (n,) int32 for entries that have none."""
+        """Allocate slots (n,) int32 for entries without a slot."""
         kept = max(len(self._released) - len(entries), 0)
         reused, self._released = self._released[kept:][::-1], self._released[:kept]
         needed = self.num_slots + len(entries) - len(reused)
@@ -242,12 +241,12 @@ class VoxelBlocks(Stateful):
         return slots
 
     def use_slots(self, num_slots: int) -> None:
-        """Take the slots below a number for used."""
+        """Mark all slots below a number as used."""
         self.num_slots = num_slots
         self.geometry_mirror.used = self.colors_mirror.used = num_slots
 
     def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
-        """Release and empty slots; their entries (n,) int32 get at least so many observations of emptiness."""
+        """Release and empty slots; their entries (n,) int32 get at least this many observations of emptiness."""
         entries = self.entry_of[slots]
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
@@ -258,12 +257,12 @@ class VoxelBlocks(Stateful):
         return entries
 
     def entries_in(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Entries (n,) of the blocks from ``low`` up to, not including, ``high`` (3,), ascending."""
+        """Entries (n,) of the blocks from ``low`` to ``high`` (3,) (exclusive), ascending."""
         coords = self.coords[: self.num_entries]
         return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
 
     def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
-        """Copies of the blocks of entries (n,), the voxels in the order of the entries or of the slots."""
+        """Copies of the blocks of entries (n,), with voxels in the order of the entries or of the slots."""
         slots = self.slot_of[entries]
         owners = np.flatnonzero(slots >= 0).astype(np.int32)
         if by_slot:
@@ -275,7 +274,7 @@ class VoxelBlocks(Stateful):
         )  # fmt: skip
 
     def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
-        """Forget entries (n,) and their voxels. The other entries are numbered anew; slots keep their numbers."""
+        """Remove entries (n,) and their voxels. The other entries are renumbered; slots keep their numbers."""
         n = self.num_entries
         slots = self.slot_of[entries]
         slots = np.sort(slots[slots >= 0])
@@ -298,7 +297,7 @@ class VoxelBlocks(Stateful):
         hashing.rebuild(self.table, self.coords, m)
 
     def insert(self, records: BlockRecords, frame_number: int) -> NDArray[np.int32]:
-        """Add blocks, none of which is known; slots (m,) int32 of those that own voxels."""
+        """Add unknown blocks; returns the slots (m,) int32 of the blocks with voxels."""
         entries = self.entries_at(records.coords, len(records.coords))
         self.free_count[entries] = records.free_count
         slots = self.allocate(entries[records.owners], frame_number)
@@ -307,7 +306,7 @@ class VoxelBlocks(Stateful):
         return slots
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 = no voxels."""
         entries = hashing.find_all(self.table, self.coords, coords)
         return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
 
@@ -328,7 +327,7 @@ class VoxelBlocks(Stateful):
         """Blocks of a map file: all entries, and entry and voxels of each slot.
 
         Raises:
-            ValueError: The arrays do not belong together, or a block is there twice.
+            ValueError: The arrays do not fit each other, or a block occurs twice.
         """
         _check_restored(coords, free_count, entries, geometry, colors)
         blocks = cls(len(entries))
@@ -339,10 +338,10 @@ class VoxelBlocks(Stateful):
 
 
 def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
-    """Check types, shapes and ranges of the arrays of a map file, which kernels take as they are.
+    """Check types, shapes and ranges of the arrays of a map file, because kernels do not check them.
 
     Raises:
-        ValueError: They are not those of a map.
+        ValueError: The arrays do not describe a map.
     """
     n, m = len(coords), len(entries)
     wanted = {
@@ -367,7 +366,7 @@ def _row_bytes(array: NDArray) -> int:
 
 
 def blobs_of(records: BlockRecords) -> list[list[memoryview]]:
-    """The arrays of records as they are stored, in the order of ``COLUMNS``, level by level."""
+    """The arrays of records in stored form, in the order of ``COLUMNS``, level by level."""
     levels = [records, *records.finer]
     return [[np.ascontiguousarray(getattr(level, name)).data for name in COLUMNS] for level in levels]
 
@@ -376,7 +375,7 @@ def records_of(rows: Sequence[Sequence[bytes]]) -> BlockRecords:
     """The records of stored arrays, level by level.
 
     Raises:
-        ValueError: They do not fit each other.
+        ValueError: The arrays do not fit each other.
     """
     levels = [_level_of(blobs) for blobs in rows]
     return replace(levels[0], finer=tuple(levels[1:]))
