@@ -1,8 +1,8 @@
-"""Rigid motion of the static world between two images, and what does not follow it.
+"""Rigid motion of the static world between two images, and the corners that do not follow it.
 
-Corners are tracked from image to image (Lucas and Kanade 1981) and the rigid motion that most of the visible surface
-follows is taken for that of the static world (RANSAC, Fischler and Bolles 1981); corners that do not follow it move.
-Errors are measured in pixels: a near person then weighs no more than a far wall.
+Corners are tracked between images (Lucas and Kanade 1981). The rigid motion of most of the visible surface is the
+motion of the static world (RANSAC, Fischler and Bolles 1981); corners that do not follow it move. Errors are measured
+in pixels, so that a near person weighs no more than a far wall.
 """
 
 from dataclasses import dataclass
@@ -25,22 +25,23 @@ from dudmap.core.frames.optical_flow import (
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
-"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
+"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 includes 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
 NOISE_LEVELS = 1.0, 0.5, 0.25
-"""Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
-corners of a right motion are measured with 0.07 px per coordinate."""
+"""Tested noise levels of the corners, as multiples of the sigma of NOISE_PX: in sharp images corners are measured with
+0.07 px per coordinate."""
 LEAST_SIGMA_PX = NOISE_LEVELS[-1] * NOISE_PX / np.sqrt(5.99)
-"""Smallest sigma of the inliers that is believed, pixels per coordinate."""
+"""Smallest plausible sigma of the inliers, pixels per coordinate."""
 OUTLIER_GAIN = 2.996
-"""Log-likelihood ratio of a corner without error to an outlier at the largest noise level, 5.99 / 2: a corner is an
-inlier up to the error at which both are equally likely."""
+"""Log-likelihood ratio of an error-free corner to an outlier at the largest noise level, 5.99 / 2. The inlier threshold
+is the error at which both are equally likely."""
 NEAR_PX = 5.0
-"""Scale of the prior on the distance of a motion from the expected one, pixels: a turn by 1.1 degrees at a focal length
-of 262 pixels, by which a prediction at constant velocity errs where a turn of 33 degrees/s begins within 1/30 s."""
+"""Scale of the prior on the distance of a motion from the expected one, pixels: a rotation by 1.1 degrees at a focal
+length of 262 pixels. A constant-velocity prediction has this error if a rotation of 33 degrees/s begins within 1/30
+s."""
 HYPOTHESES = 150
-"""Hypotheses from uniform samples, and as many from samples weighted by area. With a share of inliers of 1/3, samples
-of three miss all of the inliers with probability (1 - 1/27)^150 = 0.3 %."""
+"""Number of hypotheses from uniform samples, and as many from samples weighted by area. At an inlier share of 1/3, no
+sample of three has only inliers with probability (1 - 1/27)^150 = 0.3 %."""
 
 
 def rigid_motion(
@@ -53,23 +54,23 @@ def rigid_motion(
     """Motion T_after_before (4, 4) with the highest score among hypotheses from samples of three correspondences.
 
     Three correspondences determine the twist of a small motion linearly (Longuet-Higgins and Prazdny 1980). The score
-    of a motion is that of MSAC (Torr and Zisserman 2000), each correspondence weighted by its depth squared, to
-    which the surface that it stands for is proportional, times a prior:
+    is MSAC's (Torr and Zisserman 2000), weighted by squared depth, which is proportional to the surface per
+    correspondence, times a prior:
 
         score(T, sigma) = gain sum_n z_n^2 (1 - min(e_n^2 / (2 gain sigma^2), 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
         gain = log(A / (2 pi sigma^2))
 
-    where e_n is the reprojection error and d the mean distance, in pixels, of the reprojected points from where the
-    expected motion puts them. The sum is the log-likelihood of normally distributed errors against that of outliers
-    spread over an area A. The noise sigma is unknown like the motion, and the pair of the highest score is searched: at
-    a noise fixed too large, a motion between that of the static world and that of slow people explains both.
+    Here e_n is the reprojection error, and d the mean distance in pixels between the points reprojected by this and by
+    the expected motion. The sum is the log-likelihood of normally distributed errors against outliers over an area A.
+    The unknown noise sigma is maximised together with the motion. With a too large fixed sigma, a motion between the
+    static world and slow people would explain both.
 
-    The prior decides between two motions that explain nearly as much surface: a crowd that
-    walks abreast may cover more of it than the static world, and two images alone cannot tell which of the two moves.
-    The prior ranges from 1 to 1/2 only, because the expected motion is a prediction and may be wrong.
+    The prior decides between two motions that explain nearly as much surface. A crowd that walks abreast may cover more
+    surface than the static world, and two images alone cannot show which of them moves. The prior ranges from 1 to 1/2
+    only, because the expected motion may be wrong.
 
     The REFINED best hypotheses of each noise level and the expected motion are refined on their inliers with the exact
-    projection, and the one of the highest score is returned.
+    projection. The best of them is returned.
 
     Args:
         points: (n, 3) metres, first camera's frame.
@@ -91,14 +92,14 @@ def rigid_motion(
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
-    """Distance in pixels of an image, given that in an image of FLOW_WIDTH with the same view."""
+    """Distance in pixels of an image, from the distance in an image of FLOW_WIDTH with the same view."""
     return distance * camera.width / FLOW_WIDTH
 
 
 @lru_cache(maxsize=8)
 def _params(camera: Camera, near_px: float = NEAR_PX) -> ConsensusParams:
     levels = np.array(NOISE_LEVELS)
-    gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
+    gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of error-free corners grows with 1 / sigma^2
     limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
     return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(near_px, camera))
 
@@ -114,25 +115,25 @@ MOVES_PX = 1.0
 MOVES_SIGMAS = 5.0
 """Smallest reprojection error of a moving corner, in standard deviations (per coordinate) of the static corners."""
 MOVES_SHARE = 0.08
-"""Added to either limit: this share of the length of the corner's own flow (motion blur, rolling shutter)."""
+"""Share of a corner's own flow that is added to either limit (motion blur, rolling shutter)."""
 FEWEST = 15
-"""Fewest inliers of a motion that is accepted. A wrong motion gathers about one by chance: of 1000 corners with flow
-of up to 20 pixels the share (NOISE_PX / 20)^2."""
+"""Smallest number of inliers of an accepted motion. A wrong motion has about one by chance: of 1000 corners with flow
+up to 20 pixels, the share (NOISE_PX / 20)^2."""
 NEIGHBOURS = 5
-"""Nearest corners that vote on a pixel of a segment whose corners disagree."""
+"""Number of nearest corners that vote on a pixel in a segment with disagreeing corners."""
 FEWEST_MOVING = 3
-"""Fewest moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
+"""Smallest number of moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
 AGREED = 0.7
 """Smallest share of moving corners of a segment that moves as a whole, and of the neighbours of a moving pixel."""
 SAME_SURFACE = 0.02
-"""Change of depth, as a share of it, between neighbouring readings of one surface, and by the noise at 5 m."""
+"""Largest relative change of depth between neighbouring measurements of one surface, and by noise at 5 m."""
 NOISE_SHARE = 0.02
-"""Moving readings up to this share of all are taken for noise."""
+"""Largest share of moving measurements that is noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledCorners:
-    """Corners of an image, each labelled as static, as moving, or as neither where that is unclear.
+    """Corners of an image, each labelled as static, moving, or unclear.
 
     Attributes:
         level: The image, at the resolution of the labels.
@@ -150,23 +151,23 @@ class LabelledCorners:
     static: NDArray[np.bool_]
 
     def count_by_segment(self, which: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
-        """Corners (count + 1,) in each segment, of those that are given (n,); entry 0: in none."""
+        """Number of the selected corners (n,) in each segment (count + 1,); entry 0: in none."""
         return np.bincount(self.segment_of[which], minlength=self.segmentation.count + 1)
 
     @cached_property
     def segment_of(self) -> NDArray[np.int32]:
-        """Segment (n,) that each corner lies in."""
+        """Segment (n,) of each corner."""
         return self.segmentation.labels[self.pixels[:, 1], self.pixels[:, 0]]
 
 
 @dataclass(frozen=True, eq=False)
 class DominantMotion:
-    """Rigid motion of most of the visible surface between two images, and what does not follow it.
+    """Rigid motion of most of the visible surface between two images, and the labelled corners.
 
     Attributes:
         T_after_before: (4, 4) motion of the static world from the first camera's frame to the second's.
-        share: Share of the surface not known to move, as sampled by the corners, that follows it.
-        before, after: The corners in the first and in the second image; moving are those that do not follow it.
+        share: Share of the surface that follows it, sampled by corners not known to move.
+        before, after: The corners in the first and in the second image; moving corners do not follow the motion.
     """
 
     T_after_before: NDArray[np.float64]
@@ -186,12 +187,12 @@ class DominantMotion:
 
     @cached_property
     def static_after(self) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the second image in segments seen to be static; segments without corners are neither."""
+        """Pixels (h, w) of the second image in segments with static corners; segments without corners are undecided."""
         return static_segments(self.after)
 
 
 def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether the moving pixels (h, w) are a larger share of the readings of an image than noise produces."""
+    """Whether moving pixels (h, w) are a larger share of an image's measurements than noise produces."""
     return bool(np.count_nonzero(moving) > NOISE_SHARE * level.num_readings)
 
 
@@ -205,29 +206,32 @@ def dominant_motion(
 ) -> DominantMotion | None:
     """Motion of the static world between two images, and the corners that do not follow it.
 
-    The static world is the largest *surface* that moves rigidly: each corner counts by its depth squared, since a crowd
-    may fill half of the image, but hardly ever half of the visible square metres. A corner is moving if its
+    The static world is the largest *surface* that moves rigidly. Each corner counts by its squared depth, because a
+    crowd may fill half of the image, but hardly ever half of the visible square metres. A corner is moving if its
     reprojection error e exceeds
 
         max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
-    with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
-    dropped if it does. It is unclear up to MOVES_SIGMAS standard deviations that the covariance of the motion gives its
-    pixel, if it was not known to move: a few corners on the far side of a room do not tell where the floor before the
-    camera ought to be. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
-    sigma.) The median is by surface: corners on slow people may be more than half of all, and near enough to count.
+    with the inlier threshold t of the estimate. (The length of a vector of two normally distributed coordinates has the
+    median sqrt(2 ln 2) sigma.) The median is weighted by surface, because most corners may be on slow, near people.
+
+    Exceptions:
+
+    * The image matches as well at the corner's static position: the corner is dropped.
+    * The error is within MOVES_SIGMAS standard deviations of the pixel by the covariance of the motion, and the corner
+      was not known to move: the corner is unclear. A few corners on the far side of a room do not determine the floor
+      before the camera.
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.
         segmentations: Segments of both, at the resolution of the labels.
-        moving: (h, w) bool at that resolution, pixels of the first image known to move; corners on them are left out of
-            the estimate of the motion.
-        T_expected: (4, 4) predicted motion: the search for the corners starts there, and between consecutive images it
-            is the prior of the estimate. None: the identity.
-        intervals: Corners that are off by more than so many times the limit are dropped, and so are those whose depth
-            changed by more than such a motion along the line of sight. Between images so many intervals apart, slower
-            motion is hidden from image to image; what seems faster was confused with something else, such as the
-            surface that a person uncovers, or is known.
+        moving: (h, w) bool at that resolution, known moving pixels of the first image, excluded from the motion
+            estimate.
+        T_expected: (4, 4) predicted motion: start of the corner search, and between consecutive images the prior of the
+            estimate. None: the identity.
+        intervals: Number of frame intervals between the images. Corners that exceed the limit by more than this factor,
+            or whose depth changed by more, are dropped. Slower motion is hidden between consecutive images; faster
+            corners are mismatches, for example on surface that a person uncovers, or are known already.
 
     Returns:
         None if too few corners follow one motion.
@@ -246,7 +250,8 @@ def dominant_motion(
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
         return None
-    near_px = NEAR_PX if np.isinf(intervals) else np.inf  # a pose that followed a crowd expects it to rest
+    # no prior: a pose that followed a crowd expects the crowd to be static
+    near_px = NEAR_PX if np.isinf(intervals) else np.inf
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected, near_px)
     predicted = reproject(T, points, camera)
     error = lengths(predicted - targets)
@@ -297,15 +302,15 @@ def _deviations(
     error: NDArray[np.float64],
     camera: Camera,
 ) -> NDArray[np.float64]:
-    """Standard deviations (n,) per coordinate of the pixels that a fitted motion gives points.
+    """Standard deviations (n,) per coordinate of the pixels of points after a fitted motion.
 
-    They follow from its covariance by the normal equations of the inliers, sigma^2 (sum J^T J)^-1, where J (2, 6) is
+    They follow from the covariance by the normal equations of the inliers, sigma^2 (sum J^T J)^-1, where J (2, 6) is
     the derivative of a pixel by the twist of the motion: sigma_n^2 = sigma^2 tr(J_n (sum J^T J)^-1 J_n^T) / 2.
 
     Args:
         T: (4, 4).
         points: (n, 3) metres, before the motion.
-        inliers: (m, 3) the points that it was fitted to.
+        inliers: (m, 3) points of the fit.
         error: (m,) their reprojection errors, pixels.
         camera: Camera of the pixels.
     """
@@ -320,7 +325,7 @@ def _deviations(
 
 
 def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Derivatives (n, 2, 6) of the pixels of points (n, 3) after a motion T (4, 4) by a twist of it."""
+    """Derivatives (n, 2, 6) of the pixels of points (n, 3) after a motion T (4, 4) by its twist."""
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     x, y, by_z, none = x / z, y / z, 1 / z, np.zeros_like(z)
     u = np.stack([by_z, none, -x * by_z, -x * y, 1 + x * x, -y], axis=1)
@@ -336,7 +341,7 @@ def _depth_change(
     Args:
         T: (4, 4) motion of the static world.
         points: (n, 3) the corners, metres, first camera's frame.
-        targets: (n, 2) where they were found in the second image; without a reading there is no change.
+        targets: (n, 2) their pixels in the second image; the change is 0 without depth.
         level: The second image.
     """
     u, v = _nearest_pixels(targets, level).T
@@ -346,21 +351,22 @@ def _depth_change(
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Smallest of the values (n,), n > 0, that together with the smaller ones has half of the weight (n,)."""
+    """Weighted median: smallest of the values (n,), n > 0, that has half of the weight (n,) together with smaller
+    values."""
     order = values.argsort()
     total = weights[order].cumsum()
     return float(values[order[total.searchsorted(total[-1] / 2)]])
 
 
 def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
-    """Moving pixels (h, w) of an image: the labels of the corners carried over to the segments they lie in.
+    """Moving pixels (h, w) of an image, by propagation of the corner labels to their segments.
 
-    A segment moves as a whole if at least AGREED of its corners move. Where its corners disagree, a pixel of it moves
-    if at least AGREED of the NEIGHBOURS nearest corners of the same segment do, by distance in space.
+    A segment moves as a whole if at least AGREED of its corners move. If its corners disagree, a pixel moves if at
+    least AGREED of the NEIGHBOURS nearest corners of the same segment move, by distance in space.
 
     Args:
         corners: The labelled corners.
-        whole_only: Leave out the segments whose corners disagree.
+        whole_only: Exclude segments with disagreeing corners.
     """
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
@@ -377,14 +383,14 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     if len(rows) == 0:
         return out
     queries = level.camera.points(columns, rows, level.depth[rows, columns].astype(np.float64))
-    # a segment of three moving and other corners has five and more
+    # a segment of three moving and other corners has at least five
     votes = neighbour_votes(queries, labels[rows, columns], corners.points, corners.segment_of, moving, NEIGHBOURS)
     out[rows, columns] = votes >= AGREED * NEIGHBOURS
     return out
 
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
-    """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of such corners."""
+    """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of them."""
     num_static, num_all = corners.count_by_segment(corners.static), corners.count_by_segment()
     static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
     static[0] = False
@@ -394,7 +400,7 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
 def _pixels_of_level(
     pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level
 ) -> NDArray[np.int64]:
-    """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
+    """Nearest pixels (n, 2) int u, v in another level to positions (n, 2) of a level."""
     scale = other.camera.width / level.camera.width
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
 

@@ -1,4 +1,4 @@
-"""Surface segments of an image, and pixel counts that scale with it: they are given for images 160 pixels wide."""
+"""Surface segments of an image, and scaling of pixel counts, which refer to images 160 pixels wide."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,37 +11,37 @@ from dudmap.core.backends.cpu.segmentation import segment_surface
 from dudmap.core.frames.observation import Level
 
 REFERENCE_WIDTH = 160
-"""Width of the label image that pixel counts are given for: the default of ``dynamics.width``."""
+"""Label image width to which pixel counts refer: the default of ``dynamics.width``."""
 
 
 def pixel_scale(level: Level) -> float:
-    """Pixels of a label image per pixel of one of REFERENCE_WIDTH."""
+    """Pixels of a label image per pixel at REFERENCE_WIDTH."""
     return level.camera.width / REFERENCE_WIDTH
 
 
 def scaled_length(pixels: float, level: Level) -> int:
-    """A length given at REFERENCE_WIDTH, pixels of a label image; 1 at least."""
+    """Length in pixels of a label image, from the length at REFERENCE_WIDTH; at least 1."""
     return max(1, round(pixels * pixel_scale(level)))
 
 
 def scaled_side(radius: float, level: Level) -> int:
-    """Side of a square window, given by its radius at REFERENCE_WIDTH, pixels of a label image; odd, 3 at least."""
+    """Side of a square window in pixels of a label image, from its radius at REFERENCE_WIDTH; odd, at least 3."""
     return 2 * scaled_length(radius, level) + 1
 
 
 def scaled_area(pixels: float, level: Level) -> float:
-    """An area given at REFERENCE_WIDTH, pixels of a label image; 9 (a square of 3x3) at least."""
+    """Area in pixels of a label image, from the area at REFERENCE_WIDTH; at least 9 (3x3)."""
     return max(9.0, pixels * pixel_scale(level) ** 2)
 
 
 EDGE_REACH = 3
-"""Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
+"""Distance from a concave edge to the compared normals on either side, pixels at REFERENCE_WIDTH."""
 NORMAL_REACH = 2
-"""Pixels to either side over which a normal is estimated, at REFERENCE_WIDTH."""
+"""Half width of the window of a normal, pixels at REFERENCE_WIDTH."""
 CONCAVITY = 0.2
 """Sine of half the smallest angle between the normals across a concave edge: 23 degrees."""
 MIN_PIXELS = 60
-"""Segments of fewer pixels are not classified as a whole, at REFERENCE_WIDTH: 0.3 % of an image of 4:3."""
+"""Smallest segment that is classified as a whole, pixels at REFERENCE_WIDTH: 0.3 % of a 4:3 image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,10 @@ class Segmentation:
     """Surface segments of one image.
 
     Attributes:
-        labels: (h, w) int32 segment numbers from 1, 0 = no reading.
+        labels: (h, w) int32 segment numbers from 1, 0 = no measurement.
         count: Number of segments.
         gradient: (h, w) float32, local mean of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH.
-        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
         window: Side of the window for local means of intensities, pixels.
     """
 
@@ -63,19 +63,19 @@ class Segmentation:
     window: int = 3
 
     def with_noise(self, sigma: NDArray[np.float32], least: float) -> SegmentImage:
-        """The segments as kernels take them; sigma (h, w) is that of the distance of a static point, metres, and
-        ``least`` what it is here at least."""
+        """The segments for kernels; sigma (h, w): standard deviation of the distance of a static point, metres;
+        ``least``: its lower bound."""
         least_sigma: Any = np.float32(least)
         return SegmentImage(self.labels, self.count, self.min_pixels, self.gradient, self.window, sigma, least_sigma)
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""
+        """Share (count + 1,) of each segment's pixels in a mask (h, w) bool; entry 0 is meaningless."""
         total = np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
         return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(total, 1)
 
 
 def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
-    """Cut the surface an image shows along depth edges and concave edges (Stein et al. 2014).
+    """Segment the visible surface along depth edges and concave edges (Stein et al. 2014).
 
     Args:
         level: The image.
@@ -95,5 +95,5 @@ def intensity_gradient(level: Level) -> NDArray[np.float32]:
     scale, window = pixel_scale(level), scaled_side(1, level)
     du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=scale / 8)
     dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=scale / 8)
-    magnitude = np.sqrt(du * du + dv * dv)  # that of OpenCV rounds by the address of the array
+    magnitude = np.sqrt(du * du + dv * dv)  # OpenCV's magnitude depends on the address of the array
     return np.asarray(cv2.blur(magnitude, (window, window)), dtype=np.float32)

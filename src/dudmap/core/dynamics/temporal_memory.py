@@ -1,5 +1,4 @@
-"""What labels remember: recent frames (what moved in the last one, what they have seen through, what has stood still
-since), and the static background behind pixels without a reading."""
+"""Temporal state of the dynamic detector: recent frames, and the static background behind pixels without depth."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -18,20 +17,20 @@ from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 
 SETTLE_FRAMES = 4
-"""Frames kept of ``settle_time``, in which a segment must stand still to be released."""
+"""Number of frames over ``settle_time`` in which a segment must be still to be released."""
 START_FRAMES = 6
-"""Frames kept of ``start_seconds``, whose lines of sight are free space."""
+"""Number of frames over ``start_seconds`` whose lines of sight are free space."""
 YOUNG_PERIODS = 3.0
-"""Age of the map, in units of ``start_seconds``, up to which single frames give free space; later the map does."""
+"""Age of the map, in units of ``start_seconds``, until which single frames give free space; later the map does."""
 YOUNG_UNKNOWN_SHARE = 0.1
-"""Share of the readings in space unknown to the map from which on single frames give free space at any age."""
+"""Share of measurements in space unknown to the map above which single frames give free space at any age."""
 SEAM = 1
-"""Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+"""Half width, pixels at REFERENCE_WIDTH, of the false free regions along depth edges at a slightly wrong pose."""
 MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from the last frame's reading of it, reference depths: 3 m/s at 30 frames per second in a
-room."""
+"""Largest distance of a point from its measurement in the last frame, reference depths: 3 m/s at 30 frames per second
+in a room."""
 DYNAMIC_SHARE = 0.2
-"""Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
+"""Smallest share of dynamic pixels of a segment that is remembered as dynamic."""
 
 
 @dataclass(eq=False)
@@ -52,7 +51,7 @@ class RememberedFrame:
 
 
 class TemporalMemory(Stateful):
-    """Remembered frames that new ones are compared with.
+    """Remembered frames, for comparison with new ones.
 
     Args:
         config: ``settle_time`` and ``start_seconds``.
@@ -74,7 +73,7 @@ class TemporalMemory(Stateful):
         self._start_frames = []
 
     def start(self, timestamp: float) -> None:
-        """Begin with the first frame of a map, of this time in seconds."""
+        """Begin with the first frame of a map, at a time in seconds."""
         self._young_until = timestamp + YOUNG_PERIODS * self.config.start_seconds
         self._start_frames = []
         self._recent_frames.clear()
@@ -84,7 +83,7 @@ class TemporalMemory(Stateful):
 
         Args:
             other: The memory of that pass.
-            Ts_world_camera: (4, 4) poses of its frames by timestamp; frames without one are left out.
+            Ts_world_camera: (4, 4) poses of its frames by timestamp; frames without a pose are dropped.
         """
         self._young_until, self._imported = other._young_until, True
         self._start_frames = [
@@ -108,7 +107,7 @@ class TemporalMemory(Stateful):
             level: The image.
             T_world_camera: (4, 4).
             dynamic: (h, w) bool.
-            segmentation: Segments of the image; None where motion is not decided by segment.
+            segmentation: Segments of the image; None if motion is not decided by segment.
         """
         marks = np.zeros(dynamic.shape, dtype=np.uint8)
         if segmentation is not None:
@@ -136,7 +135,7 @@ class TemporalMemory(Stateful):
             frame.T_world_camera = T_new_old @ frame.T_world_camera
 
     def reset(self) -> None:
-        """Forget all frames after a loss of tracking; those imported from another pass stay."""
+        """Forget all frames after a loss of tracking, except imported ones."""
         self._last = None
         self._settle_frames.clear()
         self._recent_frames.clear()
@@ -154,14 +153,14 @@ class TemporalMemory(Stateful):
         return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0, self._near)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
-        """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
+        """Remembered frames whose lines of sight are free space for a frame at a time in seconds.
 
-        Single frames are compared while the map is young, and where it does not know much of what is in view;
-        otherwise there are none. In the first seconds of a second pass later frames are compared, too.
+        Single frames are used while the map is young or much of the view is unknown to it; otherwise none. A second
+        pass also compares later frames of the first seconds.
 
         Args:
             timestamp: Seconds.
-            unknown: Share of the readings that lie in space unknown to the map.
+            unknown: Share of the measurements in space unknown to the map.
         """
         if timestamp < self._young_until:
             candidates = self._start_frames if self._imported else self._recent_frames
@@ -178,14 +177,14 @@ class TemporalMemory(Stateful):
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) in space that single frames have seen to be free.
 
-        A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
-        at least half as many frames have as have seen a surface at it.
+        A point is in free space if a frame has seen farther by more than ``noise`` along its line of sight, and the
+        number of such frames is at least half the number that saw a surface there.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
-            noise: (h, w) float32, largest depth difference between two readings of one point, metres.
-            frames: As of ``free_space_frames``.
+            noise: (h, w) float32, largest depth difference between two measurements of one point, metres.
+            frames: See ``free_space_frames``.
         """
         import cv2
 
@@ -206,9 +205,9 @@ class TemporalMemory(Stateful):
         dynamic: NDArray[np.bool_],
         least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
-        """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
+        """Dynamic pixels (h, w) whose segment has been still for ``settle_time``.
 
-        The dynamic part of a segment has settled if it has stood still (``stand_still``) since every frame kept of
+        The dynamic part of a segment has settled if it is still (``stand_still``) relative to every frame kept of
         ``settle_time``.
 
         Args:
@@ -216,7 +215,7 @@ class TemporalMemory(Stateful):
             level: The image.
             T_world_camera: (4, 4) its pose.
             segmentation: Its segments.
-            sigma: (h, w) float32, standard deviation of a distance, metres; ``least_sigma`` at least.
+            sigma: (h, w) float32, standard deviation of a distance, metres; at least ``least_sigma``.
             dynamic: (h, w) bool.
             least_sigma: Metres.
         """
@@ -227,7 +226,7 @@ class TemporalMemory(Stateful):
         for frame in frames:
             found = _reprojected(level, T_world_camera, [frame])
             stand_still(segments, dynamic, found.gap[0], found.difference[0], still)
-            if not still.any():  # what moves has mostly left its place since the oldest one
+            if not still.any():  # moving objects have mostly left their place since the oldest frame
                 break
         return dynamic & still[segments.labels]
 
@@ -241,33 +240,33 @@ def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequ
 
 
 def _seen_marked(found: Reprojection, n: int, near: float) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose points a marked reading of frame n shows within a distance, metres."""
+    """Pixels (h, w) whose points have a marked measurement of frame n within ``near`` metres."""
     return (found.marks[n] > 0) & (np.abs(found.gap[n]) < near)
 
 
 SAME_INTENSITY = 0.15
-"""Largest difference of a pixel's intensity to those of the background around it."""
+"""Largest difference of a pixel's intensity from the background around it."""
 MIN_AGE = 0.3
-"""Time for which a surface must have been seen to be background, seconds."""
+"""Smallest time for which background has been seen, seconds."""
 VOTING_SIDE = 7
-"""Side of the square in which pixels without a reading vote, subsampled pixels."""
+"""Side of the square in which pixels without depth vote, subsampled pixels."""
 MIN_KNOWN = 0.2
-"""Share of that square behind which the background must be known."""
+"""Smallest share of that square with known background."""
 STRIDE = 2
 """Pixels of the label image per subsampled pixel, across and down, at REFERENCE_WIDTH."""
 SQUARE = np.ones((3, 3), np.uint8)
 MIN_AREA = 0.005
-"""Smallest region without readings that is examined, as a share of the image."""
+"""Smallest examined region without depth, as a share of the image."""
 
 
 class BackgroundModel(Stateful):
-    """The last static reading of every pixel, as a point in the world that is carried from image to image.
+    """The last static measurement of every pixel, as a world point that is carried from image to image.
 
-    An object that gives no reading, too near or too dark, hides the background known to be behind it, and looks
-    different; the sensor's own shadow, a screen or a window looks as the background did.
+    An object without depth, too near or too dark, hides the known background and looks different. A sensor shadow, a
+    screen or a window looks like the background before.
 
     Args:
-        config: ``settle_time``: background that has not been seen for longer is dropped.
+        config: ``settle_time``: age of unseen background beyond which it is dropped.
     """
 
     _background: Remembered[PointImage | None] = None
@@ -276,15 +275,15 @@ class BackgroundModel(Stateful):
         self.config = config
 
     def reset(self) -> None:
-        """Drop the background: it belongs to another world, or the pose was lost."""
+        """Drop the background, because it belongs to another world or the pose was lost."""
         self._background = None
 
     def hidden(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) without a reading in front of known background.
+        """Pixels (h, w) without depth in front of known background.
 
-        A pixel without a reading votes if the background is known within 3x3 pixels, and votes for hidden if its
-        intensity lies outside of the range of the background's there, extended by SAME_INTENSITY. A pixel is hidden
-        by majority within VOTING_SIDE, where at least MIN_KNOWN of the pixels vote.
+        A pixel without depth votes if the background is known within 3x3 pixels. It votes for hidden if its intensity
+        is outside the background's range there, extended by SAME_INTENSITY. A pixel is hidden by majority within
+        VOTING_SIDE, if at least MIN_KNOWN of the pixels vote.
 
         Args:
             timestamp: Seconds.
@@ -324,13 +323,13 @@ class BackgroundModel(Stateful):
     def update(
         self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], dynamic: NDArray[np.bool_]
     ) -> None:
-        """Replace the background by the static readings of an image.
+        """Replace the background by the static measurements of an image.
 
         Args:
             timestamp: Seconds.
             level: The image, with the exposure of the map.
             T_world_camera: (4, 4).
-            dynamic: (h, w) bool, pixels whose readings are left out.
+            dynamic: (h, w) bool, excluded pixels.
         """
         stride = _stride(level)
         depth, intensity = _subsampled(level, stride)

@@ -1,9 +1,10 @@
-"""All checks of a registered frame: one table, in which each has a figure, a limit and a reason.
+"""All checks of a registered frame: one table of metric, limit and reason.
 
-All figures are computed for every frame and reported (``FrameResult.checks``). The first check that fails rejects the
-frame. Checks against what was usual in the frames before find registrations that converged to a wrong minimum, which
-explain a frame much worse than its predecessors, though often well enough for any fixed limit. Such a check is only a
-suspicion: it is overruled where independent evidence confirms the pose.
+All metrics are computed for every frame and reported (``FrameResult.checks``). The first failed check rejects the
+frame.
+
+Relative checks compare a frame with the frames before. They find registrations in a wrong minimum, which fit much worse
+than their predecessors, but often within any fixed limit. Independent evidence for the pose overrules them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,47 +16,50 @@ import numpy as np
 from dudmap.config import SensorConfig, TrackerConfig
 
 MIN_READINGS = 100
-"""Static readings on the map that a registration needs: well above its six unknowns."""
+"""Smallest number of static measurements on the map: well above the six unknowns of a registration."""
 MAX_DRIFT = 0.03
-"""Largest standard deviation of a pose that follows the prediction where the view shows no motion, metres."""
+"""Largest standard deviation of a pose that follows the prediction in unobserved directions, metres."""
 MIN_VERIFIED_SHARE = 0.09
-"""Share of the readings that must be static and lie on the map where most of the view is dynamic."""
+"""Smallest share of measurements that are static and on the map, in mostly dynamic views."""
 MAX_STEP = 0.5
-"""Largest motion between two frames whose times are not known, as a share of the width of the image by which it moves
-the median reading: half of the view is still common then, from which a registration can start."""
+"""Largest motion between two frames without known times: shift of the median measurement as a share of the image width.
+Half of the view is then still common, from which a registration can start."""
 MAX_IMAGE_SHIFT = 1.0
-"""Largest misregistration of two images by a right pose, pixels of the coarsest level: a registration that is farther
-off has not converged on any level."""
+"""Largest misregistration of two images at a correct pose, pixels of the coarsest level. A larger one has not converged
+on any level."""
 CONFIRMED_SHARE, CONFIRMED_OF_SEEN = 0.5, 0.8
-"""Shares of the readings, of all and of those that the last frame shows, whose depth must agree with the last frame for
-it to confirm a pose: most of the view, and no room for another motion beside it. With a right pose noise leaves 99.7 %,
-depth edges a few percent less; at the wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
+"""Smallest shares of measurements whose depth agrees with the last frame, of all and of those visible in it, to confirm
+a pose. They leave no room for a second motion. At a correct pose noise leaves 99.7 %, depth edges a few percent less;
+at wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
 STRICTNESS = {
     "tracking": (4.0, 4.0, 0.03),
     "mostly dynamic": (2.0, 4.0, 0.03),
     "recovering": (1.6, 2.5, 0.02),
     "recognized": (2.5, 2.5, 0.02),
 }
-"""Largest distance residual and largest intensity difference in multiples of what was usual, and smallest limit of the
-intensity difference (0..1). Where most of the view is dynamic, a dynamic object registered as static shows in the
-distances first. After a loss the initial pose is poor and wrong minima are common. Where place recognition found the
-same pose, larger distances are accepted."""
+"""Largest distance residual and intensity difference, in multiples of the usual values, and smallest limit of the
+intensity difference (0..1).
+
+* mostly dynamic: a dynamic object registered as static shows in the distances first
+* recovering: the initial pose is poor and wrong minima are common
+* recognized: place recognition found the same pose, so that larger distances are accepted
+"""
 USUAL_OVERLAP = 0.6
-"""Smallest share of the static readings on the map after a loss, in multiples of what was usual."""
+"""Smallest share of static measurements on the map after a loss, in multiples of the usual share."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Quantities from which the limits of the checks follow.
+    """Quantities that determine the limits of the checks.
 
     Attributes:
         config: Configured limits.
         sensor: Noise of the sensor.
-        max_dynamic_share: Configured largest share of dynamic readings.
+        max_dynamic_share: Configured largest share of dynamic measurements.
         mode: Key of STRICTNESS.
-        mostly_dynamic: Most of the readings are dynamic.
+        mostly_dynamic: Most of the measurements are dynamic.
         blind: The image carries no information.
-        residual_mm, overlap, color: Usual values of the frames before; NaN if not known yet.
+        residual_mm, overlap, color: Usual values of the frames before; NaN if unknown.
     """
 
     config: TrackerConfig
@@ -70,7 +74,7 @@ class Limits:
 
     @cached_property
     def sigma_mm(self) -> float:
-        """Standard deviation of a reading at 1 m, millimetres."""
+        """Standard deviation of a measurement at 1 m, millimetres."""
         return 1000 * self.sensor.reference_sigma
 
 
@@ -79,12 +83,12 @@ class Check:
     """One condition of a registered frame.
 
     Attributes:
-        figure: Name of the figure that is judged, with its unit.
-        limit: Limit of the figure. A check whose figure or limit is not known, NaN, passes.
-        reason: Text, in which ``figure`` and ``limit`` are replaced by their values.
-        at_least: The figure must not be below the limit, instead of not above.
-        overruled_by: Evidence against which the check does not hold: the ``last frame``, seen from the pose, has the
-            same depth and the same image; the ``corners`` of the last image support the pose.
+        figure: Name of the tested metric, with its unit.
+        limit: Limit of the metric. A NaN metric or limit passes.
+        reason: Text with placeholders for ``figure`` and ``limit``.
+        at_least: The limit is a lower bound instead of an upper bound.
+        overruled_by: Evidence that overrules the check: the ``last frame``, seen from the pose, has the same depth and
+            image; or the ``corners`` of the last image support the pose.
     """
 
     figure: str
@@ -116,7 +120,7 @@ REGISTRATION = (
 )
 """Checks of a registration by itself."""
 RELATIVE = (
-    # a residual within the noise of the sensor speaks against no pose, however small it was before
+    # a residual within the sensor noise never rejects a pose, however small it was before
     Check(
         "residual_mm",
         lambda limits: max(STRICTNESS[limits.mode][0] * limits.residual_mm, limits.sigma_mm),
@@ -130,7 +134,7 @@ RELATIVE = (
         at_least=True,
         overruled_by="last frame",
     ),
-    # two walls of one room have the same shape, but not the same texture
+    # two walls of a room have the same shape, but different texture
     Check(
         "color_residual",
         lambda limits: max(STRICTNESS[limits.mode][1] * limits.color, STRICTNESS[limits.mode][2]),
@@ -138,7 +142,7 @@ RELATIVE = (
         overruled_by="last frame",
     ),
 )
-"""Checks against what was usual in the frames before."""
+"""Checks against the usual values of the frames before."""
 CHECKS = (
     *REGISTRATION,
     Check("speed_m_s", lambda limits: limits.config.max_speed, "the camera would have jumped at {figure:.1f} m/s"),
@@ -174,7 +178,7 @@ CHECKS = (
         overruled_by="corners",
     ),
 )
-"""All checks of a frame, in the order in which they are applied."""
+"""All checks of a frame, in order of application."""
 
 
 def first_failure(
@@ -187,9 +191,9 @@ def first_failure(
 
     Args:
         checks: The checks.
-        figures: By name.
-        limits: What the limits follow from.
-        evidence: What decides whether a check that fails is overruled, by name; None for no evidence.
+        figures: Metrics by name.
+        limits: Quantities that determine the limits.
+        evidence: Functions that decide on overruling, by name; None for no evidence.
     """
     for check in checks:
         figure, limit = figures[check.figure], check.limit(limits)

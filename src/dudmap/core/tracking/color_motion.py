@@ -1,4 +1,4 @@
-"""Registration of the colour image with the camera's motion, and the noise that remains in its intensities."""
+"""Registration of the colour image with the camera motion, and the remaining noise of its intensities."""
 
 from dataclasses import replace
 from functools import cache, cached_property
@@ -22,13 +22,13 @@ from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 
 
 class RegisteredLevel(Level):
-    """A level whose intensities are registered when they are first asked for, since few frames need all levels.
+    """A level that registers its intensities on demand, because few frames need all levels.
 
-    The intensities follow from the other attributes, so that they are no part of the state of a system.
+    The intensities follow from the other attributes and are not part of the state of a system.
 
     Attributes:
         observation: The frame.
-        calibration: Of the colour camera.
+        calibration: Calibration of the colour camera.
         velocity: (6,) twist of the camera per second.
     """
 
@@ -51,30 +51,30 @@ class RegisteredLevel(Level):
 
 
 class ColorMotion(Stateful):
-    """Registers colour to depth with the calibration in use, which may change while the camera moves.
+    """Registers colour to depth with the present calibration, which may change while the camera moves.
 
-    A colour image taken at tau after the depth image of a camera at x with the velocity v shows what is seen from
-    y = x + tau v. Registered with the velocity v + d it asks for the pose x - tau d; if colour has the share k of the
-    registration, the velocity that follows from the found pose is v - k (tau / dt) d, where dt is the time since the
-    last frame. For tau > dt / 2 and k = 1, errors would grow from frame to frame if that velocity were used for the
-    next. Going the part a = 1 / (1 + tau / dt) of the way from the assumed velocity to the found one leaves
-    d (1 - a (1 + k tau / dt)): nothing where colour decides, and where it does not the pose is not concerned.
+    A colour image taken tau after the depth image shows the view from y = x + tau v, with the camera position x and
+    velocity v. Registered with the velocity v + d, it pulls the pose to x - tau d. If colour has the share k of the
+    registration, the found pose implies the velocity v - k (tau / dt) d, with the time dt since the last frame. Used
+    directly for the next frame, errors would grow for tau > dt / 2 and k = 1. Therefore the velocity only moves the
+    part a = 1 / (1 + tau / dt) from the assumed to the found velocity. This leaves d (1 - a (1 + k tau / dt)): zero if
+    colour dominates; otherwise colour hardly affects the pose.
 
-    The velocity of the first frame of a map is not known. Its colours are taken as they are, and so are those of the
-    second frame, whose motion since the first is then right; with it the first frame is fused anew.
+    The velocity of the first frame of a map is unknown. Its colours and the colours of the second frame are not moved,
+    so that the motion between both is correct. With this motion the first frame is fused again.
 
     Args:
         motion: Velocity of the camera.
-        given: Calibration with which frames are prepared; None for colour that is registered to depth.
+        given: Calibration for preparing frames; None for colour that is registered to depth.
 
     Attributes:
-        calibration: In use; None for images that are taken as they are.
+        calibration: Calibration in use; None for images without correction.
     """
 
     given: Remembered[Calibration | None]
     calibration: Remembered[Calibration | None]
-    _is_first: Remembered[bool] = False  # whether the last frame began a map, with images of an unknown velocity
-    _rectified_from: Remembered[float] = -np.inf  # time stamp of the first frame whose rolling shutter was known
+    _is_first: Remembered[bool] = False  # the last frame began a map, with unknown velocity
+    _rectified_from: Remembered[float] = -np.inf  # time stamp of the first frame with known rolling shutter
 
     def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
         self.motion = motion
@@ -86,16 +86,15 @@ class ColorMotion(Stateful):
         return assumed if self.calibration is None else self.calibration.time_sigma(assumed)
 
     def start(self, view: FrameView) -> None:
-        """A map was made of this frame, whose velocity is not known yet."""
+        """Begin with the first frame of a map, whose velocity is unknown."""
         self._is_first = not self.is_prepared(view.observation) or self.rectifies
 
     def first_frame(
         self, first: FrameView | None, timestamp: float, T_world_camera: NDArray[np.float64]
     ) -> FrameView | None:
-        """The first frame of a map rectified and its colours registered, once the pose (4, 4) of the next is known.
+        """The first frame of a map, rectified and with registered colours, once the pose (4, 4) of the next is known.
 
-        None where the map is right as it is, where its first frame is forgotten, or where too much time has passed for
-        the velocity to be known.
+        Returns None if the map is already correct, its first frame is forgotten, or the velocity is outdated.
         """
         is_first, self._is_first = self._is_first, False
         if first is None or not is_first or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
@@ -104,17 +103,17 @@ class ColorMotion(Stateful):
         return self._with_colors(replace(first, observation=self.rectified(first.observation, velocity)), velocity)
 
     def predicted(self, view: FrameView) -> FrameView:
-        """The frame with the intensities of its pyramid registered by the velocity so far."""
+        """The frame with pyramid intensities registered by the last velocity."""
         return self._with_levels(view, self.motion.velocity)
 
     def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
-        """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
+        """The frame with pyramid intensities registered by the velocity to a first estimate of its pose (4, 4)."""
         if self._is_first:
             return view
         return self._with_levels(view, self._velocity(view, T_world_camera))
 
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
-        """The frame once its pose (4, 4) is known; another thread registers its colours (``FrameView.colored``)."""
+        """The frame after its pose (4, 4) is known; another thread registers its colours (``FrameView.colored``)."""
         velocity = self._velocity(view, T_world_camera)
         if self._is_first:  # the next frames are compared with its intensities
             view = self._with_levels(view, velocity)
@@ -126,10 +125,10 @@ class ColorMotion(Stateful):
         """A frame with its recorded colour registered to the depth.
 
         Args:
-            frame: Preprocessed depth, and colour as it was recorded.
-            camera: Of the depth image, without distortion.
-            velocity: (6,) twist of the camera per second, its own axes.
-            calibration: Of the colour camera; None for colour that is registered already.
+            frame: Preprocessed depth, and recorded colour.
+            camera: Camera of the depth image, without distortion.
+            velocity: (6,) twist of the camera per second, camera axes.
+            calibration: Calibration of the colour camera; None for registered colour.
         """
         if calibration is None:
             return frame
@@ -137,7 +136,7 @@ class ColorMotion(Stateful):
         return replace(frame, color=register_color(frame.rgb, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
-        """Whether the frame was prepared with all that is known of its colours."""
+        """Whether the colours of the frame need no further registration."""
         calibration = self.calibration
         if calibration is None or calibration.is_registered(observation.camera) or not observation.has_color:
             return True
@@ -145,15 +144,15 @@ class ColorMotion(Stateful):
 
     @property
     def rectifies(self) -> bool:
-        """Whether the depth images have a rolling shutter to be taken out."""
+        """Whether the depth images have a rolling shutter to correct."""
         return self._depth_readout != 0
 
     def rectified(self, observation: Observation, velocity: NDArray[np.float64] | None = None) -> Observation:
-        """A frame at the time of its middle row; itself where all rows are taken at once.
+        """A frame rectified to the time of its middle row; unchanged with a global shutter.
 
         Args:
-            observation: As recorded.
-            velocity: (6,) twist of the camera per second; None for that so far.
+            observation: Recorded images.
+            velocity: (6,) twist of the camera per second; None for the last velocity.
         """
         velocity = self.motion.velocity if velocity is None else velocity
         if not (self.rectifies and velocity.any()):
@@ -161,7 +160,7 @@ class ColorMotion(Stateful):
         return rectified(observation, self._depth_readout, velocity, with_color=self.is_prepared(observation))
 
     def use(self, calibration: Calibration, timestamp: float) -> None:
-        """Take a calibration for all frames after this time stamp."""
+        """Use a calibration for all frames after this time stamp."""
         if calibration.depth_readout != self._depth_readout:
             self._rectified_from = timestamp
         self.calibration = calibration
@@ -173,7 +172,7 @@ class ColorMotion(Stateful):
     def _projection(self, calibration: Calibration, frame: Frame, velocity: NDArray[np.float64]) -> ColorProjection:
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         readout = calibration.depth_readout
-        if frame.timestamp <= self._rectified_from or readout != self._depth_readout:  # its depth is as recorded
+        if frame.timestamp <= self._rectified_from or readout != self._depth_readout:  # its depth is not rectified
             calibration = replace(calibration, depth_readout=0.0)
         return color_projection(calibration, velocity, offset)
 
@@ -191,7 +190,7 @@ class ColorMotion(Stateful):
         return replace(view, colors=submit(colored))
 
     def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist per second (6,) after a frame was registered with that of the motion model."""
+        """Twist per second (6,) after registration of a frame with the velocity of the motion model."""
         if self.calibration is None:
             return view.color_velocity
         assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
@@ -217,29 +216,26 @@ class ColorMotion(Stateful):
 
 
 RESOLUTION = 0.5
-"""Displacement, in voxels or pixels, below which intensities cannot tell two images apart: half a sampling distance."""
+"""Displacement, in voxels or pixels, that intensities cannot resolve: half a sampling distance."""
 STRIDE = 8
-"""Every so many pixels, across and down, enter the median."""
+"""Step between the pixels of the median, across and down."""
 
 
 def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: float, voxel_size: float) -> float:
-    """Factor in (0, 1] of the weight of the intensity residual while the camera moves.
+    """Factor in (0, 1] for the weight of the intensity residual while the camera moves.
 
-    Colour and depth of one pixel are not taken at one time: the rows of a rolling shutter are read out one after the
-    other, exposure takes time, and the two cameras are not synchronised. With a standard deviation ``s`` of that time
-    and an image that moves by ``u`` pixels per second, the colour of a reading is displaced by ``s u`` pixels, and its
-    residual has the variance
+    Colour and depth of one pixel are captured at different times, because of rolling shutter, exposure and
+    unsynchronised cameras. ``s`` is the standard deviation of this time difference, and ``u`` the speed of the image,
+    pixels per second. The colour is then displaced by ``s u`` pixels, and its residual has the variance
 
-        sigma^2 + |grad I|^2 (s u)^2 = sigma^2 (1 + (s u / r)^2),   r = sigma / |grad I|,
+        sigma^2 + |grad I|^2 (s u)^2 = sigma^2 (1 + (s u / r)^2),   r = sigma / |grad I|.
 
-    where r is the displacement that the intensities resolve at all: half a pixel of the level, or half a voxel, since
-    the map holds no finer detail. The weight is divided by the bracket with the median of u / r over the image. The
-    motion field of a twist (v, omega) is, per unit of the image at depth 1 (Longuet-Higgins and Prazdny 1980),
+    Here r is the displacement that intensities resolve: half a pixel of the level, or half a voxel, because the map has
+    no finer detail. The weight is divided by the bracket with the median of u / r over the image. The motion field of a
+    twist (v, omega) is, per unit of the image at depth 1 (Longuet-Higgins and Prazdny 1980),
 
         (-v_x + x v_z) / z - omega_y + y omega_z + x (y omega_x - x omega_y),
-        (-v_y + y v_z) / z + omega_x - x omega_z + y (y omega_x - x omega_y):
-
-    a camera that moves forwards shifts the middle of its image less than one that moves sideways.
+        (-v_y + y v_z) / z + omega_x - x omega_z + y (y omega_x - x omega_y).
 
     Args:
         level: Finest level of the registration.
@@ -262,10 +258,10 @@ def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: flo
 
 
 def gain_discount(gain: float, sigma: float, color_weight: float) -> float:
-    """Factor in (0, 1] of the weight of the intensity residual of an image that is darker than the map.
+    """Factor in (0, 1] for the weight of the intensity residual of an image that is darker than the map.
 
-    A weight w of the intensities against distances of the standard deviation ``sigma`` stands for the variance
-    sigma^2 / w. Grey levels of an image that a gain g brightens are g apart, and their rounding adds (g^2 - 1) / 12.
+    A weight w of intensities against distances with standard deviation ``sigma`` corresponds to the variance sigma^2 /
+    w. A gain g spreads the grey levels to steps of g, whose rounding adds (g^2 - 1) / 12.
     """
     rounding = max(gain * gain - 1, 0.0) / (12 * 255**2)
     return 1 / (1 + rounding * color_weight / sigma**2)

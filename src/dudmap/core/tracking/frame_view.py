@@ -1,4 +1,4 @@
-"""A frame on its way: what needs no other frame, its pose and labels once registered, and the time of each stage."""
+"""A frame in processing: its independent parts, its pose and labels after registration, and the time of each stage."""
 
 import time
 from collections.abc import Callable
@@ -21,23 +21,23 @@ from dudmap.core.tracking.tracker import TrackingResult
 
 
 class StageTimer:
-    """Milliseconds per stage of the processing of a frame; the times of a stage that runs twice are added.
+    """Milliseconds per processing stage of a frame; repeated stages are added.
 
-    A stage that runs within another one counts for itself alone, so that no time is counted twice.
+    A nested stage does not count for the outer one, so that no time is counted twice.
 
     Args:
-        timings: Milliseconds per stage that were measured before.
+        timings: Earlier milliseconds per stage.
     """
 
     def __init__(self, timings: dict[str, float] | None = None) -> None:
         self.timings = timings or {}
         self._running: tuple | None = None  # stage, start, milliseconds within the outer stage, the outer stage
         self._stage = ""
-        self._within = 0.0  # milliseconds of the stages that ran within the one that is running
+        self._within = 0.0  # milliseconds of the stages nested in the present one
 
     @property
     def stage(self) -> str:
-        """The stage that is running; empty outside of all."""
+        """The running stage; empty if there is none."""
         return "" if self._running is None else self._running[0]
 
     def __call__(self, stage: str) -> "StageTimer":
@@ -62,7 +62,7 @@ class StageTimer:
 TEXTURELESS = 0.01
 """Standard deviation of the intensities (0..1) below which an image carries no information: black or saturated."""
 EXPOSED, USUAL_INTENSITY = (0.2, 0.75), 0.4
-"""Mean intensities of images that are exposed as usual, and the one that others begin a map with."""
+"""Range of mean intensities of normally exposed images, and target mean of other first images of a map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,13 @@ class FrameView:
     Attributes:
         observation: Preprocessed images.
         levels: Returns the image pyramid of the observation.
-        segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them.
+        segmentation: Returns the surface segments of ``pyramid.labelled``; waits for the thread that computes them.
         timer: Collects the processing time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
         blind: The image is textureless although the first image of the map was not, or the light has changed too much.
-            The pose rests on the distances alone, and the frame is not fused.
+            Only the distances determine the pose, and the frame is not fused.
         color_velocity: (6,) twist of the camera per second with which the colours were registered.
-        colors: Returns the observation with its colours registered; None where those it has are.
+        colors: Returns the observation with registered colours; None if its colours are registered.
     """
 
     observation: Observation
@@ -94,8 +94,8 @@ class FrameView:
     def of(
         cls, observation: Observation, config: Config, detector: DynamicDetector, *, now: bool = True
     ) -> "FrameView":
-        """A preprocessed frame with its pyramid and segments, computed ``now`` or at the first use."""
-        _ = observation.num_readings  # cached there for the result
+        """A preprocessed frame with its pyramid and segments, computed ``now`` or on demand."""
+        _ = observation.num_readings  # cached for the result
         levels = cache(lambda: Pyramid.of(observation, observation.camera, config))
         if now:
             levels()
@@ -108,7 +108,7 @@ class FrameView:
 
     @property
     def without_image(self) -> bool:
-        """Whether the pose rests on the distances alone: the image carries no information, or there is none."""
+        """Whether only the distances determine the pose: the image carries no information, or there is none."""
         return self.blind or not self.observation.has_color
 
     def colored(self) -> Observation:
@@ -129,25 +129,25 @@ class FrameView:
         return self.pyramid.labelled
 
     def with_dynamic(self, moving: NDArray[np.bool_]) -> "FrameView":
-        """The frame with more pixels that are known to be dynamic: (h, w) bool, label resolution."""
+        """The frame with additional known dynamic pixels: (h, w) bool, label resolution."""
         known = full_size(moving, self.labelled.depth, self.observation.depth)
         return replace(self, known_dynamic=known if self.known_dynamic is None else known | self.known_dynamic)
 
     def tracked_at(self, T_world_camera: NDArray[np.float64], **attributes: Any) -> TrackedImage:  # noqa: ANN401
-        """Image of the frame at a pose (4, 4), to be compared with others."""
+        """Image of the frame at a pose (4, 4), for comparison with other images."""
         return TrackedImage(self.timestamp, T_world_camera, self.pyramid, self.segmentation(), **attributes)
 
     @property
     def brightness(self) -> float:
-        """Mean intensity of the pixels with a depth, or of all if none has one: an object before a dark background is
-        not dark."""
+        """Mean intensity of the pixels with depth, or of all pixels if there are none; an object before a dark
+        background is thus not dark."""
         coarse = self.pyramid.coarse
         return float((coarse.intensity[coarse.depth > 0] if coarse.depth.any() else coarse.intensity).mean())
 
     @property
     def first_gain(self) -> float:
-        """Gain with which the frame begins a map: cameras often start before their exposure has settled, and the
-        colours of a map, whose exposure later frames get, are stored in steps of 1 / 255."""
+        """Gain of the first frame of a map. Cameras often start before their exposure has settled, and a map, whose
+        exposure later frames adopt, stores colours in steps of 1 / 255."""
         mean = self.brightness
         return 1.0 if self.textureless or EXPOSED[0] <= mean <= EXPOSED[1] else USUAL_INTENSITY / mean
 
@@ -161,7 +161,7 @@ class FrameView:
 
 
 PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
-"""Weight in the first registration of pixels that were dynamic in the previous frame."""
+"""Weight of previously dynamic pixels in the first registration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +170,10 @@ class PoseEstimate:
 
     Attributes:
         tracking: Result of the last registration.
-        labels: Static probabilities and dynamic pixels; None where labelling is switched off or the frame starts a map.
-        unverified_mask: (h, w) bool, label resolution, pixels that ego-motion could not verify as static while most of
-            the view moves; None for none.
-        view: The frame with the colours that were registered; None where those it was given with were.
+        labels: Static probabilities and dynamic pixels; None without labelling or for the first frame of a map.
+        unverified_mask: (h, w) bool, label resolution, pixels not verified as static while most of the view moves; None
+            for none.
+        view: The frame with the registered colours; None if they did not change.
     """
 
     tracking: TrackingResult
@@ -195,7 +195,7 @@ class PoseEstimate:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Gain and offset that map the frame's intensities to those of the map."""
+        """Gain and offset from the frame's intensities to the map's."""
         return self.tracking.exposure
 
     @property
@@ -204,8 +204,8 @@ class PoseEstimate:
         return unobserved_motion(self.tracking.unobservable)
 
     def doubt(self, view: FrameView) -> str:
-        """Reason why the pose is uncertain: the view does not determine all directions, or the light has changed and
-        most of the image is saturated; empty if there is none."""
+        """Reason why the pose is uncertain, empty if there is none: unobserved directions, or changed light with a
+        mostly saturated image."""
         if self.unobserved_motion:
             return self.unobserved_motion
         level = view.labelled
@@ -214,7 +214,7 @@ class PoseEstimate:
         return f"the light has changed, and {share:.0%} of the image is saturated" if share > 0.5 else ""
 
     def dynamic_mask(self, view: FrameView) -> NDArray[np.bool_]:
-        """Dynamic pixels (H, W) of the frame, of the labels and of those that are known before."""
+        """Dynamic pixels (H, W) of the frame: labelled or known before."""
         with view.timer("label"):
             if self.labels is None:
                 mask = np.zeros(view.observation.depth.shape, dtype=bool)
@@ -241,12 +241,12 @@ def static_weights(
 def initial_weights(
     levels: list[Level], previously_dynamic: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
 ) -> list[NDArray[np.float32]] | None:
-    """Weights of the first registration, before the frame is labelled; None counts every pixel fully.
+    """Weights of the first registration, before the frame is labelled; None = 1 for every pixel.
 
     Args:
         levels: Pyramid levels.
-        previously_dynamic: (h, w) bool, dynamic pixels of the previous frame; their weight is reduced.
-        excluded: Masks of any size of pixels that get no weight.
+        previously_dynamic: (h, w) bool, dynamic pixels of the previous frame, whose weight is reduced.
+        excluded: Masks of any size of pixels without weight.
     """
     if previously_dynamic is None and not excluded:
         return None

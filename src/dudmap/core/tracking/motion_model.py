@@ -14,13 +14,13 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.errors import ConfigError
 
 GivenRole = Literal["estimated", "given", "refined"]
-"""Role of poses that come with the frames, see ``MotionModel``."""
+"""Role of poses given with the frames, see ``MotionModel``."""
 VELOCITY_LIFETIME = 0.15
-"""Time after the last accepted pose during which the velocity is still used, seconds."""
+"""Time since the last accepted pose during which the velocity is valid, seconds."""
 PAUSE = 1.0
-"""Time without a pose after which the last velocity is useless, seconds: a hand accelerates by about 1 m/s^2."""
+"""Time without a pose after which the velocity is useless, seconds: a hand accelerates by about 1 m/s^2."""
 ACCELERATION = 1.0
-"""Standard deviation of the acceleration of a handheld camera, m/s^2: the cause of prediction errors."""
+"""Standard deviation of the acceleration of a handheld camera, m/s^2, which causes the prediction errors."""
 
 
 class MotionModel(Stateful):
@@ -45,7 +45,7 @@ class MotionModel(Stateful):
     _timestamp: Remembered[float] = 0.0
     _velocity: Remembered[NDArray[np.float64]]
     _initialized: Remembered[bool] = False
-    _observed: Remembered[float] = 0.0  # time of the last pose whose motion was seen in all directions
+    _observed: Remembered[float] = 0.0  # time of the last pose that was observed in all directions
 
     def __init__(self, config: TrackerConfig, *, timed: bool = True, poses: GivenRole = "estimated") -> None:
         self.config = config
@@ -76,7 +76,7 @@ class MotionModel(Stateful):
 
     @property
     def missing(self) -> Rejection | None:
-        """Why the next frame cannot be used, None if it can."""
+        """Reason to reject the next frame, or None."""
         lacks = self.poses == "given" and self._T_given is None
         return Rejection("pose", "no pose is given for the frame") if lacks else None
 
@@ -99,11 +99,11 @@ class MotionModel(Stateful):
         return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
     def repeated(self, timestamp: float, T_last: NDArray[np.float64], *, depth_only: bool) -> NDArray[np.float64]:
-        """Pose (4, 4) of a frame that repeats the images of the last one, of pose ``T_last``, or its depth alone."""
+        """Pose (4, 4) of a frame that repeats the images of the last one (pose ``T_last``), or only its depth."""
         return self.predict(timestamp) if depth_only or self.is_given else T_last
 
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
-        """Accept the pose of a tracked frame, whose motion was ``observed`` in all directions or partly predicted."""
+        """Accept the pose of a tracked frame; ``observed``: no direction of its motion was predicted."""
         if observed:
             self._observed = timestamp
         if self._initialized:
@@ -119,7 +119,7 @@ class MotionModel(Stateful):
         return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
 
     def lost(self, timestamp: float) -> bool:
-        """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
+        """Register a frame without a pose; after the velocity's lifetime, the last pose is the prediction.
 
         Returns:
             Whether the velocity's lifetime is over.
@@ -134,14 +134,15 @@ class MotionModel(Stateful):
         return self._initialized and timestamp - self._timestamp > PAUSE
 
     def drift(self, timestamp: float) -> float:
-        """Standard deviation of a pose that is partly predicted, metres.
+        """Standard deviation of a partly predicted pose, metres.
 
-        An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
+        An unknown acceleration with standard deviation a displaces the camera by a t^2 / 2 from its prediction in a
+        time t.
         """
         return ACCELERATION * (timestamp - self._observed) ** 2 / 2
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Continue from the pose of a relocalised frame with unknown velocity."""
+        """Continue from the pose of a relocalized frame with unknown velocity."""
         self._initialized, self._velocity = False, np.zeros(6)
         self.update(timestamp, T_world_camera)
 
@@ -153,8 +154,7 @@ class MotionModel(Stateful):
     def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
         """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``.
 
-        Without the times of the frames it is ``step``: the shift of the median measurement as a share of the image
-        width.
+        Without frame times it is ``step``: the shift of the median measurement as a share of the image width.
 
         Args:
             timestamp: Seconds.

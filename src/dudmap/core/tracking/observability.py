@@ -12,27 +12,28 @@ from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level
 
 INTENSITY_SIGMA = 1 / 255
-"""Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
+"""Standard deviation of a voxel's intensity: one grey level, the storage step."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
-"""Readings across the image from which the noise of H is computed, and how many of all must lie on the map."""
+"""Number of samples across the image for the noise of H, and smallest number of samples on the map."""
 INTERPOLATED = 2 * (2 / 3) ** 2
-"""Variance of a component of the gradient of the trilinear interpolation of independent values of variance 1, per cell:
-a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
+"""Variance of a gradient component of trilinearly interpolated independent values of variance 1, averaged over a cell.
+It is a difference of two means over four edges, whose weights a (1 - a) each square to (2/3)^2 over the cell."""
 STEEPEST = 9.5
-"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors return no depth."""
 REGULAR = 1e-6
-"""Share by which the diagonal of the noise is raised."""
+"""Relative increase of the diagonal of the noise."""
 AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
-"""Motion along and about the camera's x, y and z."""
+"""Motions along and about the camera's x, y and z."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """Which directions of a twist (v, omega) about the camera's centre a registration determines.
+    """Directions of a twist (v, omega) about the camera's centre that a registration determines.
 
     Attributes:
         observable: (6, m) basis of the determined directions, world axes.
-        unobservable: (6 - m, 6) the others, camera axes; each of unit length if one radian counts as the mean depth.
+        unobservable: (6 - m, 6) the other directions, camera axes; each of unit length if one radian counts as the mean
+            depth.
     """
 
     observable: NDArray[np.float64]
@@ -44,7 +45,7 @@ class Observability:
         return len(self.unobservable) == 0
 
     def with_shown(self, shown: NDArray[np.bool_], R_world_camera: NDArray[np.float64]) -> "Observability":
-        """The same with those of the k unobservable directions that are ``shown`` (k,) among the observable ones."""
+        """Copy in which the directions ``shown`` (k,) of the k unobservable ones are observable."""
         if shown.all():
             return COMPLETE
         more = np.kron(np.eye(2), R_world_camera) @ self.unobservable[shown].T
@@ -57,7 +58,7 @@ COMPLETE = Observability(np.eye(6), np.empty((0, 6)))
 
 @dataclass(frozen=True, eq=False)
 class GradientNoise:
-    """Information that noise of the gradients alone contributes to H.
+    """Information in H from noise of the gradients alone.
 
     Attributes:
         distances, intensities: (6, 6) of the two terms, world axes.
@@ -77,21 +78,21 @@ class GradientNoise:
         R_world_camera: NDArray[np.float64],
         least: float,
     ) -> Observability:
-        """Directions on which the information of both terms, each in units of its own noise, exceeds it.
+        """Directions in which the information of both terms, in units of their noise, exceeds the noise.
 
-        Gradients e + n of a term with noise n give E[H] = H_true + N: where a view says nothing, H is not zero but N,
-        and the registration settles wherever the noise fits best. A term of precise gradients and one of poor ones
-        count by their variances s^2: the generalised eigenvalues of
+        Gradients e + n of a term with noise n give E[H] = H_true + N. In unobserved directions H is N instead of zero,
+        and the registration settles at the best fit of the noise. Terms with precise and with poor gradients count by
+        their variances s^2. The generalised eigenvalues of
 
             (H_d / s_d^2 + H_c / s_c^2) v = mu (N_d / s_d^2 + N_c / s_c^2) v
 
-        are 1 where there is only noise, whatever the units of translation and rotation.
+        are 1 for pure noise, independent of the units of translation and rotation.
 
         Args:
             H_distances: (6, 6) normal equations of the distances alone, world axes.
             H: (6, 6) of both terms.
             R_world_camera: (3, 3).
-            least: Smallest eigenvalue of a direction that is determined.
+            least: Smallest eigenvalue of a determined direction.
         """
         s_d, s_c = self.variances
         information, noise = H_distances / s_d, self.distances / s_d
@@ -124,15 +125,15 @@ def gradient_noise(
     H: NDArray[np.float64],
     least: float,
 ) -> GradientNoise | None:
-    """What noise of the gradients contributes to H in a view.
+    """Information in H from noise of the gradients in a view.
 
     Noise of standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient variance
-    sigma^2 a^2 / (8 pi s^4) (variance sigma^2 a^2 / (4 pi s^2) over 2 s^2); s is that of the filter and of half a voxel
-    together. A voxel takes the reading of the nearest pixel, which on a slanted surface is wrong by a uniform share of
-    the step g between two pixels, in each voxel by another: the trilinear interpolation of distances of variance
-    g^2 / 12 has the gradient variance 2 (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent:
-    2 (2/3)^2 sigma_I^2 / voxel^2. The noise is isotropic, so that a reading at p from the camera's centre contributes
-    its variance times J' J with J = [I, -hat(p)].
+    sigma^2 a^2 / (8 pi s^4): the variance sigma^2 a^2 / (4 pi s^2) over 2 s^2. s combines the filter and half a voxel.
+    A voxel takes the nearest pixel. On a slanted surface its error is uniform over the depth step g between two pixels,
+    independently per voxel. Trilinear interpolation of distances of variance g^2 / 12 has the gradient variance 2
+    (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent: 2 (2/3)^2 sigma_I^2 / voxel^2. The
+    noise is isotropic: a measurement at p from the camera centre contributes its variance times J' J with J = [I,
+    -hat(p)].
 
     Args:
         level: The image.
@@ -140,16 +141,16 @@ def gradient_noise(
         weights: (h, w) static weights.
         R_world_camera: (3, 3).
         voxel_size: Metres.
-        map_width: Width of the images that the map was made of, pixels.
+        map_width: Width of the map's source images, pixels.
         filter_px: Spatial standard deviation of their depth filter, pixels.
         parameters: The weights of the residuals.
         H: (6, 6) normal equations of both terms, world axes.
-        least: Smallest information of a direction that is determined, in units of the noise.
+        least: Smallest information of a determined direction, in units of the noise.
 
     Returns:
-        None where H has more than ``least`` times the information of the noise on every direction (then one of its two
-        terms has), without enough readings on the map, or where the pixels of the map's images are wider than its
-        voxels: then neighbouring voxels take the same reading, and the noise is another one.
+        The noise, or None in one of three cases. H exceeds ``least`` times the noise in every direction, because one
+        term does. Too few measurements are on the map. The pixels of the source images are wider than the voxels:
+        neighbouring voxels then take the same measurement, and this noise model does not apply.
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
@@ -177,23 +178,22 @@ def unobserved_motion(unobservable: NDArray[np.float64]) -> str:
 
 
 ACROSS = 80
-"""Readings across the image whose gradients are compared."""
+"""Number of compared gradients across the image."""
 MIN_AGREEMENT = 0.2
-"""Share of the gradients, of distances and intensities together, that map and image have in common, from which on a
-direction is shown. Noise gives 1 / sqrt(n) in n readings, 0.02; an endless tunnel and a wall without texture gave up to
-0.06, walls with wallpaper of which H says no more than of those two 0.3 to 0.6 (rendered
-corridors)."""
+"""Smallest correlation of map and image gradients, of distances and intensities together, along an observed direction.
+Noise gives 1 / sqrt(n) in n measurements, 0.02. In rendered corridors, an endless tunnel and an untextured wall gave up
+to 0.06; papered walls with the same H gave 0.3 to 0.6."""
 
 
 class GradientAgreement:
-    """Compares the gradients of a linearisation with those of its image.
+    """Compares the gradients of a linearisation with the gradients of its image.
 
-    Noise of the map's gradients adds to H, and nothing in H tells it from what the scene shows. The image has gradients
-    of its own, whose noise is independent of the map's: the sum of products of the two is without that bias. It is an
-    instrumental variable, as errors in the variables of a regression ask for (Fuller 1987, Measurement error models,
-    section 1.4). This holds for the intensities alone: errors of the distances are not independent, since the depth
-    filter rounds the corners of a tunnel the more the farther they are, in every image alike, so that the tunnel seems
-    to narrow, and to move with the camera.
+    Noise of the map's gradients adds to H and cannot be separated within H. The image has gradients with independent
+    noise, so that the sum of products of both is unbiased. The image gradient is an instrumental variable, the remedy
+    for errors in the variables of a regression (Fuller 1987, Measurement error models, section 1.4).
+
+    Only intensities have independent errors. The depth filter rounds distant corners of a tunnel in every image alike,
+    so that the tunnel seems to narrow and to move with the camera.
 
     Args:
         level: The image.
@@ -229,7 +229,7 @@ class GradientAgreement:
             return np.stack([across, down, -x * across - y * down], axis=-1)
 
         step = spatial(z)
-        normal = step - (0.0, 0.0, 1.0)  # of the depth of the surface at a pixel, less that of a point there
+        normal = step - (0.0, 0.0, 1.0)  # depth gradient of the surface minus the depth gradient of a point
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._shade = spatial(level.intensity.astype(np.float64))
         on_surface = known & _complete(z > 0)[self._sampled] & (np.hypot(step[..., 0], step[..., 1]) < STEEPEST)
@@ -238,23 +238,23 @@ class GradientAgreement:
         self._weights = residual_weights(level.depth[self._sampled], seen, static, parameters)
 
     def along(self, twist: NDArray[np.float64], forth: ImageStack, back: ImageStack, step: float) -> float:
-        """Share of the gradients along a twist that map and image have in common, in [-1, 1]: from the ``sums``
+        """Correlation in [-1, 1] of the gradients of map and image along a twist, from the ``sums``
 
             sum w_c g_map g_image / sqrt(sum w g_map^2 sum w g_image^2),
 
-        over the intensities above, over distances and intensities below.
+        with intensities in the numerator, and distances and intensities in the denominator.
         """
         of_map, _, of_image = (sums := self.sums(twist, forth, back, step)).sum(axis=0)
         return float(sums[1, 1] / max(np.sqrt(of_map * of_image), 1e-30))
 
     def sums(self, twist: NDArray[np.float64], forth: ImageStack, back: ImageStack, step: float) -> NDArray[np.float64]:
-        """Sums of w g_map^2, w g_map g_image and w g_image^2 (columns) over distances and intensities (rows), w that of
-        the registration.
+        """Sums of w g_map^2, w g_map g_image and w g_image^2 (columns) over distances and intensities (rows), with the
+        weights w of the registration.
 
         Args:
             twist: (6,) about the camera's centre, world axes.
             forth, back: Residuals (2, h, w) after a motion by ``step`` and ``-step`` times the twist.
-            step: Of both.
+            step: Step of both motions.
         """
         motion = self._turn @ twist[:3] + np.cross(self._turn @ twist[3:], self._points)
         changes = [(forth[n][self._sampled] - back[n][self._sampled]) / (2 * step) for n in (0, 1)]

@@ -1,7 +1,7 @@
-"""Acceptance of registered frames: the figures of ``checks.py``, and what was usual in the frames before.
+"""Acceptance of registered frames: the metrics of ``checks.py``, and their usual values in the frames before.
 
-A camera that jumps may converge to a wrong pose that fits the map. The last image, seen from there, then shows
-something else. Shape alone does not tell: walls and desks resemble each other, their texture does not.
+A camera that jumps may converge to a wrong pose that fits the map. Seen from there, the last image differs. Shape alone
+does not reveal this, because walls and desks resemble each other; their texture differs.
 """
 
 import statistics
@@ -34,12 +34,12 @@ from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
 
 CLEARLY_LESS = 0.5
-"""Another motion explains two images clearly better if its misregistration is below this share of the other: both are
-known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
+"""Another motion explains two images clearly better if its misregistration is below this share. Noise and blur add half
+a pixel to both in the median frame of a hand-held camera."""
 MIN_PIXELS = 100
-"""Pixels of the coarsest level that must show the same static surface in both images."""
+"""Smallest number of pixels of the coarsest level that show the same static surface in both images."""
 MIN_CORNERS = 60
-"""Corners of an image from which on a motion that most of them follow would be found: four times those it needs."""
+"""Smallest number of corners from which a common motion would be found: four times its minimum."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class ImageComparison:
     """The last tracked frame, seen from the pose of this one.
 
     Attributes:
-        shift: Distance by which the static pixels of the last image lie beside those of this one, pixels of the
-            coarsest level; NaN where too few are common, or an image carries no information.
-        share: Share of the readings, static and dynamic, whose depth agrees with that of the last frame.
-        share_of_seen: The same share of those at whose place the last frame has a reading.
+        shift: Misregistration of the static pixels of both images, pixels of the coarsest level. NaN if too few are
+            common, or an image carries no information.
+        share: Share of the measurements, static and dynamic, whose depth agrees with the last frame.
+        share_of_seen: The same share of the measurements that the last frame shows, too.
     """
 
     shift: float = np.nan
@@ -64,7 +64,7 @@ class ImageComparison:
 
     @property
     def is_same_view(self) -> bool:
-        """Whether depths and images agree. In a corridor the depths do wherever the camera is."""
+        """Whether depths and images agree. In a corridor the depths agree at any position."""
         return self.confirms and self.shift <= MAX_IMAGE_SHIFT
 
 
@@ -73,7 +73,7 @@ class ImageConsistency:
 
     Args:
         config: Noise of the sensor.
-        motion: Knows the pose of the last tracked frame.
+        motion: Provides the pose of the last tracked frame.
     """
 
     def __init__(self, config: Config, motion: MotionModel) -> None:
@@ -90,17 +90,21 @@ class ImageConsistency:
     ) -> bool:
         """Whether the images are compatible with the pose of a frame.
 
-        They are not if the last one lies more than MAX_IMAGE_SHIFT beside this one, and the corners of the two follow
-        no common motion, or one that explains the images clearly better. Where the depths confirm the pose and not that
-        motion, colour and depth were taken at different times, and the pose is that of the depth. Blur alone moves
-        corners and images alike. That corners are not found again where the exposure has changed suddenly says nothing.
+        They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT, and the corners of both
+        images follow no common motion or one that explains the images clearly better.
+
+        Exceptions:
+
+        * The depths confirm the pose, but not the motion of the corners: colour and depth were captured at different
+          times, and the pose is correct for the depth.
+        * The corners follow no motion, and their number is small or the exposure has changed suddenly.
 
         Args:
-            last: The last tracked frame; None where it is not known.
+            last: The last tracked frame; None if unknown.
             view: The frame.
             estimate: Its pose and labels.
             seen: Its comparison with the last frame.
-            image_pose: Computes the pose (4, 4) that the corners predict; None if they follow no common motion.
+            image_pose: Computes the pose (4, 4) that the corners predict; None without a common motion.
         """
         if last is None or not seen.shift > MAX_IMAGE_SHIFT:
             return True
@@ -124,18 +128,18 @@ class ImageConsistency:
 
             d = sqrt(2) median |I_last - I| / median |grad I|
 
-        over pixels that show the same surface in both images, after the best gain and offset. What does not resemble at
-        all gives the correlation length of the texture, a few pixels. Two depths agree within three standard deviations
-        of their difference.
+        over pixels that show the same surface in both images, after the best gain and offset. Unrelated images give the
+        correlation length of the texture, a few pixels. Two depths agree within three standard deviations of their
+        difference.
 
         Args:
-            last: The last tracked frame; None where it is not known.
+            last: The last tracked frame; None if unknown.
             view: This frame.
             estimate: Its pose and labels.
-            T_world_camera: (4, 4) another pose of this frame; None for that of the estimate.
+            T_world_camera: (4, 4) another pose of this frame; None for the pose of the estimate.
 
         Returns:
-            Of NaN where the last frame is not known.
+            The comparison; NaN if the last frame is unknown.
         """
         if last is None:
             return ImageComparison()
@@ -158,18 +162,18 @@ class ImageConsistency:
 
 
 def _reduced(mask: NDArray[np.bool_] | None, level: Level) -> NDArray[np.bool_]:
-    """A mask, None for an empty one, at the size of a level (h, w)."""
+    """A mask at the size of a level (h, w); None becomes an empty mask."""
     return np.zeros(level.depth.shape, bool) if mask is None else reduced(mask, level)
 
 
 HISTORY = 30
-"""Accepted registrations that are remembered."""
+"""Number of remembered accepted registrations."""
 MIN_HISTORY = 5
-"""Accepted registrations before new ones are compared with them."""
+"""Number of accepted registrations before new ones are compared with them."""
 SMALL_COLOR_RESIDUAL = 0.005
 """Intensity difference (0..1) that is good with any sensor."""
 UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
-"""Multiples of the median residuals from which on a registration is repeated from another initial pose."""
+"""Multiples of the median residuals above which a registration is repeated from another initial pose."""
 
 
 @dataclass(frozen=True)
@@ -178,8 +182,8 @@ class RegistrationHistory:
 
     Attributes:
         residuals: Root mean square distances to the map, metres.
-        shares: Shares of the static readings on the map.
-        colors: Root mean square intensity differences (0..1).
+        shares: Shares of the static measurements on the map.
+        colors: Median absolute intensity differences (0..1).
     """
 
     residuals: tuple[float, ...] = ()
@@ -192,8 +196,8 @@ class Verdict:
     """Outcome of the checks of a frame.
 
     Attributes:
-        reason: Of the rejection; empty for a frame that is accepted.
-        figures: All figures by name, NaN where one is not known.
+        reason: Reason of the rejection; empty for an accepted frame.
+        figures: All metrics by name, NaN if unknown.
     """
 
     reason: str
@@ -221,11 +225,11 @@ class QualityMonitor(Stateful):
         self.reset()
 
     def reset(self) -> None:
-        """Forget all registrations: a new map begins."""
+        """Forget all registrations, because a new map begins."""
         self._residuals = deque(maxlen=HISTORY)
         self._shares = deque(maxlen=HISTORY)
         self._colors = deque(maxlen=HISTORY)
-        self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN where they are not known yet
+        self._usual = (np.nan, np.nan, np.nan)  # medians of the three; NaN if unknown
         self.recovering = False
 
     @property
@@ -234,7 +238,7 @@ class QualityMonitor(Stateful):
         return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
 
     def continue_from(self, history: RegistrationHistory) -> None:
-        """Compare new registrations with those of an earlier run in the same map."""
+        """Compare new registrations with an earlier run in the same map."""
         self._residuals.extend(history.residuals)
         self._shares.extend(history.shares)
         self._colors.extend(history.colors)
@@ -243,14 +247,14 @@ class QualityMonitor(Stateful):
     def judge(
         self, last: TrackedImage | None, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose
     ) -> Verdict:
-        """Figures of a registered frame, and the reason of the first check of ``CHECKS`` that it fails.
+        """Metrics of a registered frame, and the reason of the first failed check of ``CHECKS``.
 
         Args:
-            last: The last tracked frame; None where it is not known.
+            last: The last tracked frame; None if unknown.
             view: The frame.
             estimate: Its pose and labels.
-            image_pose: Computes the pose (4, 4) that the last image and this one alone give; None if their corners
-                follow no common motion.
+            image_pose: Computes the pose (4, 4) from the last image and this one alone; None if their corners follow no
+                common motion.
         """
         tracking, labels = estimate.tracking, estimate.labels
         with view.timer("check"):

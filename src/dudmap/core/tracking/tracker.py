@@ -25,16 +25,16 @@ from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
 from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, GradientAgreement, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
-"""Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
-directions, along which more damping shortens the steps until they are taken for convergence."""
+"""Largest initial damping of the finest level, relative to the diagonal of J^T J. It is well below the eigenvalues of
+weak directions, in which more damping shortens the steps until they seem converged."""
 NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0)
-"""Rules of a registration that ends where it begins, with the normal equations there."""
+"""Rules for the normal equations at the initial pose, without a step."""
 EXPOSURE_NOISE = 0.01
-"""A change of gain and offset below this in total is noise of the fit and is not applied."""
+"""Largest change of gain and offset in total that is noise of the fit and not applied."""
 NEAREST_STEPS = 3
-"""Largest number of steps to the minimum next to a pose that is near it."""
+"""Largest number of steps to a nearby minimum."""
 MEDIAN_STRIDE = 4
-"""Every so many pixels, across and down, enter a median over the image."""
+"""Step between the pixels of a median over the image, across and down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,20 +43,20 @@ class TrackingResult:
 
     Attributes:
         T_world_camera: (4, 4).
-        exposure: Gain and offset that map the frame's intensities to those of the map.
+        exposure: Gain and offset from the frame's intensities to the map's.
         converged: Whether all checks passed.
         reason: The failed check, empty if none.
-        inlier_share: Share of the static readings that lie on the map.
+        inlier_share: Share of the static measurements on the map.
         residual: Root mean square of the distance residuals scaled by sigma(1 m) / sigma(z), metres at 1 m depth.
-        condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is not
-            constrained.
+        condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is
+            unconstrained.
         iterations: Number of linearisations over all levels.
-        color_residual: Median absolute intensity difference (0..1) to the map at the static readings, after the best
-            gain and offset; NaN for a textureless image.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static measurements, after the
+            best gain and offset; NaN for a textureless image.
         settled: Whether the last level ended by a stop criterion and not at the iteration limit.
-        unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the initial pose was
+        unobservable: (k, 6) twists, camera axes, that the view does not determine and along which the initial pose was
             kept (``core/tracking/observability.py``).
-        readings: Number of static readings on the map, weighted.
+        readings: Number of static measurements on the map, weighted.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -74,8 +74,8 @@ class TrackingResult:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Figures of ``checks.REGISTRATION`` and ``checks.RELATIVE``; directions that are known not to be determined do
-        not count as badly conditioned, as long as others remain."""
+        """Metrics of ``checks.REGISTRATION`` and ``checks.RELATIVE``. Known unobservable directions do not count as
+        badly conditioned, unless all six are unobservable."""
         missing = len(self.unobservable)
         return {
             "readings": self.readings,
@@ -88,12 +88,12 @@ class TrackingResult:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a registration has ended.
+    """End of a registration.
 
     Attributes:
         T_world_camera: (4, 4).
-        exposure: Gain and offset that map the frame's intensities to those of the map.
-        equations: Normal equations there.
+        exposure: Gain and offset from the frame's intensities to the map's.
+        equations: Normal equations at this pose.
         level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
         iterations: Number of linearisations over all levels.
         settled: Whether the last level ended by a stop criterion and not at the iteration limit.
@@ -115,8 +115,8 @@ class Tracker:
 
     Args:
         config: Residual weights, iterations, stop criteria, checks.
-        sensor: Noise of the depth readings.
-        filter_px: Spatial standard deviation of the filter of the depth images, pixels.
+        sensor: Noise of the depth measurements.
+        filter_px: Spatial standard deviation of the depth filter, pixels.
     """
 
     def __init__(
@@ -137,8 +137,8 @@ class Tracker:
         exposure: tuple[float, float] = (1.0, 0.0),
         color_weight: float | None = None,
     ) -> TrackingResult:
-        """Pose that minimises the distances and intensity differences of a frame to the map, and whether it can be
-        trusted; arguments as of ``minimize``."""
+        """Pose with the smallest distances and intensity differences of a frame to the map, and whether it can be
+        trusted; arguments as for ``minimize``."""
         found = self.minimize(volume, levels, T_init, static_weights, first_level, exposure, color_weight)
         T = found.T_world_camera.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
@@ -162,12 +162,12 @@ class Tracker:
             volume: The map.
             levels: Image pyramid, coarse to fine.
             T_init: (4, 4) initial T_world_camera.
-            static_weights: Per level (h, w) float32 in [0, 1]; None weighs every pixel 1.
+            static_weights: Per level (h, w) float32 in [0, 1]; None = 1.
             first_level: Index of the first of these levels in the configuration.
             exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
             color_weight: Weight of the intensity term; None takes the configured weight.
-            relit: Whether the light may differ from the light of the map. If not, a large gain comes from an image of
-                another surface and is not applied.
+            relit: Whether the light may differ from the map's. If not, a large gain comes from an image of another
+                surface and is not applied.
         """
         volume.look_at(T_init)
         T, iterations, system, settled, seen = T_init, 0, None, True, None
@@ -188,9 +188,9 @@ class Tracker:
                     lit, system = exposed(level, exposure), None
             rules = self._rules(limit, finest=index == len(limits) - 1)
             found = self._descend(volume, lit, T, weights, system, rules, parameters)
-            if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
+            if seen is None or not seen.is_complete:  # finer levels determine all directions of the coarsest level
                 seen = self._observability(volume, lit, found.T_world_camera, weights, found.equations, parameters)
-                if not seen.is_complete:  # its steps went where noise led them
+                if not seen.is_complete:  # noise determined its steps
                     iterations += found.iterations
                     system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
                     seen = self._observability(volume, lit, T, weights, system, parameters)
@@ -231,14 +231,14 @@ class Tracker:
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Pose (4, 4) of the minimum next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and
-        distances (h, w) of the readings to the map there, metres, NaN off the map.
+        """Minimum (4, 4) next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and the distances
+        (h, w) of the measurements to the map there, metres, NaN off the map.
 
         Args:
             volume: The map; its window must cover the view.
             level: The image.
             T_world_camera: (4, 4).
-            weights: (h, w) float32 static weights in [0, 1]; None weighs every pixel 1.
+            weights: (h, w) float32 static weights in [0, 1]; None = 1.
         """
         weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
         rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
@@ -254,7 +254,7 @@ class Tracker:
         system: NormalEquations,
         parameters: RegistrationParameters,
     ) -> Observability:
-        """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
+        """Directions that a level determines at a pose; all directions if too little is on the map to decide."""
         least, R = self.config.min_information, T_world_camera[:3, :3]
         if least == 0:
             return COMPLETE
@@ -288,14 +288,14 @@ class Tracker:
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
+        """Levenberg-Marquardt steps on one level from a pose (4, 4); ``system``: normal equations there, if known."""
         image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
         darkest, brightest = level.shown
         parameters = parameters._replace(darkest=darkest, brightest=brightest)
         return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
-        """Rules of the steps of a level along all directions."""
+        """Step rules of a level for all directions."""
         config, basis = self.config, COMPLETE.observable
         if finest:
             return DescentRules(basis, min(config.damping, FINEST_DAMPING), limit, config.stop, stop_gain=0.0)
@@ -322,7 +322,7 @@ class Tracker:
         return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
 
     def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
-        """Parameters of the cost in a map with this truncation band; ``color_weight`` None: as configured."""
+        """Cost parameters in a map with this truncation band; ``color_weight`` None: as configured."""
         config = self.config
         return RegistrationParameters(
             band=band,
@@ -335,11 +335,11 @@ class Tracker:
         )
 
     def _judge(self, found: Minimum, T_world_camera: NDArray[np.float64]) -> TrackingResult:
-        """Result of a registration that has ended at a pose (4, 4), with the first check it fails.
+        """Result of a registration that ended at a pose (4, 4), with the first failed check.
 
-        The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
-        the registration does not weigh by it, and intensities after the best gain and offset even if the registration
-        does not apply them.
+        The metrics are comparable between configurations. Distances are in units of the sensor noise even if the
+        registration does not weigh by it. Intensities are compared after the best gain and offset even if the
+        registration does not apply them.
         """
         config, system, level, weights = self.config, found.equations, found.level, found.weights
         share = system.weight / max(system.readings, 1.0)
@@ -354,7 +354,7 @@ class Tracker:
             differences = differences + np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
-        if np.isfinite(level.shown[1]):  # pixels that are saturated differ by nothing
+        if np.isfinite(level.shown[1]):  # saturated pixels have no difference
             difference = difference[difference > 0]
         color_residual = float(median(difference)) if len(difference) else 0.0
         result = TrackingResult(
@@ -365,8 +365,8 @@ class Tracker:
         return replace(result, converged=False, reason=reason) if reason else result
 
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
-        """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
-        computes with ``noise_weighting``."""
+        """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2, as linearised with
+        ``noise_weighting``."""
         noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale, self.sensor.reference_depth)
         everywhere = TruncationBand(np.inf, np.inf, 0.0, np.inf, noise)  # other residuals are NaN
         parameters = self.parameters(everywhere)._replace(noise_weighting=1.0)
