@@ -1,4 +1,4 @@
-"""Mapping: frames whose pose is known become part of the map, whose first frames wait until it is known what moves."""
+"""Mapping: fusion of frames with known poses. The first frames of a map are held back until slow motion is visible."""
 
 from dataclasses import dataclass, replace
 
@@ -21,9 +21,9 @@ from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
 
 WINDOW, WINDOW_STEP = 30, 2
-"""Fused frames after which the poses of a new map are estimated once more, of every second one."""
+"""Number of fused frames after which the poses of a new map are refined, and step between the refined frames."""
 MIN_READINGS = 0.02
-"""Share of the pixels of a first frame that must have a static depth reading."""
+"""Smallest share of pixels with static depth in a first frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,13 @@ class StartFrame:
 
 @dataclass(frozen=True, eq=False)
 class FusedFrame:
-    """A fused frame whose pose is estimated once more.
+    """A fused frame whose pose is refined later.
 
     Attributes:
         frame: Depth and colour.
         level: Finest level of the registration.
         T_world_camera: (4, 4).
-        exposure: Gain and offset that make the colours those of the map.
+        exposure: Gain and offset from its colours to the map's.
         dynamic_mask: (H, W) bool, pixels that were not fused.
     """
 
@@ -63,7 +63,7 @@ class FusedFrame:
 
     @classmethod
     def of(cls, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> "FusedFrame":
-        """What of a frame is needed."""
+        """The parts of a frame that the refinement needs."""
         observation, fine = view.colored(), view.pyramid.fine
         frame = Frame(observation.timestamp, observation.depth, observation.rgb)
         level = Level(fine.camera, fine.depth, fine.intensity)  # without the images it is made from
@@ -74,18 +74,18 @@ class Bootstrap(Stateful):
     """The first frames of a map, parts of which must be removed again.
 
     A single image shows no motion. So all pixels of the first frame count as static unless the caller declares them
-    dynamic, and slow motion appears only after a while. As soon as motion appears, its pixels are removed from the
-    first frame, and the map is rebuilt from this frame. The later frames are held back until slow motion can be seen.
-    Then they are fused without their moving pixels.
+    dynamic, and slow motion appears only later. When motion appears, its pixels are removed from the first frame, and
+    the map is rebuilt from this frame. Later frames are held back until slow motion is visible, and are then fused
+    without their moving pixels.
 
-    The first frames were registered to a map that had seen little: they are remembered to be registered once more.
+    The first frames were registered to an incomplete map. They are kept to be registered again.
 
     Args:
-        refines: Whether the first frames are remembered for a second registration.
+        refines: Whether the first frames are kept for a second registration.
         second_pass: The map of the first pass shows motion: frames are held back only until the stream ends.
 
     Attributes:
-        textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
+        textureless: Whether the image of the first frame carries no information; later ones are then not called blind.
     """
 
     textureless: Remembered[bool] = False
@@ -106,12 +106,12 @@ class Bootstrap(Stateful):
         return "" if enough else "the depth image holds hardly any readings"
 
     def start(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Remember the frame that a map was made of."""
+        """Record the frame that starts a map."""
         self._frames, self._num_fused = [StartFrame(view, estimate, dynamic_mask, fused=True)], 1
         self._window = [FusedFrame.of(view, estimate, dynamic_mask)] if self._refines else []
 
     def fused(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Remember what was fused after the first frame, or that the map began anew with it."""
+        """Record a fused frame, or the first frame of a map that is rebuilt."""
         if not self._window:
             return
         if view.timestamp <= self._window[0].frame.timestamp:
@@ -121,36 +121,36 @@ class Bootstrap(Stateful):
         self._num_fused += 1
 
     def complete_window(self) -> list[FusedFrame]:
-        """Every ``WINDOW_STEP``-th fused frame, in the order of time, once these are ``WINDOW``; they are forgotten
-        then. Before, none."""
+        """Every ``WINDOW_STEP``-th fused frame, in order of time, after ``WINDOW`` fused frames, and forget them; empty
+        before."""
         if not self._window or self._num_fused < WINDOW:
             return []
         window, self._window = self._window, []
         return sorted(window, key=lambda fused: fused.frame.timestamp)
 
     def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
-        """Remember another frame of the first moments."""
+        """Record another frame of the first moments."""
         if self._frames or self._second_pass:
             self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
 
     @property
     def first(self) -> FrameView | None:
-        """The first frame; None if it is no longer remembered."""
+        """The first frame; None if it is no longer kept."""
         return self._frames[0].view if self._frames and not self._second_pass else None
 
     def recolored(self, view: FrameView) -> StartFrame:
-        """The first frame, which is remembered, with other colours."""
+        """The first frame, which must be kept, with other colours."""
         self._frames[0] = replace(self._frames[0], view=view)
         return self._frames[0]
 
     def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
-        """The first frame with its moving pixels added to the mask; None if the map holds none of them.
+        """The first frame with its moving pixels added to the mask; None if the map has none of them.
 
-        The later frames then count as not fused, since the map is rebuilt.
+        The later frames then count as not fused, because the map is rebuilt.
 
         Args:
-            moving_before: (h, w) bool, label resolution, pixels of the first image that a later image shows as moving;
-                None if unknown.
+            moving_before: (h, w) bool, label resolution, pixels of the first image that move in a later image; None if
+                unknown.
         """
         if self.first is None or moving_before is None:
             return None
@@ -164,10 +164,10 @@ class Bootstrap(Stateful):
         return first
 
     def released(self, *, ended: bool = False) -> list[StartFrame]:
-        """The frames held back, without the pixels that have moved since; this releases them.
+        """The held-back frames without the pixels that have moved since; releases them.
 
-        A frame that follows no common motion with the last one is left out. Depth without colour cannot be compared: it
-        is left out, too, unless the stream has ``ended`` and no later frame will show the same.
+        A frame without a common motion with the last one is dropped. So is depth without colour, which cannot be
+        compared, unless the stream has ``ended`` and no later frame replaces it.
         """
         if self._second_pass and not ended:
             self._frames = []
@@ -190,7 +190,7 @@ class Bootstrap(Stateful):
         return out if last.fused else [*out, last]
 
     def abandon(self) -> None:
-        """Forget the frames: the camera is tracked in another map."""
+        """Forget the frames, because the camera is tracked in another map."""
         self._frames, self._window = [], []
 
 
@@ -199,13 +199,13 @@ class Mapper:
 
     Args:
         config: All parameters.
-        camera: Of the frames, without lens distortion.
+        camera: Camera of the frames, without lens distortion.
         atlas: The maps.
         bootstrap: The first frames of the current map.
-        predictor: Knows for how long slow motion cannot be seen yet.
-        color_motion: Colours moved by the velocity of the camera.
-        redundancy: Is told which views the map holds.
-        localize: Frames that are not fused do not become keyframes either.
+        predictor: Decides how long slow motion is hidden.
+        color_motion: Registers colours by the velocity of the camera.
+        redundancy: Records the fused views.
+        localize: Frames are neither fused nor made keyframes.
     """
 
     def __init__(
@@ -225,35 +225,35 @@ class Mapper:
         self._localize = localize
 
     def revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
-        """Rebuild the map from the first frame without pixels that a later image shows as moving. Once slow motion can
-        be seen, fuse the frames held back."""
+        """Rebuild the map from the first frame without pixels that move in a later image. Once slow motion is visible,
+        fuse the held-back frames."""
         self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
         if not self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
             self._fuse_held(self._bootstrap.released(), view.timer)
 
     def finish(self) -> int:
-        """Fuse the frames that are held back until slow motion can be seen: no later frame will show it."""
+        """Fuse the held-back frames at the end of the stream; returns their number."""
         return self._fuse_held(self._bootstrap.released(ended=True), StageTimer())
 
     def _fuse_held(self, frames: list[StartFrame], timer: StageTimer) -> int:
-        """Fuse frames of the first moments; their number."""
+        """Fuse frames of the first moments; returns their number."""
         for frame in frames:
             self.integrate(replace(frame.view, timer=timer), frame.estimate, frame.dynamic_mask)
         return len(frames)
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
+        """Rebuild the map of the first frame with colours registered by the velocity to the second frame."""
         first = self._color_motion.first_frame(self._bootstrap.first, view.timestamp, estimate.T_world_camera)
         self._begin_anew(None if first is None else self._bootstrap.recolored(first), view)
 
     def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:
-        """Empty the map and fuse its first frame again; None leaves it as it is."""
+        """Empty the map and fuse its first frame again; None changes nothing."""
         if first is not None:
             self._atlas.clear_map()
             self.integrate(replace(first.view, timer=view.timer), first.estimate, first.dynamic_mask)
 
     def extend(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool) -> None:
-        """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
+        """Fuse a frame, and keep it for relocalization if no keyframe is near."""
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
         if self._config.relocalization.enabled and not view.without_image:
@@ -267,18 +267,17 @@ class Mapper:
             self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
     def refine_first_poses(self, tracker: Tracker) -> NDArray[np.float64] | None:
-        """Once the map has seen enough, register the frames of its first moments again and make it anew of them.
+        """Register the first frames of a map again to the more complete map, and rebuild it from them.
 
-        The first frames were registered to a map of few others, whose noise they followed. In the map of all of them
-        each counts little, so that its own noise does not hold it where it was. Frames between those that are
-        remembered follow their neighbours.
+        The first frames were registered to a map of few frames and followed its noise. In the later map each frame has
+        little weight, so that its own noise does not bind it. Poses between the refined frames are interpolated.
 
         Args:
             tracker: Registers frames.
 
         Returns:
-            (4, 4) motion of the last pose; None where the map stays as it is: it is too young, was refined before, does
-            not hold all its frames, or one of them does not fit it.
+            (4, 4) motion of the last pose. None if the map is unchanged: it is too young, was refined before, is
+            incomplete, or does not fit one of the frames.
         """
         window, atlas = self._bootstrap.complete_window(), self._atlas
         if not window or self._localize or atlas.current == atlas.saved or atlas.current in atlas.rebuildings:
@@ -308,11 +307,11 @@ class Mapper:
         return corrections[-1]
 
     def _static(self, dynamic_mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Pixels (H, W) that are fused: none within the margin of a dynamic reading."""
+        """Pixels (H, W) that are fused: none within the margin of a dynamic measurement."""
         return ~grown_mask(dynamic_mask & (depth > 0), self._config.dynamics.margin_px * self._camera.width // 640)
 
     def integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
+        """Fuse the static pixels of a frame, in the exposure of the map, and store it for corrections."""
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask, observation.depth)

@@ -1,7 +1,7 @@
-"""Motion segmentation from images, for as long as the map cannot tell static from moving.
+"""Motion segmentation from images, while the map cannot separate static and moving surface.
 
-A new map knows no free space, and whoever is in view is part of it. Each image is compared with the last one
-(``dominant_motion``), and with older ones for motion that is too slow to be seen from one image to the next.
+A new map knows no free space, and its moving objects are part of it. Each image is compared with the last one
+(``dominant_motion``). Older images show motion that is too slow between consecutive images.
 """
 
 from collections import deque
@@ -23,23 +23,23 @@ from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 
 ImagePose = Callable[[], NDArray[np.float64] | None]
-"""Computes the pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
+"""Computes the pose (4, 4) by the ego-motion between two images; None if unknown."""
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
-"""Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
-the map is young, images are kept at intervals of the shorter one."""
+"""Age of the older image that shows slow motion, seconds. While the map is young, images are kept at intervals of the
+shorter baseline."""
 
 
 @dataclass(eq=False)
 class TrackedImage:
-    """Image of a frame, at its pose or a prediction of it, which is compared with older ones and later with newer ones.
+    """Image of a frame at its (predicted) pose, for comparison with older and newer images.
 
     Attributes:
         timestamp, T_world_camera: Seconds; (4, 4).
         pyramid: Its images.
         segmentation: Its segments, at the resolution of the labels.
-        moving: (h, w) bool, its pixels that are known to move; None for none.
-        blind: Whether its intensities say nothing.
-        gain: Of its exposure.
+        moving: (h, w) bool, its known moving pixels; None for none.
+        blind: Whether its intensities carry no information.
+        gain: Gain of its exposure.
     """
 
     timestamp: float
@@ -51,10 +51,10 @@ class TrackedImage:
     gain: float = 1.0
 
     def motion_to(self, later: "TrackedImage", intervals: float) -> DominantMotion | None:
-        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image; None
-        if it cannot be determined. ``intervals`` of consecutive images lie between the two.
+        """Motion of the static world to a later image, and motion too slow between consecutive images; None if unknown.
 
-        What is seen to move in this image is left out of the estimates of the next comparisons.
+        ``intervals``: number of frame intervals between the two images. Pixels of this image that move are excluded
+        from the estimates of later comparisons.
         """
         T_expected = se3.inverse(later.T_world_camera) @ self.T_world_camera
         segmentations = self.segmentation, later.segmentation
@@ -67,13 +67,13 @@ class TrackedImage:
 
 @dataclass(frozen=True, eq=False)
 class SlowMotion:
-    """Motion between an older image and a new one that is too slow to be seen from image to image.
+    """Motion between an older image and a new one that is too slow between consecutive images.
 
     Attributes:
-        T_world_camera: (4, 4) pose of the new image, from that of the older one.
-        moving: (h, w) bool, pixels of the new image in segments that moved as a whole in between.
-        static: (h, w) bool, pixels of the new image in segments that rested in between.
-        moving_first: (h, w) bool, the same of the older image if that is the first one of the map; else None.
+        T_world_camera: (4, 4) pose of the new image, relative to the older one.
+        moving: (h, w) bool, pixels of the new image in segments that moved as a whole.
+        static: (h, w) bool, pixels of the new image in static segments.
+        moving_first: (h, w) bool, moving pixels of the older image if it is the first one of the map; else None.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -86,11 +86,11 @@ class EgoMotionSegmenter(Stateful):
     """Segments moving objects by comparing images, while the map is young or most of the view moves.
 
     Args:
-        seconds: Duration of the comparison from the first frame of a map on; extended, up to twice that, while moving
-            objects are found. 0 turns the comparison off for good.
+        seconds: Duration of the comparison after the first frame of a map. It is extended, up to twice, while moving
+            objects are found. 0 disables the comparison.
 
     Attributes:
-        active: Whether the next frame is to be compared with the last one.
+        active: Whether to compare the next frame with the last one.
         last: The last tracked frame.
     """
 
@@ -119,15 +119,15 @@ class EgoMotionSegmenter(Stateful):
         return bool(np.isfinite(self._started))
 
     def map_is_young(self, timestamp: float) -> bool:
-        """Whether the map cannot tell static from moving yet."""
+        """Whether the map cannot separate static and moving surface yet."""
         return timestamp < self._young_until
 
     def slow_motion_is_hidden(self, timestamp: float) -> bool:
-        """Whether the map is younger than the longest baseline over which slow motion is looked for."""
+        """Whether the map is younger than the longest baseline for slow motion."""
         return timestamp < self._started + min(LONGEST_BASELINE, self.seconds)
 
     def update(self, frame: TrackedImage) -> None:
-        """Take over a tracked frame as the one that the next is compared with; with a blind one nothing is."""
+        """Set the tracked frame for the next comparison; after a blind frame there is none."""
         self.last, self._compared, self.active = frame, None, False
         if frame.blind:
             return
@@ -140,14 +140,14 @@ class EgoMotionSegmenter(Stateful):
             self._older.append(replace(frame))
 
     def reset(self) -> None:
-        """Drop the last frame: nothing is compared before the next ``update``."""
+        """Drop the last frame, so that nothing is compared before the next ``update``."""
         self.last, self._compared, self.active = None, None, False
 
     def compare(self, now: TrackedImage, T_expected: NDArray[np.float64] | None = None) -> DominantMotion | None:
-        """Motion of the static world since the last frame, expected to be ``T_expected`` (4, 4) if that is known; None
-        if it cannot be determined.
+        """Motion of the static world since the last frame; None if unknown.
 
-        The result is kept: a second call with the same timestamp returns the same object.
+        ``T_expected``: (4, 4) expected motion, or None. The result is cached: a second call with the same timestamp
+        returns the same object.
         """
         last = self.last
         if last is None or last.blind:
@@ -165,10 +165,10 @@ class EgoMotionSegmenter(Stateful):
         return self._compared[1]
 
     def slow_motion(self, now: TrackedImage) -> SlowMotion | None:
-        """Comparison with an older image; None where there is none, or they follow no common motion.
+        """Comparison with the oldest suitable image; None without one or without a common motion.
 
-        Where that shows something to move, the newest of the older images is compared, too: what came into view since
-        the oldest one was taken moves in neither comparison otherwise.
+        If it shows motion, the newest of the older images is compared, too, because it shows surface that came into
+        view later.
         """
         timestamp = now.timestamp
         while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:

@@ -14,13 +14,13 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import MapSample
 
 START = 0.1, 1.0, 6.0
-"""Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
+"""Initial values of the EM: prior of the dynamic density, and standard deviations, static and dynamic."""
 PRIOR_BOUNDS = 0.02, 0.98
 """Bounds of the prior of the dynamic density; they keep its logarithm finite."""
 STATIC_BOUNDS = 0.5, 2.0
-"""Bounds of the standard deviation of the static density, which is 1 where the sensor model is exact."""
+"""Bounds of the standard deviation of the static density, which is 1 for an exact sensor model."""
 SEPARATION = 3.0
-"""Least ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
+"""Smallest ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
 
 RULES = MixtureRules(30, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION)
 """Rules of the fit of a frame."""
@@ -68,7 +68,7 @@ def fit_mixture(
     Args:
         histogram: (n,) counts.
         edges: (n + 1,) edges of the bins.
-        iterations: Most iterations.
+        iterations: Largest number of iterations.
     """
     centers = (edges[:-1] + edges[1:]) / 2
     prior, static, dynamic = labeling.fit_mixture(
@@ -79,16 +79,16 @@ def fit_mixture(
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Static and dynamic pixels of one frame, at the resolution of the label level.
+    """Static and dynamic pixels of one frame, at label resolution.
 
     Attributes:
         static_probability: (h, w) float32 in [0, 1]; the weights of the second registration.
         dynamic: (h, w) bool.
-        mixture: The fitted densities; None for methods that fit none.
+        mixture: The fitted densities; None for methods without a fit.
         histogram: (BINS,) counts of the normalised residuals.
         sample: Distance, intensity difference and occupancy of the map at the points of the frame.
-        segmentation: Surface segments of the frame; None where motion is not decided by segment.
-        hidden: (h, w) bool, pixels without a reading in front of known background; None where that is not examined.
+        segmentation: Surface segments of the frame; None if motion is not decided by segment.
+        hidden: (h, w) bool, pixels without depth in front of known background; None if not examined.
     """
 
     static_probability: NDArray[np.float32]
@@ -101,13 +101,13 @@ class Labels:
 
 
 SEAM = 1
-"""Half width of the seams along depth edges where readings fit no map, pixels at REFERENCE_WIDTH."""
+"""Half width of the seams along depth edges whose measurements fit no map, pixels at REFERENCE_WIDTH."""
 CLOSING_RADIUS = 2
-"""Half width of the holes in the depth that belong to the dynamic region around them, pixels at REFERENCE_WIDTH."""
+"""Half width of depth holes that belong to the surrounding dynamic region, pixels at REFERENCE_WIDTH."""
 
 
 def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Mask (h, w) of an image without parts as thin as the seams along its depth edges."""
+    """Mask (h, w) of an image without parts as thin as the seams along depth edges."""
     import cv2
 
     side = scaled_side(SEAM, level)
@@ -115,11 +115,11 @@ def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Dynamic pixels (H, W) bool at full size, with the holes of the depth inside of a dynamic region.
+    """Dynamic pixels (H, W) bool at full size, including depth holes within dynamic regions.
 
     Args:
         labels: Labels of the frame.
-        level: The image they belong to.
+        level: The labelled image.
         depth: (H, W) float32, metres, 0 = none.
     """
     import cv2
@@ -138,9 +138,9 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 def _hidden_region(
     hidden: NDArray[np.bool_], dynamic: NDArray[np.bool_], depth: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) without a reading that are nearer to a hidden one than to a static reading.
+    """Pixels (h, w) without depth that are nearer to a hidden pixel than to a static measurement.
 
-    Behind the others of an object without readings, the background is not known, or looks alike.
+    The other pixels of an object without depth have unknown or similar background.
     """
     import cv2
 
@@ -154,7 +154,7 @@ def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDA
     """Mask (h, w) of a pyramid level at the resolution (H, W) of its depth image; see ``labeling.upsample_labels``.
 
     Args:
-        low: (h, w) bool; a level is made by halvings, which round odd sizes down.
+        low: (h, w) bool; halvings of a level round odd sizes down.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
     """
@@ -163,7 +163,7 @@ def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDA
 
 
 def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """Mask (H, W) dilated by some pixels."""
+    """Mask (H, W) dilated by ``pixels``."""
     import cv2
 
     marks = mask.view(np.uint8)

@@ -23,19 +23,18 @@ CLEARLY_BETTER = 0.95
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """Initial pose of a registration and what two images alone tell of the scene's motion.
+    """Initial pose of a registration, and the scene motion visible in two images.
 
     Attributes:
         T_world_camera: (4, 4).
-        image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
-        image_motion: Computes this ego-motion and what does not follow it; None if unknown.
+        image_pose: Computes the pose (4, 4) by the ego-motion since the previous image; None if unknown.
+        image_motion: Computes this ego-motion with its labelled corners; None if unknown.
         moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
-        slow: (h, w) bool, those of them that an older image shows to move; None where none was compared.
-        moving_before: (h, w) bool, as ``moving``, of the first image of the map where it is compared with that; else
-            None.
+        slow: (h, w) bool, the part of ``moving`` found with an older image; None without comparison.
+        moving_before: (h, w) bool, moving pixels of the map's first image if that is compared; else None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
-        crowd_in_map: (h, w) bool, as ``moving``, if that is most of the view and part of the map, which the camera has
-            followed then; else None.
+        crowd_in_map: (h, w) bool, ``moving`` if it is most of the view and part of the map, so that the camera has
+            followed it; else None.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -58,16 +57,16 @@ class PosePredictor(Stateful):
         known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
 
     Attributes:
-        mostly_slow: Whether most of the view is seen to move, but only in comparison with an older image: what has not
-            been seen to rest in between may move as well, and is neither registered nor fused.
+        mostly_slow: Whether most of the view moves, but only in comparison with an older image. Pixels not verified as
+            static may then move as well; they are neither registered nor fused.
     """
 
     ego_motion: Remembered[EgoMotionSegmenter]
     mostly_slow: Remembered[bool] = False
-    _single_frame_map: Remembered[bool] = False  # the map holds one frame, whose dynamic pixels are not known yet
+    _single_frame_map: Remembered[bool] = False  # the map consists of one frame, whose dynamic pixels are unknown
     _dynamic_start: Remembered[bool] = False  # most of the view has moved in every frame so far
     _mostly_moving: Remembered[bool] = False  # most of the view moved in the last frame
-    _looked_back: Remembered[bool] = False  # the last frame was compared with an older image, which showed nothing
+    _looked_back: Remembered[bool] = False  # an older image showed no motion in the last frame
 
     def __init__(
         self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
@@ -78,21 +77,23 @@ class PosePredictor(Stateful):
         self._known_poses = known_poses
 
     def start(self, view: FrameView) -> None:
-        """A map has been made of this frame."""
+        """Begin with the first frame of a map."""
         self.ego_motion.start(view.timestamp)
         self._single_frame_map = self._dynamic_start = True
 
     def is_mostly_dynamic(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
-        """Whether most of the view has moved since the map was begun, or in the last tracked frame, whose dynamic
-        pixels (h, w) are given; None for none."""
+        """Whether most of the view has moved since the start of the map, or in the last tracked frame.
+
+        ``last_dynamic``: its dynamic pixels (h, w), None for none.
+        """
         return self._dynamic_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
 
     def ambiguity(self, view: FrameView, prediction: PosePrediction, estimate: PoseEstimate) -> str:
-        """Reason why the labels of a tracked frame cannot be trusted yet, empty if they can.
+        """Reason to distrust the labels of a tracked frame, empty if there is none.
 
-        In the first moments of a map motion of less than MOVES_PX from image to image cannot be told from that of the
-        camera. If something moves in view, more of it may move, more slowly, and drag the camera along. Where most of
-        the view is seen to move, the rest has been verified to be static corner by corner (``unverified_mask``).
+        In a young map, motion below MOVES_PX between consecutive images cannot be separated from camera motion. If
+        something moves, more of the view may move slowly and drag the camera. Exception: if most of the view moves, the
+        rest has been verified corner by corner (``unverified_mask``).
         """
         if not self.ego_motion.slow_motion_is_hidden(view.timestamp):
             return ""
@@ -135,11 +136,11 @@ class PosePredictor(Stateful):
             if known:
                 T_image = T_expected
             elif slow is not None:
-                T_image = T_image if was_slow else slow.T_world_camera  # what is known to move misleads no corner
+                T_image = T_image if was_slow else slow.T_world_camera  # known moving pixels mislead no corner
             elif not self._single_frame_map and self.fits_better(
                 volume, T_expected, T_image, pyramid.coarse, previously_dynamic
             ):
-                return by_velocity  # the dominant motion is that of the dynamic objects
+                return by_velocity  # the dominant motion is the motion of the dynamic objects
             moving_before = motion.moving_before if self._single_frame_map else None
             self._single_frame_map = False
             moving = motion.moving_after
@@ -151,7 +152,7 @@ class PosePredictor(Stateful):
             mapped = lasts and unverified is not None and moving_before is None and not known
             mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
             crowd_in_map = moving if mapped else None
-            if not young:  # where the map is known, it labels better than two images
+            if not young:  # a known map labels better than two images
                 moving = moving & (occupancy == UNKNOWN)
         slowly = None if slow is None else slow.moving
         return replace(
@@ -168,14 +169,14 @@ class PosePredictor(Stateful):
         *,
         was_moving: bool,
     ) -> tuple[NDArray[np.bool_] | None, bool]:
-        """Take note of whether most of the view moves, as by the pixels ``moving`` (h, w) bool, and whether slowly.
+        """Record whether most of the view moves, by the pixels ``moving`` (h, w) bool, and whether slowly.
 
-        A single comparison of two images may be wrong about that: of a fast crowd it is believed from the second frame
-        on (``was_moving`` in the last one) or from the start of the map on.
+        A single comparison of two images may be wrong. A fast crowd is therefore accepted in its second frame
+        (``was_moving`` in the last one), or if it lasts since the start of the map.
 
         Returns:
-            The pixels (h, w) bool that are not verified to rest if most of the view moves, else None; whether it has
-            moved for more than this frame.
+            The pixels (h, w) bool not verified as static if most of the view moves, else None; and whether it has moved
+            in more than this frame.
         """
         young = self.ego_motion.map_is_young(view.timestamp)
         self._mostly_moving = is_majority_dynamic(moving, view.labelled)
@@ -187,7 +188,7 @@ class PosePredictor(Stateful):
         return ~motion.static_after | moving if young and lasts else None, lasts
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Set the image that the next one is compared with: a frame whose pose is accepted."""
+        """Set the image for the next comparison: a frame with an accepted pose."""
         if self.ego_motion.seconds == 0:
             return
         with view.timer("parallax"):
@@ -203,18 +204,19 @@ class PosePredictor(Stateful):
         moving: NDArray[np.bool_],
         crowd: NDArray[np.bool_] | None,
     ) -> SlowMotion | None:
-        """Comparison with an older image, where that shows more to move than the last one does.
+        """Comparison with an older image, if it shows more motion than the last one.
 
-        Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
-        most of the view is seen to move anyway, few corners would be found again after a longer time. A slow crowd is
-        taken to move on where an older image cannot tell. As long as nothing is seen to move, every second frame is
-        compared: what is slow has not come far in the other.
+        Motion below MOVES_PX between consecutive images counts as static and drags the pose. Rules:
+
+        * If most of the view moves, no older image is compared, because few corners would be found again.
+        * If an older image shows nothing about a slow crowd, the crowd is assumed to move on.
+        * While nothing moves, every second frame is compared.
 
         Args:
             view: The frame.
             T_world_camera: (4, 4) its pose by the last image.
-            moving: (h, w) bool, what moves by the last image.
-            crowd: (h, w) bool, what moved in the last image if most of that moved slowly; else None.
+            moving: (h, w) bool, moving pixels by the last image.
+            crowd: (h, w) bool, moving pixels of the last image if most of them moved slowly; else None.
         """
         if crowd is None and is_majority_dynamic(moving, view.labelled):
             return None
@@ -254,7 +256,7 @@ class PosePredictor(Stateful):
         level: Level,
         previously_dynamic: NDArray[np.bool_] | None,
     ) -> bool:
-        """Whether a pose explains the image clearly better than another one, not counting readings in free space."""
+        """Whether a pose explains the image clearly better than another one, without measurements in free space."""
         weights = initial_weights([level], previously_dynamic, []) or [np.ones_like(level.depth)]
         static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
         cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
@@ -262,6 +264,6 @@ class PosePredictor(Stateful):
 
 
 def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Occupancy (h, w) that the map gives the points of an image: UNKNOWN, SURFACE or FREE."""
+    """Occupancy (h, w) of the map at the points of an image: UNKNOWN, SURFACE or FREE."""
     volume.look_at(T_world_camera)
     return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).occupancy
