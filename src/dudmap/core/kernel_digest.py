@@ -57,7 +57,6 @@ def _read(kernel: Any) -> tuple[str, tuple[Any, ...]]:  # noqa: ANN401
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Code of a function and its inner functions."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

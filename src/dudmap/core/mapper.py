@@ -236,7 +236,6 @@ class Mapper:
         return self._fuse_held(self._bootstrap.released(ended=True), StageTimer())
 
     def _fuse_held(self, frames: list[StartFrame], timer: StageTimer) -> int:
-        """Fuse frames of the first moments; returns their number."""
         for frame in frames:
             self.integrate(replace(frame.view, timer=timer), frame.estimate, frame.dynamic_mask)
         return len(frames)

@@ -238,7 +238,6 @@ class Slam(SlamResults, Stateful):
             return replace(FrameView.of(observation, self.config, self.detector), timer=view.timer, known_dynamic=known)
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
-        """Report a rejected frame, which changes nothing."""
         nothing = np.zeros_like(view.observation.readings)
         return self._result(view, None, nothing, reason=rejection.reason, rejected=rejection.kind)
 
@@ -305,7 +304,6 @@ class Slam(SlamResults, Stateful):
         return found.estimate
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
-        """Report a lost frame, or start a new submap with it after some time."""
         mostly_dynamic = self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
         self.relocalizer.lost(view.timestamp, mostly_dynamic=mostly_dynamic)
         self.front_end.lose(view.timestamp)
@@ -315,7 +313,6 @@ class Slam(SlamResults, Stateful):
         return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 
     def _start_submap(self, view: FrameView) -> FrameResult:
-        """Start a new map with this frame."""
         self.color_calibration.interrupt()
         self.atlas.start_submap()
         for remembered in (self.monitor, self.detector, self.predictor.ego_motion, self.redundancy):

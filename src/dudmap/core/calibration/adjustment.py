@@ -195,7 +195,6 @@ class _PairSystems:
 
     @property
     def begin(self) -> int:
-        """Index of the first unknown."""
         return SHARED + 2 * POSE - self.b.shape[1]
 
 
@@ -342,12 +341,8 @@ def _without_light(
 ) -> _PairSystems:
     """Normal equations of all pairs in the parameters and the poses of both frames, without gain and offset.
 
-    Args:
-        H, b: (P, 21, 21), (P, 21) of ``linearize_pair``.
-        light: (P, 2) gains and offsets.
-        Ts: (P, 4, 4) relative poses of the first to the second camera.
-        residuals: (2, n).
-        begin: First unknown; the parameters before it are known.
+    ``H``, ``b``: (P, 21, 21), (P, 21) of ``linearize_pair``. ``light``: (P, 2) gains and offsets. ``Ts``: (P, 4, 4)
+    relative poses of the first to the second camera. ``begin``: first unknown; the parameters before it are known.
     """
     known, of_light, own = slice(begin, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), SHARED - begin
     prior = CORRELATED * LIGHT_SIGMA**-2
@@ -367,7 +362,6 @@ def _without_light(
 
 
 def _times(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Products (n, i) of matrices (n, i, j) and vectors (n, j)."""
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 

@@ -86,7 +86,6 @@ class ReadoutSearch:
         return self._adjustment.costs(pairs, fit, self._adjustment.levels[-1:])
 
     def _rectified(self, readout: float) -> PairSet:
-        """The pairs, rectified to the times of the middle rows."""
         frames = {id(frame): frame for pair in self._pairs for frame in (pair.first, pair.second)}
         moved = {key: rectified_keyframe(frame, readout) for key, frame in frames.items()}
         return PairSet([Pair(moved[id(pair.first)], moved[id(pair.second)]) for pair in self._pairs], self._stride)

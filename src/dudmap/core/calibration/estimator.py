@@ -199,12 +199,10 @@ class CalibrationEstimator:
         return readout, sigma, evidence, gain if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
-        """Calibration of the colour camera for a known depth readout."""
         rectified = CalibrationEstimator(self.given.with_depth_readout(depth_readout), self.sensor, self.workers)
         return rectified._beside_rectified([rectified_keyframe(frame, depth_readout) for frame in keyframes])
 
     def _beside_rectified(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
-        """Calibration of the colour camera for rectified depth images."""
         middle = len(keyframes) // 2
         within = _halves(keyframes, PAIRS)
         halves = [PairSet(pairs, STRIDE) for pairs in within]
@@ -304,7 +302,6 @@ class CalibrationEstimator:
         return self._freed(halves, before.fits, free)
 
     def _freed(self, halves: list[PairSet], starts: list[Fit], free: NDArray[np.bool_]) -> "_Trial":
-        """Fits of both halves with some free parameters, from given starts."""
         # only the geometry can displace colours enough to need the smallest images
         levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
 

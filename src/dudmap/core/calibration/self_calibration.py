@@ -185,7 +185,6 @@ class ColorCalibration(Stateful):
             self._estimation.interrupt()
 
     def _registered(self, stored: Frame) -> Frame:
-        """A stored frame with colours registered by the newest calibration."""
         velocity = self._atlas.velocity_at(stored.timestamp)
         calibration = self._next or self._color_motion.calibration
         return self._color_motion.frame_with_colors(stored, self._camera, velocity, calibration)

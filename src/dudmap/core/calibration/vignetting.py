@@ -94,7 +94,6 @@ def _weights(residual: Values) -> Values:
 
 
 def _moved(T: Values, points: Values) -> Values:
-    """Points (n, 3) after a rigid motion (4, 4)."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 

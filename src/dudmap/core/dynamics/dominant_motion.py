@@ -302,17 +302,12 @@ def _deviations(
     error: NDArray[np.float64],
     camera: Camera,
 ) -> NDArray[np.float64]:
-    """Standard deviations (n,) per coordinate of the pixels of points after a fitted motion.
+    """Standard deviations (n,) px per coordinate of the pixels of points (n, 3) m after a fitted motion T (4, 4).
 
-    They follow from the covariance by the normal equations of the inliers, sigma^2 (sum J^T J)^-1, where J (2, 6) is
-    the derivative of a pixel by the twist of the motion: sigma_n^2 = sigma^2 tr(J_n (sum J^T J)^-1 J_n^T) / 2.
+    The covariance follows from the normal equations of the inliers (m, 3) with errors (m,) px. J (2, 6) is the
+    derivative of a pixel by the twist of the motion:
 
-    Args:
-        T: (4, 4).
-        points: (n, 3) metres, before the motion.
-        inliers: (m, 3) points of the fit.
-        error: (m,) their reprojection errors, pixels.
-        camera: Camera of the pixels.
+        sigma_n^2 = sigma^2 tr(J_n (sum J^T J)^-1 J_n^T) / 2
     """
     if len(points) == 0:
         return np.empty(0)
@@ -336,13 +331,10 @@ def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera:
 def _depth_change(
     T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], level: Level
 ) -> NDArray[np.float64]:
-    """Length (n,) of the change of depth of corners, as pixels of a motion across the line of sight at that depth.
+    """Change of depth (n,) of corners (n, 3) m, in pixels of an equal motion across the line of sight.
 
-    Args:
-        T: (4, 4) motion of the static world.
-        points: (n, 3) the corners, metres, first camera's frame.
-        targets: (n, 2) their pixels in the second image; the change is 0 without depth.
-        level: The second image.
+    ``T``: (4, 4) motion of the static world. ``targets``: (n, 2) pixels of the corners in ``level``, the second image;
+    the change is 0 without depth.
     """
     u, v = _nearest_pixels(targets, level).T
     found, expected = level.depth[v, u], points @ T[2, :3] + T[2, 3]
@@ -362,11 +354,8 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     """Moving pixels (h, w) of an image, by propagation of the corner labels to their segments.
 
     A segment moves as a whole if at least AGREED of its corners move. If its corners disagree, a pixel moves if at
-    least AGREED of the NEIGHBOURS nearest corners of the same segment move, by distance in space.
-
-    Args:
-        corners: The labelled corners.
-        whole_only: Exclude segments with disagreeing corners.
+    least AGREED of the NEIGHBOURS nearest corners of the same segment move, by distance in space. ``whole_only``
+    excludes such segments.
     """
     level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
     if np.count_nonzero(moving) < FEWEST_MOVING:
@@ -406,6 +395,5 @@ def _pixels_of_level(
 
 
 def _nearest_pixels(positions: "NDArray[np.floating]", level: Level) -> NDArray[np.int64]:
-    """Pixels (n, 2) int u, v of a level nearest to positions (n, 2)."""
     last = level.camera.width - 1, level.camera.height - 1
     return np.minimum(np.maximum(np.rint(positions), 0), last).astype(np.int64)

@@ -81,9 +81,7 @@ class TemporalMemory(Stateful):
     def import_from(self, other: "TemporalMemory", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
         """Import the frames of the first seconds from another pass over the same recording.
 
-        Args:
-            other: The memory of that pass.
-            Ts_world_camera: (4, 4) poses of its frames by timestamp; frames without a pose are dropped.
+        ``Ts_world_camera``: (4, 4) poses by timestamp; frames without a pose are dropped.
         """
         self._young_until, self._imported = other._young_until, True
         self._start_frames = [
@@ -100,14 +98,9 @@ class TemporalMemory(Stateful):
         dynamic: NDArray[np.bool_],
         segmentation: Segmentation | None,
     ) -> None:
-        """Remember a tracked frame.
+        """Remember a tracked frame (timestamp in seconds) with its dynamic pixels (h, w) bool.
 
-        Args:
-            timestamp: Seconds.
-            level: The image.
-            T_world_camera: (4, 4).
-            dynamic: (h, w) bool.
-            segmentation: Segments of the image; None if motion is not decided by segment.
+        ``segmentation``: segments of the image; None if motion is not decided by segment.
         """
         marks = np.zeros(dynamic.shape, dtype=np.uint8)
         if segmentation is not None:
@@ -142,12 +135,7 @@ class TemporalMemory(Stateful):
         self._start_frames = self._start_frames if self._imported else []
 
     def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
-
-        Args:
-            level: The image.
-            T_world_camera: (4, 4) its pose.
-        """
+        """Pixels (h, w) of an image at a pose (4, 4) whose points belonged to a dynamic segment in the last frame."""
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, bool)
         return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0, self._near)
@@ -155,12 +143,8 @@ class TemporalMemory(Stateful):
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at a time in seconds.
 
-        Single frames are used while the map is young or much of the view is unknown to it; otherwise none. A second
-        pass also compares later frames of the first seconds.
-
-        Args:
-            timestamp: Seconds.
-            unknown: Share of the measurements in space unknown to the map.
+        Single frames are used while the map is young, or if ``unknown``, the share of measurements in space unknown to
+        the map, is large. Otherwise there are none. A second pass also compares later frames of the first seconds.
         """
         if timestamp < self._young_until:
             candidates = self._start_frames if self._imported else self._recent_frames
@@ -175,14 +159,12 @@ class TemporalMemory(Stateful):
         noise: NDArray[np.float32],
         frames: Sequence[RememberedFrame],
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) in space that single frames have seen to be free.
+        """Pixels (h, w) of an image at a pose (4, 4) in space that single frames have seen to be free.
 
-        A point is in free space if a frame has seen farther by more than ``noise`` along its line of sight, and the
-        number of such frames is at least half the number that saw a surface there.
+        A point is in free space if at least one frame has seen farther by more than ``noise`` along its line of sight.
+        The number of such frames must be at least half the number that saw a surface there.
 
         Args:
-            level: The image.
-            T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest depth difference between two measurements of one point, metres.
             frames: See ``free_space_frames``.
         """
@@ -212,12 +194,10 @@ class TemporalMemory(Stateful):
 
         Args:
             timestamp: Seconds.
-            level: The image.
-            T_world_camera: (4, 4) its pose.
+            level, T_world_camera: The image and its pose (4, 4).
             segmentation: Its segments.
             sigma: (h, w) float32, standard deviation of a distance, metres; at least ``least_sigma``.
             dynamic: (h, w) bool.
-            least_sigma: Metres.
         """
         frames = self._settle_frames
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
@@ -232,7 +212,6 @@ class TemporalMemory(Stateful):
 
 
 def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> Reprojection:
-    """Differences of an image at a pose (4, 4) to remembered frames."""
     Ts = se3.inverse(np.array([frame.T_world_camera for frame in frames])) @ T_world_camera
     older = np.array([(frame.level.depth, frame.level.intensity) for frame in frames])
     marks = np.array([frame.dynamic for frame in frames])
@@ -283,12 +262,7 @@ class BackgroundModel(Stateful):
 
         A pixel without depth votes if the background is known within 3x3 pixels. It votes for hidden if its intensity
         is outside the background's range there, extended by SAME_INTENSITY. A pixel is hidden by majority within
-        VOTING_SIDE, if at least MIN_KNOWN of the pixels vote.
-
-        Args:
-            timestamp: Seconds.
-            level: The image, with the exposure of the map.
-            T_world_camera: (4, 4).
+        VOTING_SIDE, if at least MIN_KNOWN of the pixels vote. The image must have the exposure of the map.
         """
         import cv2
 
@@ -323,14 +297,8 @@ class BackgroundModel(Stateful):
     def update(
         self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], dynamic: NDArray[np.bool_]
     ) -> None:
-        """Replace the background by the static measurements of an image.
-
-        Args:
-            timestamp: Seconds.
-            level: The image, with the exposure of the map.
-            T_world_camera: (4, 4).
-            dynamic: (h, w) bool, excluded pixels.
-        """
+        """Replace the background by the measurements of an image, except at ``dynamic`` pixels (h, w). The image must
+        have the exposure of the map."""
         stride = _stride(level)
         depth, intensity = _subsampled(level, stride)
         self._background = self._seen_from(timestamp, level, stride, T_world_camera)
@@ -346,7 +314,6 @@ class BackgroundModel(Stateful):
     def _seen_from(
         self, timestamp: float, level: Level, stride: int, T_world_camera: NDArray[np.float64]
     ) -> PointImage:
-        """The background in an image at a pose, subsampled by a stride."""
         if self._background is None:
             return PointImage.empty(level.depth[::stride, ::stride].shape)
         since, intrinsics = timestamp - self.config.settle_time, level.camera.intrinsics / np.float32(stride)

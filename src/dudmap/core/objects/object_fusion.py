@@ -240,7 +240,6 @@ class ObjectFusion(Stateful):
         T_world_camera: NDArray[np.float64],
         restarts: tuple[str, ...] = (),
     ) -> None:
-        """Start a map with one frame; the object's origin is the centroid of its visible side."""
         T = np.eye(4)
         T[:3, 3] = mover.centroid
         volume = ObjectVolume(

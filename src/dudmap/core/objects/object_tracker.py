@@ -220,7 +220,6 @@ class ObjectTracker(Stateful):
         return same + [group for group in groups if region.area < 0.5 * sum(part.area for part in group)]
 
     def _is_near(self, region: Region, group: list[Region]) -> bool:
-        """Whether a region is closer to an object than ``merge_distance``."""
         return any(region.is_near(part, self.config.merge_distance) for part in group)
 
     def _is_established(self, track: _Track, area: float) -> bool:

@@ -190,7 +190,6 @@ class LoopCloser(Stateful):
         _mark_seen(near, query.observation.timestamp)
 
     def _correct(self, place: PlaceMatch, query: LoopQuery, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Correct the current submap by a verified place; returns the correction of the newest pose."""
         edge = self.corrector.measured_edge(place.keyframe, query.tracking.T_world_camera, T_found)
         correction = None if edge is None else self.corrector.correct(edge)
         self.closed += correction is not None

@@ -91,7 +91,6 @@ class LoopCorrector(Stateful):
         return self.atlas.correct(nodes, Ts_new, volume, [nodes[i] for i in (*old, *new)])
 
     def _map_of(self, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]) -> TsdfVolume:
-        """Map of the ``chosen`` stored frames of ``nodes`` with poses (n, 4, 4)."""
         assert self.atlas.history is not None
         volume = self.atlas.make_volume()
         self.atlas.history.reintegrate(volume, [nodes[i] for i in chosen], list(Ts[chosen]))
@@ -129,7 +128,6 @@ def _mean(parts: list[NDArray[np.float32]]) -> float:
 
 
 def _is_worse(after: tuple[float, float], before: tuple[float, float], unit: float) -> bool:
-    """Whether frames fit a map clearly worse than their own map, in distance or intensity."""
     offsets = MAX_OFFSETS[0] * unit, MAX_OFFSETS[1]
     return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, offsets, strict=True))
 

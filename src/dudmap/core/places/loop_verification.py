@@ -109,7 +109,6 @@ class LoopVerifier:
         return local is None or _misfit(local, newest, T_corrected) < _misfit(local, newest, T_tracked)
 
     def _poses_since(self, place: PlaceMatch) -> Iterator[TimedPose]:
-        """Poses in the current submap since the last visit of a place."""
         poses = self.atlas.poses
         begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
         return (pose for pose in islice(poses, begin, None) if pose.submap == self.atlas.current)

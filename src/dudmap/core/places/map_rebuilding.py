@@ -112,5 +112,4 @@ def view_distances(
 
 
 def _looked_at(Ts_world_camera: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """Points (..., 3) on the optical axes at ``VIEW_DEPTH``."""
     return Ts_world_camera[..., :3, 3] + VIEW_DEPTH * unit * Ts_world_camera[..., :3, 2]

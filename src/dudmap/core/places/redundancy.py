@@ -182,6 +182,5 @@ class RedundantViews(Stateful):
 
 
 def _static(view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
-    """Measurements (h, w) of a frame, label resolution, that are not labelled as dynamic."""
     readings = view.labelled.depth > 0
     return readings if estimate.labels is None else readings & ~estimate.labels.dynamic

@@ -122,13 +122,10 @@ class ColorMotion(Stateful):
     def frame_with_colors(
         self, frame: Frame, camera: Camera, velocity: NDArray[np.float64], calibration: Calibration | None
     ) -> Frame:
-        """A frame with its recorded colour registered to the depth.
+        """A frame with its recorded colour registered to the preprocessed depth.
 
-        Args:
-            frame: Preprocessed depth, and recorded colour.
-            camera: Camera of the depth image, without distortion.
-            velocity: (6,) twist of the camera per second, camera axes.
-            calibration: Calibration of the colour camera; None for registered colour.
+        ``camera``: of the depth image, without distortion. ``velocity``: (6,) twist per second, camera axes.
+        ``calibration``: of the colour camera; None for registered colour.
         """
         if calibration is None:
             return frame
@@ -150,9 +147,7 @@ class ColorMotion(Stateful):
     def rectified(self, observation: Observation, velocity: NDArray[np.float64] | None = None) -> Observation:
         """A frame rectified to the time of its middle row; unchanged with a global shutter.
 
-        Args:
-            observation: Recorded images.
-            velocity: (6,) twist of the camera per second; None for the last velocity.
+        ``velocity``: (6,) twist of the camera per second; None for the last velocity.
         """
         velocity = self.motion.velocity if velocity is None else velocity
         if not (self.rectifies and velocity.any()):

@@ -266,7 +266,6 @@ class GradientAgreement:
 
 
 def _differences(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Central differences across and down, 0 at the border."""
     across, down = np.zeros_like(image), np.zeros_like(image)
     across[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / 2
     down[1:-1] = (image[2:] - image[:-2]) / 2

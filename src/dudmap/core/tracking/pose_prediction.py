@@ -212,11 +212,8 @@ class PosePredictor(Stateful):
         * If an older image shows nothing about a slow crowd, the crowd is assumed to move on.
         * While nothing moves, every second frame is compared.
 
-        Args:
-            view: The frame.
-            T_world_camera: (4, 4) its pose by the last image.
-            moving: (h, w) bool, moving pixels by the last image.
-            crowd: (h, w) bool, moving pixels of the last image if most of them moved slowly; else None.
+        ``T_world_camera`` (4, 4) and ``moving`` (h, w) are pose and moving pixels by the last image. ``crowd``: moving
+        pixels of the last image if most of them moved slowly; else None.
         """
         if crowd is None and is_majority_dynamic(moving, view.labelled):
             return None
@@ -237,7 +234,6 @@ class PosePredictor(Stateful):
         return SlowMotion(T_world_camera, moves, ~moves, moving_first=None)
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
-        """Motion of the static world from the previous image to this one."""
         if self.ego_motion.seconds == 0:
             return None
         with view.timer("parallax"):

@@ -90,19 +90,18 @@ class ImageConsistency:
     ) -> bool:
         """Whether the images are compatible with the pose of a frame.
 
-        They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT, and the corners of both
-        images follow no common motion or one that explains the images clearly better.
+        They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT, and no common motion of
+        the corners supports the pose. A motion that explains the images clearly better contradicts it.
 
         Exceptions:
 
-        * The depths confirm the pose, but not the motion of the corners: colour and depth were captured at different
+        * The depths confirm the pose, but not the motion of the corners. Colour and depth were captured at different
           times, and the pose is correct for the depth.
         * The corners follow no motion, and their number is small or the exposure has changed suddenly.
 
         Args:
             last: The last tracked frame; None if unknown.
-            view: The frame.
-            estimate: Its pose and labels.
+            view, estimate: The frame, its pose and labels.
             seen: Its comparison with the last frame.
             image_pose: Computes the pose (4, 4) that the corners predict; None without a common motion.
         """
@@ -122,7 +121,7 @@ class ImageConsistency:
         estimate: PoseEstimate,
         T_world_camera: NDArray[np.float64] | None = None,
     ) -> ImageComparison:
-        """Comparison of a frame with the last tracked one.
+        """Comparison of a frame with the last tracked one; NaN if that is None.
 
         A shift by d pixels in a random direction changes intensities by the mean square d^2 |grad I|^2 / 2, so
 
@@ -132,14 +131,7 @@ class ImageConsistency:
         correlation length of the texture, a few pixels. Two depths agree within three standard deviations of their
         difference.
 
-        Args:
-            last: The last tracked frame; None if unknown.
-            view: This frame.
-            estimate: Its pose and labels.
-            T_world_camera: (4, 4) another pose of this frame; None for the pose of the estimate.
-
-        Returns:
-            The comparison; NaN if the last frame is unknown.
+        ``T_world_camera``: (4, 4) another pose of this frame; None for the pose of the estimate.
         """
         if last is None:
             return ImageComparison()
@@ -251,10 +243,9 @@ class QualityMonitor(Stateful):
 
         Args:
             last: The last tracked frame; None if unknown.
-            view: The frame.
-            estimate: Its pose and labels.
-            image_pose: Computes the pose (4, 4) from the last image and this one alone; None if their corners follow no
-                common motion.
+            view, estimate: The frame, its pose and labels.
+            image_pose: Computes the pose (4, 4) from the last image and this one alone; None without a common motion of
+                corners.
         """
         tracking, labels = estimate.tracking, estimate.labels
         with view.timer("check"):

@@ -231,14 +231,11 @@ class Tracker:
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Minimum (4, 4) next to a pose, by at most NEAREST_STEPS steps of the finest level's rules, and the distances
-        (h, w) of the measurements to the map there, metres, NaN off the map.
+        """Minimum (4, 4) next to a pose, and distances (h, w) of the measurements to the map there, metres, NaN off the
+        map.
 
-        Args:
-            volume: The map; its window must cover the view.
-            level: The image.
-            T_world_camera: (4, 4).
-            weights: (h, w) float32 static weights in [0, 1]; None = 1.
+        It takes at most NEAREST_STEPS steps of the finest level's rules. The window of the map must cover the view.
+        ``weights``: (h, w) float32 static weights in [0, 1]; None = 1.
         """
         weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
         rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
@@ -309,14 +306,10 @@ class Tracker:
         weights: NDArray[np.float32],
         color_weight: float | None = None,
     ) -> NormalEquations:
-        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose.
+        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose (4, 4).
 
-        Args:
-            volume: The map; its window must cover the view.
-            level: The image.
-            T_world_camera: (4, 4).
-            weights: (h, w) float32 static weights in [0, 1].
-            color_weight: Weight of the intensity term; None takes the configured weight.
+        The window of the map must cover the view. ``weights``: (h, w) float32 static weights in [0, 1].
+        ``color_weight``: weight of the intensity term; None takes the configured weight.
         """
         parameters = self.parameters(volume.band, color_weight)
         return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
