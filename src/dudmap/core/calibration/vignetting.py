@@ -23,9 +23,9 @@ ITERATIONS = 8
 class Brightness:
     """Brightness of common surfaces in both frames of P pairs.
 
-    For a surface that reflects equally to both sides, the log ratio of both brightnesses equals the log ratio of the
-    exposures, minus the vignetting times the difference of the squared distances to the image centre. On an untextured
-    wall this holds even for wrong poses.
+    For a surface that reflects equally to both sides, the log ratio of both brightnesses has two terms: the log ratio
+    of the exposures, minus the vignetting times the difference of the squared distances to the image centre. On an
+    untextured wall this holds even for wrong poses.
 
     Attributes:
         numbers: (P, 2) int64, the frames of every pair.
@@ -98,8 +98,10 @@ def _moved(T: Values, points: Values) -> Values:
 
 
 def _seen(brightness: NDArray[np.float32], camera: Camera, points: Values) -> tuple[Values, Values]:
-    """Brightness at points (n, 3) in the frame of a colour camera, NaN outside the image, and their squared distance to
-    the image centre, 1 at the corners."""
+    """Brightness at points (n, 3) in the frame of a colour camera, and their squared distance to the image centre.
+
+    Brightness is NaN outside the image; the distance is 1 at the corners.
+    """
     pixels = camera.project(points)
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     return _sampled(brightness, pixels), np.sum((pixels - middle) ** 2, axis=1) / np.sum(middle**2)

@@ -1,8 +1,8 @@
 """Rigid motion of the static world between two images, and the corners that do not follow it.
 
-Corners are tracked between images (Lucas and Kanade 1981). The rigid motion of most of the visible surface is the
-motion of the static world (RANSAC, Fischler and Bolles 1981); corners that do not follow it move. Errors are measured
-in pixels, so that a near person weighs no more than a far wall.
+Corners are tracked between images (Lucas and Kanade 1981). RANSAC (Fischler and Bolles 1981) finds the rigid motion of
+most of the visible surface, the static world. Corners that do not follow it move. Errors are measured in pixels, so
+that a near person weighs no more than a far wall.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ from dudmap.core.frames.optical_flow import (
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
-"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 includes 95 % of the errors (chi-square, two
-degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
+"""Inlier threshold t of the reprojection error, pixels. t^2 = 5.99 sigma^2 includes 95 % of the errors (chi-square, two
+degrees of freedom) of corners with sigma = 0.29 px per coordinate."""
 NOISE_LEVELS = 1.0, 0.5, 0.25
 """Tested noise levels of the corners, as multiples of the sigma of NOISE_PX: in sharp images corners are measured with
 0.07 px per coordinate."""
@@ -36,8 +36,8 @@ OUTLIER_GAIN = 2.996
 """Log-likelihood ratio of an error-free corner to an outlier at the largest noise level, 5.99 / 2. The inlier threshold
 is the error at which both are equally likely."""
 NEAR_PX = 5.0
-"""Scale of the prior on the distance of a motion from the expected one, pixels: a rotation by 1.1 degrees at a focal
-length of 262 pixels. A constant-velocity prediction has this error if a rotation of 33 degrees/s begins within 1/30
+"""Scale of the prior on the distance of a motion from the expected one, pixels. It is a rotation by 1.1 degrees at a
+focal length of 262 pixels: the error of a constant-velocity prediction if a rotation of 33 degrees/s begins within 1/30
 s."""
 HYPOTHESES = 150
 """Number of hypotheses from uniform samples, and as many from samples weighted by area. At an inlier share of 1/3, no

@@ -210,7 +210,7 @@ class Atlas(Stateful):
         self.volumes[number] = self.make_volume()
 
     def switch_to(self, number: int) -> None:
-        """Make a submap the current one and page the other maps out where a pager allows it."""
+        """Make a submap the current one, and page the other maps out if they have a pager."""
         self.current = number
         for other, volume in self.volumes.items():
             if other != number:
@@ -290,7 +290,7 @@ class Atlas(Stateful):
         """Set new poses of the stored frames of the current submap, and replace its map.
 
         Trajectory and keyframes receive the correction interpolated in time between the stored frames. ``volume`` was
-        built from the stored frames ``nodes`` at their new poses (n, 4, 4), or only from ``fused``; then it is
+        built from the stored frames ``nodes`` at their new poses (n, 4, 4). If it was built only from ``fused``, it is
         provisional until the map of all frames is complete. Returns the motion (4, 4) of the newest stored frame.
         """
         assert self.history is not None

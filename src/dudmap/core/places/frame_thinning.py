@@ -26,10 +26,10 @@ class FrameThinning(Stateful):
 
     Two conditions must hold for newer frames of the same view (SAME_DISTANCE, SAME_ANGLE_DEG):
 
-    * In every cell where the frame was fused, they represent more than ``similarity.threshold`` of the measurements
-      that the running average of a voxel can hold. Background behind an object that stays is thus kept.
-    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, because a loop closure is
-      verified against frames stored until then.
+    * They fill every cell that the frame was fused in: more than ``similarity.threshold`` of the measurements that a
+      voxel's running average can hold. Background behind an object that stays is thus kept.
+    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen. A loop closure is verified
+      against frames stored until then.
     """
 
     _stored: Remembered[int] = 0  # number of frames stored until the last call

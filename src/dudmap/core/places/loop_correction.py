@@ -64,8 +64,9 @@ class LoopCorrector(Stateful):
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
 
-        The correction is applied only if the poses are finite and the new pass fits a map of the old pass about as well
-        as its own map. Returns the motion (4, 4) of the newest pose, None if the correction was rejected.
+        The correction is applied only if the poses are finite and the new pass fits the map of the old pass. Its misfit
+        may hardly exceed the misfit to its own map. Returns the motion (4, 4) of the newest pose, None if the
+        correction was rejected.
         """
         history = self.atlas.history
         assert history is not None

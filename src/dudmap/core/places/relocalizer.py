@@ -123,8 +123,8 @@ class Relocalizer(Stateful):
 
         * The camera has been lost for ``submaps.patience`` seconds.
         * The frame has enough depth for a map and, if it has colour, enough features for a keyframe.
-        * The image motion is camera motion (``_shows_static_world``), compared with the last lost image, which reveals
-          fast people, and with an image LONGEST_BASELINE older, which reveals slow people.
+        * The image motion is camera motion (``_shows_static_world``). The last lost image reveals fast people, and an
+          image LONGEST_BASELINE older reveals slow people.
         """
         config, observation = self.config.submaps, view.observation
         if not self.may_start_submaps or self._lost_since is None:

@@ -29,8 +29,8 @@ MAX_IMAGE_SHIFT = 1.0
 on any level."""
 CONFIRMED_SHARE, CONFIRMED_OF_SEEN = 0.5, 0.8
 """Smallest shares of measurements whose depth agrees with the last frame, of all and of those visible in it, to confirm
-a pose. They leave no room for a second motion. At a correct pose noise leaves 99.7 %, depth edges a few percent less;
-at wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
+a pose. They leave no room for a second motion. At a correct pose noise leaves 99.7 %, depth edges a few percent less.
+At wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
 STRICTNESS = {
     "tracking": (4.0, 4.0, 0.03),
     "mostly dynamic": (2.0, 4.0, 0.03),

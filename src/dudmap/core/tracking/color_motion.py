@@ -53,12 +53,12 @@ class RegisteredLevel(Level):
 class ColorMotion(Stateful):
     """Registers colour to depth with the present calibration, which may change while the camera moves.
 
-    A colour image taken tau after the depth image shows the view from y = x + tau v, with the camera position x and
-    velocity v. Registered with the velocity v + d, it pulls the pose to x - tau d. If colour has the share k of the
-    registration, the found pose implies the velocity v - k (tau / dt) d, with the time dt since the last frame. Used
-    directly for the next frame, errors would grow for tau > dt / 2 and k = 1. Therefore the velocity only moves the
-    part a = 1 / (1 + tau / dt) from the assumed to the found velocity. This leaves d (1 - a (1 + k tau / dt)): zero if
-    colour dominates; otherwise colour hardly affects the pose.
+    A camera is at x with the velocity v, and the colour image is taken tau later, at y = x + tau v. Registered with the
+    velocity v + d, it pulls the pose to x - tau d. The registration gives colour the share k; dt is the time since the
+    last frame. The found pose then implies the velocity v - k (tau / dt) d. Used directly for the next frame, errors
+    would grow for tau > dt / 2 and k = 1. Therefore the velocity only moves the part a = 1 / (1 + tau / dt) from the
+    assumed to the found velocity. This leaves d (1 - a (1 + k tau / dt)): zero if colour dominates; otherwise colour
+    hardly affects the pose.
 
     The velocity of the first frame of a map is unknown. Its colours and the colours of the second frame are not moved,
     so that the motion between both is correct. With this motion the first frame is fused again.

@@ -192,8 +192,8 @@ class GradientAgreement:
     noise, so that the sum of products of both is unbiased. The image gradient is an instrumental variable, the remedy
     for errors in the variables of a regression (Fuller 1987, Measurement error models, section 1.4).
 
-    Only intensities have independent errors. The depth filter rounds distant corners of a tunnel in every image alike,
-    so that the tunnel seems to narrow and to move with the camera.
+    Only intensities have independent errors. The depth filter rounds distant corners of a tunnel in every image alike.
+    The tunnel then seems to narrow and to move with the camera.
 
     Args:
         level: The image.

@@ -90,14 +90,11 @@ class ImageConsistency:
     ) -> bool:
         """Whether the images are compatible with the pose of a frame.
 
-        They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT, and no common motion of
-        the corners supports the pose. A motion that explains the images clearly better contradicts it.
+        They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT and one of these holds:
 
-        Exceptions:
-
-        * The depths confirm the pose, but not the motion of the corners. Colour and depth were captured at different
-          times, and the pose is correct for the depth.
-        * The corners follow no motion, and their number is small or the exposure has changed suddenly.
+        * The corners of both images follow no common motion. Exceptions: few corners, or a sudden change of exposure.
+        * Their motion explains the images clearly better. Exception: the depths confirm the pose and not this motion.
+          Colour and depth were then captured at different times, and the pose is correct for the depth.
 
         Args:
             last: The last tracked frame; None if unknown.
