@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
+from dudmap.evaluation.surface import moved
+from dudmap.io.exporting.mesh_editing import cropped
 from dudmap.lab.benchmark import limits, measure, report
-from dudmap.lab.benchmark.measure import markdown
+from dudmap.lab.benchmark.measure import COMPLETE_WITHIN, markdown, score_parts
 from dudmap.lab.benchmark.report import published
 from dudmap.lab.benchmark.suites import SUITES, USUAL, Entry, find_suite, systems
 from layout_images import pose
@@ -40,7 +44,7 @@ def data(tmp_path):
 
 
 def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
-    counts = {"thesis": 12, "tum-dynamic": 8, "bonn": 26, "icl-nuim": 8}
+    counts = {"thesis": 13, "tum-dynamic": 8, "bonn": 26, "icl-nuim": 8}
     for name, count in counts.items():
         suite = find_suite(name, tmp_path)
         assert not suite.entries
@@ -50,7 +54,7 @@ def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
     assert len(find_suite("synthetic", None).entries) >= 15
     assert len(find_suite("synthetic", None, quick=True).entries) == 3
     assert len(find_suite("ablation", None).entries) == 5
-    assert set(SUITES) == {*counts, "synthetic", "ablation", "sensors", "limits", "local"}
+    assert set(SUITES) == {*counts, "synthetic", "ablation", "sensors", "limits", "fence", "local"}
 
 
 def test_recordings_are_found_one_folder_down(data):
@@ -74,7 +78,7 @@ def test_recordings_are_found_as_downloaded(tmp_path, monkeypatch):
     shutil.make_archive(str(data / "living_room_traj2n_frei_png"), "gztar", folder)
     suite = find_suite("thesis", data)
     assert [entry.name for entry in suite.entries] == ["living_room_traj2n_frei_png", "D1", "boxing"]
-    assert len(suite.missing) == 9
+    assert len(suite.missing) == 10
     for entry in suite.entries:
         np.testing.assert_allclose(entry.open().ground_truth.Ts_world_camera[-1], pose(2), atol=1e-6)
 
@@ -92,10 +96,37 @@ def test_published_figures_belong_to_recordings_of_the_suites_and_name_their_sou
     assert xyz["ReFusion"] == pytest.approx(0.099)
     crowd3 = {figure.system: figure.value for figure in published(["rgbd_bonn_crowd3"])}
     assert crowd3["StaticFusion"] == pytest.approx(0.168)
-    lr2 = {f.metric: f.value for f in published(["living_room_traj2n_frei_png"]) if f.system.startswith("DUDMap")}
+    lr2 = {f.metric: f.value for f in published(["living_room_traj2_frei_png"]) if f.system.startswith("DUDMap")}
     assert lr2 == {
         "ate_rmse_m": 0.004, "rpe_trans_rmse_m_per_s": 0.007, "rpe_rot_rmse_deg_per_s": 0.149, "mesh_accuracy_m": 0.004
     }  # fmt: skip
+
+
+def test_parts_of_the_fence_are_in_view_and_scored_alone(tmp_path):
+    """A mesh that ends in the middle of one box, and does not reach the other."""
+    (entry,) = find_suite("fence", None).entries
+    entry = replace(entry, parameters=entry.parameters | {"camera": (320, 240)})
+    seen = entry.surfaces(entry.open())[1]
+    assert {name: len(cropped(seen, box).faces) > 100 for name, box in entry.parts.items()} == {
+        "slats": True, "wires": True
+    }  # fmt: skip
+    assert {config.volume.voxel_size for config in systems(USUAL["fence"]).values()} == {0.005, 0.01, 0.02}
+    poses = Trajectory(np.arange(3.0), np.array([pose(k) for k in range(3)]))
+    T = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.9]))  # the world of the run in the true one
+    Trajectory(poses.timestamps, se3.inverse(T) @ poses.Ts_world_camera).save(tmp_path / "trajectory.txt")
+    moved(plane(0, 1), se3.inverse(T)).save(tmp_path / "mesh.ply")
+    unseen = cropped(plane(0, 1), (5, 5, 5, 6, 6, 6))
+    row = score_parts(tmp_path, poses, {"slats": plane(0, 2), "wires": plane(3, 4), "unseen": unseen})
+    assert set(row) == {"completeness_slats", "completeness_wires"}
+    assert row["completeness_slats"] == pytest.approx((1 + COMPLETE_WITHIN) / 2, abs=0.01)
+    assert row["completeness_wires"] == 0
+
+
+def plane(start, end):
+    """Strip of 1 m at z = 1 from one x to another."""
+    vertices = np.array([[start, 0, 1], [end, 0, 1], [end, 1, 1], [start, 1, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return Mesh(vertices, faces, np.zeros((4, 3), np.uint8), np.tile(np.float32([0, 0, -1]), (4, 1)))
 
 
 def test_systems_are_configurations(tmp_path):

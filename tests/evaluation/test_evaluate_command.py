@@ -14,9 +14,10 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
+from dudmap.evaluation.surface import moved
 from dudmap.evaluation.trajectory import adjusted
 from layout_images import pose, tum_line
-from layouts import bonn, replica, write
+from layouts import bonn, icl_nuim, mirrored, replica, write
 from run_folders import write_run
 
 
@@ -114,6 +115,33 @@ def test_mesh_of_a_run_is_moved_into_the_true_world(folders):
     aligned = figures("mesh", run, recording, "--register", "--samples", 2000, "--distances", "0.002")
     assert aligned["icp_rmse_m"] < 1e-3
     assert aligned["precision_2mm"] > 0.99
+
+
+def test_a_mesh_is_compared_with_the_model_of_icl_nuim(tmp_path):
+    """Table 5.1: the model has axes of its own, and poses in it that the page of the data set publishes."""
+    folder, _ = write(icl_nuim, tmp_path / "data")
+    model_world = se3.exp(np.array([0.7, -1.2, 0.4, 0.5, 2.0, -0.3]))
+    x, y = np.diag([-1.0, 1, 1, 1]), np.diag([1.0, -1, 1, 1])
+    frames = (1, 2, 3)
+    (folder / "livingRoom2.gt.freiburg").write_text("".join(tum_line(k, mirrored(pose(k))) for k in frames))
+    rows = [x @ model_world @ pose(k) @ y for k in frames]
+    (folder / "livingRoom2.gt.sim").write_text(
+        "\n".join("\n".join(" ".join(f"{v:.6f}" for v in row) for row in T[:3]) + "\n" for T in rows)
+    )
+    mesh = tetrahedron()
+    moved(mesh, model_world).save(folder.parent / "living-room.ply")
+    run = tmp_path / "run"
+    run.mkdir()
+    first = se3.inverse(pose(1))
+    moved(mesh, first).save(run / "mesh.ply")
+    Trajectory(np.array(frames) / 30, np.array([first @ pose(k) for k in frames])).save(run / "trajectory.txt")
+    out = figures("mesh", run, folder, "--samples", 2000)
+    assert out["reference"] == str(folder.parent / "living-room.ply")
+    assert max(out["accuracy_mean_m"], out["completeness_mean_m"]) < 1e-4
+    (folder / "livingRoom2.gt.sim").unlink()
+    refused = evaluate("mesh", run, folder)
+    assert refused.exit_code == 1
+    assert re.search(r"^dudmap: .*living-room.ply cannot be placed: .* 0 files \*\.gt\.sim", refused.stderr)
 
 
 def test_masks_of_a_run(folders):

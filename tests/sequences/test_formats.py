@@ -162,6 +162,26 @@ def test_a_plain_folder_asks_for_its_camera(tmp_path):
     assert open_sequence(folder).camera.depth_scale == 5000
 
 
+def test_an_svo_export_of_the_zed_sdk(tmp_path):
+    """Mode 4 of its sample (LEFT+DEPTH_16Bit): BGRA images and millimetres; mode 3 shows depth as 8-bit images."""
+    folders = [tmp_path / f"mode{mode}" for mode in (3, 4)]
+    for folder, view in zip(folders, (True, False), strict=True):
+        folder.mkdir()
+        for k in range(3):
+            opaque = np.full((48, 64, 1), 255, np.uint8)
+            depth = millimetres(k)
+            shown = np.dstack([(depth // 16).astype(np.uint8)] * 3 + [opaque])
+            cv2.imwrite(str(folder / f"left{k:06d}.png"), np.dstack([color(k)[..., ::-1], opaque]))
+            cv2.imwrite(str(folder / f"depth{k:06d}.png"), shown if view else depth)
+    recording = open_sequence(folders[1], "60,61,31,23", fps=15)
+    np.testing.assert_allclose(recording.timestamps, np.arange(3) / 15)
+    for k in range(3):
+        np.testing.assert_array_equal(recording[k].color, color(k))
+        np.testing.assert_allclose(recording[k].depth, millimetres(k) / 1000, atol=1e-6)
+    with pytest.raises(DatasetError, match=r"depthN.png \(3 with 8-bit colours\).*expected .* depth images of 16 bit"):
+        open_sequence(folders[0], "60,61,31,23")
+
+
 def test_gray_images_stand_for_colour_where_there_are_no_others(tmp_path):
     folder, expected = write(realsense, tmp_path / "a")
     shutil.copytree(folder / "color", folder / "mono")

@@ -142,7 +142,11 @@ def trajectory(
 def mesh(
     estimate: Annotated[Path, Argument(help="Mesh file, or run folder with mesh.ply.", metavar="EST")],
     reference: Annotated[
-        Path, Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
+        Path,
+        Argument(
+            help="True mesh, folder with surface.ply (and surface_observed.ply), or ICL-NUIM recording.",
+            metavar="REF",
+        ),
     ],
     register_first: Annotated[
         bool, Option("--register", help="Register the mesh to the reference first (ICP).")
@@ -165,23 +169,24 @@ def mesh(
 ) -> None:
     """Score a mesh: accuracy, completeness, precision, recall, F-score and ghosts.
 
-    A run folder and a recording with groundtruth.txt are aligned at their first pose. Other surfaces must share one
+    A run folder and a recording with ground truth are aligned at their first pose. Other surfaces must share one
     coordinate frame.
     """
     import numpy as np
 
     from dudmap.evaluation import reconstruction
-    from dudmap.evaluation.files import first_pose_alignment, load_mesh
+    from dudmap.evaluation.files import TrueSurface, first_pose_alignment, load_mesh, true_surface
     from dudmap.evaluation.surface import moved, register
 
     ending = _plot_ending(plots, plot_format)
     file = estimate / "mesh.ply" if estimate.is_dir() else estimate
-    true_file = reference / "surface.ply" if reference.is_dir() else reference
-    found, true = load_mesh(file), load_mesh(true_file)
-    observed_file = reference / "surface_observed.ply"
-    observed = load_mesh(observed_file) if reference.is_dir() and observed_file.is_file() else None
-    figures: Figures = {"estimate": str(file), "reference": str(true_file)}
-    figures["observed"] = str(observed_file) if observed is not None else None
+    found, truth = load_mesh(file), true_surface(reference) if reference.is_dir() else None
+    if truth is None:
+        true_file = reference / "surface.ply" if reference.is_dir() else reference
+        truth = TrueSurface(true_file, load_mesh(true_file))
+    true, observed = truth.whole, truth.observed
+    figures: Figures = {"estimate": str(file), "reference": str(truth.path)}
+    figures["observed"] = str(truth.observed_path) if truth.observed_path is not None else None
     T = first_pose_alignment(estimate, reference)
     if register_first:
         registration = register(found, true, T)

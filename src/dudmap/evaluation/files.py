@@ -15,6 +15,7 @@ from dudmap.core.geometry.pose_files import FORMATS, PoseFile, read_poses
 from dudmap.core.geometry.times import time_unit
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
+from dudmap.evaluation.surface import moved
 from dudmap.evaluation.trajectory import ate
 from dudmap.input_files import DAMAGE, read_json
 from dudmap.io.sequences import is_recording, open_sequence, reader_of
@@ -197,6 +198,32 @@ def _trajectory(path: Path, times: NDArray[np.float64], file: PoseFile) -> Traje
         raise DatasetError(f"{path}: {error}") from None
 
 
+class TrueSurface(NamedTuple):
+    """True static surface of a recording in the world frame of its ground truth.
+
+    Attributes:
+        path: Its file.
+        whole: The surface.
+        observed: The part that the camera saw, None if it is not known.
+        observed_path: The file of this part.
+    """
+
+    path: Path
+    whole: Mesh
+    observed: Mesh | None = None
+    observed_path: Path | None = None
+
+
+def true_surface(folder: Path) -> TrueSurface | None:
+    """True surface of a folder: surface.ply with perhaps surface_observed.ply, or the model of its data set."""
+    path, seen = folder / "surface.ply", folder / "surface_observed.ply"
+    if path.is_file():
+        observed = load_mesh(seen) if seen.is_file() else None
+        return TrueSurface(path, load_mesh(path), observed, None if observed is None else seen)
+    model = getattr(open_sequence(folder), "model", None) if folder.is_dir() and is_recording(folder) else None
+    return model and TrueSurface(model.path, moved(load_mesh(model.path), model.T_world_model))
+
+
 def load_mesh(path: Path) -> Mesh:
     """Mesh of a file."""
     if not path.is_file():
@@ -210,10 +237,17 @@ def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | No
     The world frame of a run is its first camera. An alignment of all positions would rotate the map, because the
     positions of a short path hardly determine the rotation.
     """
-    estimate, reference = run / "trajectory.txt", recording / "groundtruth.txt"
-    if not (estimate.is_file() and reference.is_file()):
+    estimate, truth = run / "trajectory.txt", _truth_in(recording)
+    if truth is None or not estimate.is_file():
         return None
-    return ate(Trajectory.load(estimate), load_reference(reference), "origin").T_reference_estimate
+    return ate(Trajectory.load(estimate), truth, "origin").T_reference_estimate
+
+
+def _truth_in(recording: Path) -> Trajectory | None:
+    """True trajectory of a folder; None if it holds none."""
+    if (recording / "groundtruth.txt").is_file():
+        return load_reference(recording / "groundtruth.txt")
+    return open_sequence(recording).ground_truth if recording.is_dir() and is_recording(recording) else None
 
 
 def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float | None:

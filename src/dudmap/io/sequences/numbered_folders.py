@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from dudmap.input_files import read_text
 from dudmap.io.sequences import camera_files, camera_search, images, intrinsics
 from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.io.sequences.intrinsics import camera_values
-from dudmap.io.sequences.pose_matrices import read_log, read_matrix, rigid_trajectory
+from dudmap.io.sequences.pose_matrices import read_log, read_matrix, read_upper_rows, rigid_trajectory
 
 
 class EpflSequence(ImageFolder):
@@ -258,6 +259,8 @@ ICL_NUIM = camera_values(481.2, 480, 319.5, 239.5, 640, 480, 5000)
 """
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Motion between the renderer's left-handed axes (y up) and dudmap's (y down), for world and camera alike."""
+MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
+"""Between the renderer's axes and the axes of the published model of the living room."""
 NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 """A number in the renderer's text files."""
 SCENE_FILE = r"scene_\d+_(\d+)"
@@ -288,6 +291,38 @@ class IclNuimSequence(ImageFolder):
 
     def _find_ground_truth(self) -> Trajectory | None:
         return _freiburg(self.path)
+
+    @property
+    def model(self) -> "PlacedModel | None":
+        """The published model of the living room in the world of the ground truth; None without its file.
+
+        The model (living-room.ply or .obj) lies in the folder or the one above. Its axes are those of the renderer with
+        x mirrored. Poses in them are in ``*.gt.sim`` (three rows of four numbers per frame), a row of
+        ``*.gt.freiburg`` for each. The latter begin elsewhere: the first pose of both places the model.
+
+        Raises:
+            DatasetError: A pose that places the model is missing.
+        """
+        files = [folder / f"living-room{ending}" for folder in (self.path, self.path.resolve().parent)
+                 for ending in (".ply", ".obj")]  # fmt: skip
+        file = next((file for file in files if file.is_file()), None)
+        if file is None:
+            return None
+        poses = sorted(self.path.glob("*.gt.sim"))
+        if len(poses) != 1 or self.ground_truth is None:
+            raise DatasetError(
+                f"{file} cannot be placed: {self.path} holds {len(poses)} files *.gt.sim; expected one, and a "
+                "*.gt.freiburg, both of the page of the data set"
+            )
+        T_model_camera = MIRROR_X @ read_upper_rows(poses[0])[0] @ MIRROR_Y
+        return PlacedModel(file, self.ground_truth.Ts_world_camera[0] @ se3.inverse(T_model_camera))
+
+
+class PlacedModel(NamedTuple):
+    """Mesh file of a true surface, and its pose (4, 4) in the world of the ground truth."""
+
+    path: Path
+    T_world_model: NDArray[np.float64]
 
 
 class IclNuimLoopSequence(ImageFolder):

@@ -41,7 +41,15 @@ def read_matrices(path: Path) -> NDArray[np.float64]:
         )
     if usual != 12:
         return numbers.reshape(-1, 4, 4)
-    poses = np.tile(np.eye(4), (len(counts), 1, 1))
+    return read_upper_rows(path)
+
+
+def read_upper_rows(path: Path) -> NDArray[np.float64]:
+    """Matrices (N, 4, 4) of a text file with their first three rows, four numbers each."""
+    numbers = _numbers(path)
+    if numbers.size == 0 or numbers.size % 12:
+        raise DatasetError(f"{path} holds {numbers.size} numbers; expected three rows of four for every pose")
+    poses = np.tile(np.eye(4), (numbers.size // 12, 1, 1))
     poses[:, :3] = numbers.reshape(-1, 3, 4)
     return poses
 

@@ -11,7 +11,7 @@ import os
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
@@ -24,6 +24,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.tables import Column, grid, shown
 from dudmap.evaluation.trajectory import RUN_FIGURES, accuracy, ate
+from dudmap.io.exporting.mesh_editing import cropped
 from dudmap.lab.benchmark.suites import PASSES, Entry
 
 if TYPE_CHECKING:
@@ -66,7 +67,11 @@ def measure(job: Job) -> Row:
     sequence, passes = job.entry.open(), PASSES.get(job.system, 1)
     surfaces = job.entry.surfaces(sequence) if job.out is not None else None
     frames, calibrate = job.entry.max_frames, job.calibrate
-    return measure_sequence(sequence, job.config, surfaces, job.out, frames, passes=passes, calibrate=calibrate)
+    row = measure_sequence(sequence, job.config, surfaces, job.out, frames, passes=passes, calibrate=calibrate)
+    if job.out is not None and surfaces is not None and sequence.ground_truth is not None and row["mesh_triangles"]:
+        parts = {name: cropped(surfaces[1], box) for name, box in job.entry.parts.items()}
+        row |= score_parts(job.out, sequence.ground_truth, parts)
+    return row
 
 
 def measure_sequence(
@@ -145,6 +150,22 @@ def score_mesh(
         "mesh_completeness": round(result.scores[0].recall, 5),
         "ghost_area_m2": None if result.ghost_area_m2 is None else round(result.ghost_area_m2, 5),
         "ghost_share": round(result.ghost_share, 5),
+    }
+
+
+def score_parts(run: Path, truth: Trajectory, parts: Mapping[str, "Mesh"]) -> Row:
+    """Share of each visible part of the true surface within ``COMPLETE_WITHIN`` of a run's mesh, aligned as above."""
+    from dudmap.core.geometry.mesh import Mesh
+    from dudmap.evaluation.surface import Surface, moved
+
+    T = ate(Trajectory.load(run / "trajectory.txt"), truth, align="origin").T_reference_estimate
+    found = Surface(moved(Mesh.load(run / "mesh.ply"), T), "the mesh")
+    return {
+        f"completeness_{name}": round(
+            float((found.distances(Surface(part, name).samples(SAMPLES)) <= COMPLETE_WITHIN).mean()), 5
+        )
+        for name, part in parts.items()
+        if len(part.faces)
     }
 
 
@@ -260,6 +281,8 @@ COLUMNS = (
     Column("mask_iou_mean", "mask IoU", 1, 3),
     Column("mesh_accuracy_m", "accuracy, mm", 1000, 1),
     Column("mesh_completeness", "completeness, %", 100, 1),
+    Column("completeness_slats", "slats, %", 100, 1),
+    Column("completeness_wires", "wires, %", 100, 1),
     Column("ghost_area_m2", "ghost, m2", 1, 3),
     Column("ms_per_frame_median", "ms/frame", 1, 1),
     Column("ms_per_frame_p95", "p95 ms", 1, 1),

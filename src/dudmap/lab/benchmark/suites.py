@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError
+from dudmap.evaluation.files import true_surface
+from dudmap.io.exporting.run_content import Box
 from dudmap.io.sequences.archive import is_archive, stem
 from dudmap.lab.data import find, tables
 
@@ -33,6 +35,8 @@ class Entry:
             fields of ``SensorFaults`` that differ from the sensor's.
         address: Public page of its download, empty if there is none.
         max_frames: Use only this many frames from the start.
+        parts: Boxes (x0, y0, z0, x1, y1, z1) in the world frame of the ground truth, metres, by name; the completeness
+            of the true surface in each is measured as well.
     """
 
     name: str
@@ -40,6 +44,7 @@ class Entry:
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
     address: str = ""
     max_frames: int | None = None
+    parts: Mapping[str, Box] = field(default_factory=dict, hash=False)
 
     def open(self) -> "Sequence":
         """Open the recording, or set up the synthetic one."""
@@ -53,15 +58,12 @@ class Entry:
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
         """True static surface and its observed part, in the frame of the ground truth, if known."""
-        from dudmap.core.geometry.mesh import Mesh
         from dudmap.lab.synthetic.recording import SyntheticSequence
 
         if isinstance(sequence, SyntheticSequence):
             return sequence.surface(), sequence.surface(observed=True)
-        if self.path is None or not (self.path / "surface.ply").is_file():
-            return None
-        whole, seen = self.path / "surface.ply", self.path / "surface_observed.ply"
-        return Mesh.load(whole), Mesh.load(seen if seen.is_file() else whole)
+        found = None if self.path is None else true_surface(self.path)
+        return found and (found.whole, found.whole if found.observed is None else found.observed)
 
 
 def local_entries(data: Path) -> list[Entry]:
@@ -110,6 +112,8 @@ SUITES: dict[str, str] = DATA["suites"]
 """Description of each suite, by name."""
 WORLDS: dict[str, dict[str, dict[str, Any]]] = DATA["worlds"]
 """Parameters of the synthetic worlds of a suite, by name."""
+PARTS: dict[str, dict[str, Box]] = DATA["parts"]
+"""Boxes whose completeness a suite measures as well, by name."""
 SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
 """Differences from the default configuration, by name."""
 PASSES = {"two-passes": 2}
@@ -120,6 +124,7 @@ USUAL = {
     "ablation": ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))]),
     "sensors": "colour-as-given,no-colour,dudmap",
     "limits": "dudmap,none,threshold,em",
+    "fence": "voxel-5mm,voxel-1cm,voxel-2cm,voxel-2cm-16m",
 }
 """Default systems of a suite; other suites have only the default system."""
 QUICK = ("room-static", "room-person", "room-people-at-start", "two-people", "speed-1.0-50", "camera_path-still-30")
@@ -156,7 +161,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
             {"frames": 60, "camera": (320, 240)} if quick else {},
         )
         names = [key for key in QUICK if key in worlds] if quick else []
-        found = [Entry(key, parameters=worlds[key] | reduced) for key in names or worlds]
+        found = [Entry(key, parameters=worlds[key] | reduced, parts=PARTS.get(name, {})) for key in names or worlds]
     elif data is None:
         raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")
     elif name == "local":
