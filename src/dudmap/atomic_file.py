@@ -58,7 +58,6 @@ def atomic_path(path: str | Path, *, sync: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def _unfinished(path: Path, sync: bool, own: bool) -> Iterator[tuple[Path, int]]:
-    """Temporary path of a file and its handle."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         with OwnFolder(path.parent, linked=not own) as folder:

@@ -92,7 +92,6 @@ def recognised() -> Iterator[None]:
 
 
 def _take(number: int, frame: FrameType | None) -> None:
-    """Handler of a signal."""
     if number == getattr(signal, "SIGHUP", None):
         _leave_terminal()
     if not _Request.signal:

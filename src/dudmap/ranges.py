@@ -73,5 +73,4 @@ def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
 
 
 def _rounded(value: float) -> float:
-    """The value rounded to the digits in use."""
     return float(f"{value:.3g}")

@@ -163,7 +163,6 @@ def main() -> None:
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:
-    """Print a warning as one line, without the place in the source."""
     from dudmap.app.terminal import say
 
     say(f"warning: {message}", err=True)

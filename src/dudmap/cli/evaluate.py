@@ -280,7 +280,6 @@ def timings(run: o.RunArgument, as_json: o.JsonOption = False, out: OutOption = 
 
 
 def _plot_ending(plots: bool, plot_format: str | None) -> str:
-    """Ending of the files of plots, empty if none are wanted."""
     ending = (plot_format or "png").lower()
     if ending not in ("png", "pdf", "svg"):
         raise ConfigError(f"found --plot-format {plot_format}; expected png, pdf or svg")
@@ -314,7 +313,6 @@ def _output_folder(out: Path | None, default: Path) -> Path:
 
 
 def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool, title: str) -> None:
-    """Write the figures as JSON and print them."""
     _write_json(file, figures)
     _print(figures, [file, *pictures], as_json=as_json, title=title, shown={})
 

@@ -73,7 +73,6 @@ def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
 
 
 def _wait() -> None:
-    """Wait for ctrl-C."""
     try:
         while True:
             time.sleep(3600)

@@ -146,13 +146,11 @@ def score_pair(
 
 
 def _iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Intersection over union of the cells of two surfaces (n, 3)."""
     cells = [{tuple(row) for row in np.floor(points / IOU_CELL).astype(int).tolist()} for points in (a, b)]
     return len(cells[0] & cells[1]) / max(len(cells[0] | cells[1]), 1)
 
 
 def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
-    """Position error at the centre of a thing, and rotation error, 0 for symmetric things."""
     off = T @ se3.inverse(true.T_after_before)
     at = true.T_after_before[:3] @ np.append(true.at, 1)
     moved = 100 * float(np.linalg.norm(off[:3, :3] @ at + off[:3, 3] - at))

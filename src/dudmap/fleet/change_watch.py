@@ -174,11 +174,9 @@ class ChangeWatch(RunObserver):
         return near[beside > z + 2 * margin], near[np.abs(reading - z) < margin]
 
     def _margin(self, z: NDArray[np.float64], sensor: Any) -> NDArray[np.float64]:  # noqa: ANN401 - its configuration
-        """Distance (n,) that noise explains at depths (n,), metres."""
         return 2 * self.volume.voxel_size + DEVIATIONS * sensor.sigma(z)
 
     def _report(self, kind: str, index: int, now: float) -> None:
-        """Report groups of certain cells that are large enough."""
         cells = self._cells[kind]
         rows = cells.certain()
         wanted = LEAST_CELLS * (self.min_size / CELL) ** 2
@@ -201,7 +199,6 @@ class ChangeWatch(RunObserver):
             self._tell(row)
 
     def _withdraw(self, kind: str, index: int, now: float) -> None:
-        """Withdraw reported changes if later frames deny most of their cells."""
         cells = self._cells[kind]
         for row in [row for row in self.reported if row["kind"] == kind]:
             rows = np.searchsorted(cells.codes, self._members[row["id"]])
@@ -223,5 +220,4 @@ class ChangeWatch(RunObserver):
 
 
 def _centres(codes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Centres (n, 3) of cells, metres."""
     return (morton.decode(codes).astype(np.float64) + 0.5) * CELL

@@ -176,7 +176,6 @@ def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: K
 
 
 def _confidence(piece: Piece, found: Evidence) -> float:
-    """One minus the squared median ratio of noise tolerance to distance."""
     share = found.tolerance[piece.vertices] / np.maximum(found.gap[piece.vertices], 1e-6)
     return float(np.clip(1 - np.median(share) ** 2, 0, 1))
 

@@ -231,7 +231,6 @@ def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tupl
 
 
 def _write_tiles(cells: CellRange, fused: FusedRange, like: TsdfVolume, out: Path, work: Path) -> list[Tile]:
-    """Write a full-resolution tile for every cell of the range that has surface."""
     volume = fused.volume(like)
     cell_of = fused.codes[fused.has_voxels] >> CELL_BITS
     own = (cell_of >= cells.first) & (cell_of <= cells.last)

@@ -149,7 +149,6 @@ def empty_counts(
 
 
 def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
-    """Sums of blocks (n, 3) on the map's own grid."""
     blocks, slots = volume.blocks, volume.slots_at(coords)
     held = slots >= 0
     words = np.where(held[:, None], blocks.geometry[np.maximum(slots, 0)], 0)
@@ -162,7 +161,6 @@ def _exact_sums(volume: TsdfVolume, coords: NDArray[np.int32]) -> BlockSums:
 def _samples(
     volume: TsdfVolume, voxels: NDArray[np.float64], T_volume_grid: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Sample a map at voxels (n, 3) of a grid (``sample_points``)."""
     blocks, motion = volume.blocks, T_volume_grid[:3].copy()
     motion[:, 3] /= volume.voxel_size
     return sample_points(

@@ -75,7 +75,6 @@ def relative_poses(
 
 
 def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
-    """Votes that agree with ``vote`` on the pose of their own camera."""
     T = vote[1]
     return [other for other in votes if agree(T @ other[2], other[1] @ other[2], SAME_DISTANCE, SAME_ANGLE_DEG)]
 

@@ -184,7 +184,6 @@ def merge_fleet(
 def _write_world(
     out: Path, part: list[int], folders: Sequence[Path], graph: RunGraph, like: MapHeader, crew: Workers
 ) -> dict[str, Any]:
-    """Fuse joined runs; return the content of world.json."""
     work = out / WORK_FOLDER
     for folder in (out / MAP_FOLDER, out / TILE_FOLDER, work):
         folder.mkdir(parents=True)

@@ -221,7 +221,6 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
 
 
 def _graph(count: int, found: Pairs, guesses: Guesses) -> RunGraph:
-    """Solve the graph from all joins; solve again without joins that contradicted guesses deny."""
     joins = [join for runs, pair in found.items() if (join := join_of(runs, pair)) is not None]
     graph = solve(count, joins)
     denied = [pair for pair, guess in guesses.items() if found[pair].contradicted and _is_at(graph, pair, guess)]
@@ -229,7 +228,6 @@ def _graph(count: int, found: Pairs, guesses: Guesses) -> RunGraph:
 
 
 def _is_at(graph: RunGraph, pair: tuple[int, int], T: NDArray[np.float64]) -> bool:
-    """Whether a graph gives a pair this relative pose."""
     a, b = pair
     return agree(se3.inverse(graph.Ts[a]) @ graph.Ts[b], T, SAME_DISTANCE, SAME_ANGLE_DEG)
 
@@ -272,6 +270,5 @@ def _more_partners(graph: RunGraph, similar: NDArray[np.float32], found: Pairs) 
 
 
 def _block_centers(run: Path) -> NDArray[np.float64]:
-    """Centres (k, 3) of the blocks with voxels of a run, metres."""
     header = MapHeader.read(run / MAP_FILE)
     return (header.coords[header.has_voxels].astype(np.float64) + 0.5) * header.volume().block_size

@@ -207,7 +207,6 @@ def _neighbours(joins: Sequence[Join]) -> dict[int, list[tuple[Join, int]]]:
 
 
 def _triangles(joins: Sequence[Join]) -> list[Cycle]:
-    """All cycles of three joins, each at least once."""
     neighbours, out = _neighbours(joins), []
     for join in joins:
         partners = {other: near for near, other in neighbours[join.b] if other != join.a}
@@ -218,7 +217,6 @@ def _triangles(joins: Sequence[Join]) -> list[Cycle]:
 
 
 def _shortest(join: Join, neighbours: dict[int, list[tuple[Join, int]]]) -> Cycle:
-    """Shortest cycle through a join and these others, empty if there is none."""
     came: dict[int, tuple[Join, int]] = {}
     queue = deque([join.b])
     while queue:

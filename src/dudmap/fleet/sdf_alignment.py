@@ -152,7 +152,6 @@ def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> 
 def _normal_equations(
     J: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Matrix (6, 6) and gradient (6,) of the weighted squares of residuals (n,) with derivatives (n, 6)."""
     weighted = J * weights[:, None]
     return weighted.T @ J, weighted.T @ residual
 

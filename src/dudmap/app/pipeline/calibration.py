@@ -98,7 +98,6 @@ def findings(estimate: "Estimate") -> list[str]:
 
 
 def _shutter_finding(estimate: "Estimate") -> str:
-    """Sentence on the rolling shutter of the depth camera."""
     evidence, readout = estimate.evidence[SHUTTER], 1000 * estimate.calibration.depth_readout
     taken = f"rows are taken to be read out within {readout:.1f} ms"
     if np.isnan(evidence):
@@ -111,7 +110,6 @@ def _shutter_finding(estimate: "Estimate") -> str:
 
 
 def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
-    """Text of the standard deviations of parameters, the largest per kind."""
     largest: dict[str, float] = {}
     for name in members:
         largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), calibration.sigmas[name])
@@ -278,7 +276,6 @@ class _Excerpt:
 
 
 def _around_keyframes(timestamps: "NDArray[np.float64]", numbers: range) -> list[int]:
-    """Numbers of the keyframes and their neighbours."""
     if not len(numbers) or timestamps[numbers[-1]] - timestamps[numbers[0]] <= SHORT:
         return list(numbers)
     chosen, due = set[int](), -np.inf

@@ -198,7 +198,6 @@ def _with_masks(
     slam: "Slam | None",
     ms: float = 0.0,
 ) -> FrameRead:
-    """A frame with its masks, prepared for processing if there is a system."""
     try:
         view = None if slam is None or isinstance(frame, FrameError) else slam.prepare(frame)
     except FrameError as error:

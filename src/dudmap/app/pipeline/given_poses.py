@@ -104,7 +104,6 @@ def _at(poses: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
 
 
 def _read(path: Path, sequence: "Sequence", name: str | None) -> Trajectory:
-    """Poses of a file or of a folder of files."""
     if path.is_dir():
         files = sorted((file for file in path.iterdir() if file.suffix == ".txt"), key=_natural)
         matrices = [_matrices(file) for file in files]
@@ -131,7 +130,6 @@ def _read(path: Path, sequence: "Sequence", name: str | None) -> Trajectory:
 
 
 def _natural(path: Path) -> tuple[int, str]:
-    """Order of numbered files, with or without leading zeros."""
     digits = "".join(filter(str.isdigit, path.stem))
     return int(digits or 0), path.name
 

@@ -138,7 +138,6 @@ def image_warnings(frames: "list[Frame]") -> list[str]:
 
 
 def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Intensity (h, WIDTH) in 0..1 of a colour image."""
     size = WIDTH, round(WIDTH * color.shape[0] / color.shape[1])
     small = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32) / np.float32(255)
@@ -250,7 +249,6 @@ def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray
 
 
 def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Edge images (h, WIDTH) of the colours and the depth of a frame."""
     gray, (height, width) = _gray(frame.rgb), frame.depth.shape
     gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     edges = np.minimum(gradient / (gradient.mean() + np.float32(1e-5)), np.float32(STEEPEST))
@@ -258,7 +256,6 @@ def _edges(frame: "Frame") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Image of depth edges: 1 next to a step between two measurements, else 0."""
     small = cv2.resize(depth, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     window = np.ones((3, 3), np.uint8)
     near = cv2.erode(np.where(small > 0, small, 1e6).astype(np.float32), window)  # a missing measurement counts as far

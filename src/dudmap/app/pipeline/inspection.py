@@ -267,7 +267,6 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32], unit_is_op
 
 
 def _left_out(found: Inspection, readings: NDArray[np.float32]) -> str:
-    """Sentence on measurements outside of the depth range, with the parameter that includes them."""
     least, largest = found.depth_range
     if found.too_near > found.too_far:
         share, where = found.too_near, f"nearer than {least:g} m"

@@ -216,12 +216,10 @@ class RunRecord:
         return out
 
     def _column(self, name: str) -> NDArray[np.float64]:
-        """Numbers of a column of all frames; NaN without any."""
         return np.array([row[name] for row in self.rows] or [np.nan])
 
 
 def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
-    """Write a CSV file of rows with different columns."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval=missing)
     writer.writeheader()
@@ -230,7 +228,6 @@ def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
 
 
 def _row(mover: "Mover") -> dict[str, Any]:
-    """JSON object of a moving object: metres, m/s, world frame."""
     return {
         "id": mover.id,
         "centroid": mover.centroid.round(4).tolist(),
@@ -243,5 +240,4 @@ def _row(mover: "Mover") -> dict[str, Any]:
 
 
 def _number(value: float | np.floating, digits: int = 3) -> float | None:
-    """Rounded number for JSON; None for NaN."""
     return round(float(value), digits) if np.isfinite(value) else None

@@ -156,7 +156,6 @@ def command_line() -> str:
 
 
 def _versions() -> dict[str, Any]:
-    """Versions and machine; fewer if the installation is broken."""
     from dudmap.app.pipeline.environment import machine, versions
 
     try:

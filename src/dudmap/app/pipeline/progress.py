@@ -146,6 +146,5 @@ def summary(metrics: dict[str, Any]) -> Table:
 
 
 def _reasons(metrics: dict[str, Any]) -> str:
-    """Why tracked frames were not fused, in brackets; a frame may have several reasons, or none in a localisation."""
     said = [f"{metrics[key]} {why}" for key, why in NOT_FUSED.items() if metrics[key]]
     return f" ({', '.join(said)})" if said else ""

@@ -25,14 +25,12 @@ def remarks(slam: "Slam", record: RunRecord) -> Iterator[str]:
 
 
 def _unmerged_submaps(slam: "Slam") -> str:
-    """Sentence on the submaps that could not be merged."""
     main, *others = (len(trajectory) for trajectory, _ in slam.maps)
     names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
     return f"{len(others)} submap(s) could not be merged: the main map has {main} frames; the others are {names}"
 
 
 def _repeats(record: RunRecord) -> str:
-    """Sentence on the frames that repeat images of the frame before."""
     what = {
         "frame": "{} both images (they have the pose of the frame before)",
         "depth": "{} the depth image (their poses are interpolated)",

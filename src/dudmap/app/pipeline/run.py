@@ -289,7 +289,6 @@ class Job:
         return report
 
     def _process(self, state: RunState, store: RunStore | None) -> None:
-        """Process the remaining frames of all remaining passes."""
         options = self.options
         for number in range(state.number, options.passes):
             if number > state.number:
@@ -325,7 +324,6 @@ class Job:
             store.end(state)
 
     def _frames(self, state: RunState, background: Background) -> Generator[SourceFrame]:
-        """Remaining frames of the pass."""
         count, source, slam = self.options.max_frames, self.sequence, state.slam
         if isinstance(source, LiveCamera):
             self.display.working("loading kernels")
@@ -337,12 +335,10 @@ class Job:
         return read_ahead(source, count, self.options.ahead, self.masks, slam, state.next)
 
     def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
-        """Create a system with the known calibration; for a second pass, with the first pass."""
         return self.system(first_pass=first_pass, calibration=state.calibration)
 
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
-        """Restore the last checkpoint, to continue on the CPU."""
         store.close(finished=False)
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
@@ -394,7 +390,6 @@ def _saved(state: RunState) -> str:
 
 
 def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
-    """Complete the recording and report its content."""
     with interruption.postponed():
         recorder.close()
     display.note(f"recorded {recorder.written} frames to {recorder.path}")

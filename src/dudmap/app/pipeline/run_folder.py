@@ -118,7 +118,6 @@ def _lock(file: IO[bytes]) -> None:
 
 
 def _described(holder: str) -> str:
-    """Text on the holder of a lock, from its file."""
     try:
         about = json.loads(holder)
         return f"process {int(about['pid'])} on {about['host']} since {about['since']}"
@@ -286,7 +285,6 @@ def write_run_folder(
 
 
 def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None) -> dict[str, Any] | None:
-    """Entry ``up`` of metrics.json; None without poses."""
     measured, problem = None, ""
     try:
         gravity = getattr(sequence, "gravity", None)
@@ -302,7 +300,6 @@ def _up(sequence: "Sequence | LiveCamera", poses: Trajectory, mesh: Mesh | None)
 
 
 def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:
-    """Write mesh and trajectory of every rigid object; return the entries of all objects in metrics.json."""
     out = []
     for obj in objects:
         row = {"id": obj.id, "rigid": obj.rigid, "why_not": obj.reason or None, "frames": obj.frames}

@@ -254,7 +254,6 @@ class RunStore:
         return time.thread_time() - start
 
     def _finish(self) -> None:
-        """Wait for the last checkpoint; note its cost or error."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -270,7 +269,6 @@ class RunStore:
             self._warn(error)
 
     def _warn(self, error: BaseException) -> None:
-        """Report once that no checkpoints are written."""
         if not self._failing:
             self._failing = True
             of_disk = isinstance(error, OSError | sqlite3.Error)
@@ -311,7 +309,6 @@ def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
 
 
 def _why_nothing(out: Path) -> str:
-    """Why a folder holds no run that can be continued."""
     try:
         metrics = read_json(out / "metrics.json")
         if metrics["complete"]:

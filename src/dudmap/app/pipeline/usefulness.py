@@ -28,7 +28,6 @@ def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float
 
 
 def _cause(metrics: Mapping[str, Any], depth_range: tuple[float, float]) -> tuple[str, str]:
-    """Cause of a useless run, and a remedy."""
     for key, where, limit in zip(("too_near", "too_far"), ("nearer", "farther"), depth_range, strict=True):
         if (share := metrics["readings"][key]) > MOST:
             name = "near" if key == "too_near" else "far"

@@ -334,7 +334,6 @@ _TABLES_OF = "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name"
 
 
 def _own_tables() -> list[tuple[str, ...]]:
-    """Result of ``_TABLES_OF`` for a new database."""
     with closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(TABLES)
         return list(connection.execute(_TABLES_OF))
@@ -356,7 +355,6 @@ def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
 
 
 def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
-    """Writable array from its chunks."""
     dtype, shape = np.dtype(about["dtype"]), tuple(about["shape"])
     if dtype.kind not in SAFE_KINDS or any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
         raise ValueError(f"found an array of {dtype} with the shape {shape}; expected numbers or text")

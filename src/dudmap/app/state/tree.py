@@ -293,7 +293,6 @@ class TreeReader:
         return out
 
     def _columns(self, node: dict[str, Node], kind: type) -> list[Any]:
-        """Objects of one class that were stored attribute by attribute."""
         hints = fields_of(kind)
         _check_names(node["columns"], hints, kind)
         columns = [self._items(node["columns"][name], list, (hint,)) for name, hint in hints.items()]
@@ -322,7 +321,6 @@ class TreeReader:
         return make_volume(*settings[:4], backend, settings.max_blocks)
 
     def _fill_map(self, volume: TsdfVolume, number: int) -> None:
-        """Read the voxels of a map whose index is complete."""
         reader, blocks = self._reader, volume.blocks
         slots, coords, voxels = reader.blocks(number)
         owned = blocks.active_slots
@@ -344,7 +342,6 @@ class TreeReader:
 
 
 def _check_names(content: object, hints: Iterable[str], kind: type) -> None:
-    """Check that the attributes of an object are exactly the expected ones."""
     if not isinstance(content, dict) or content.keys() != set(hints):
         found = sorted(content) if isinstance(content, dict) else content
         raise ValueError(f"found the attributes {found} of {kind.__name__}; expected {sorted(hints)}")

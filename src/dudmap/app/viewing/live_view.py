@@ -120,7 +120,6 @@ class LiveView(RunObserver):
             raise self._error
 
     def _poses(self) -> "dict[float, NDArray]":
-        """Poses of the largest submap by time, after all corrections."""
         assert self._slam is not None
         path = self._slam.trajectory
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))

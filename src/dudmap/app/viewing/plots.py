@@ -78,7 +78,6 @@ def _ground_axes(run: RunFiles) -> NDArray[np.float64]:
 
 
 def _thinned(path: NDArray[np.float64]) -> NDArray[np.float64]:
-    """About ``5 * POINTS`` of the positions; gaps stay."""
     return path[:: max(1, len(path) // (5 * POINTS))]
 
 
@@ -116,13 +115,11 @@ def _dynamic_share(run: RunFiles) -> str:
 
 
 def _seconds(run: RunFiles) -> NDArray[np.float64]:
-    """Times of the processed frames since the first, seconds."""
     stamps = run.column("timestamp")
     return stamps - stamps[0]
 
 
 def _lost(run: RunFiles) -> NDArray[np.float64]:
-    """Times of the lost frames since the first processed one, seconds."""
     return _seconds(run)[[row["state"] == "lost" for row in run.frames]] if run.frames else np.empty(0)
 
 

@@ -104,7 +104,6 @@ class Thumbnails(RunObserver):
             self._next = self._next_after(index)
 
     def _next_after(self, index: int) -> int:
-        """First frame of the next of NUMBER equal parts."""
         assert self._count is not None
         return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
 
@@ -253,7 +252,6 @@ def asset(name: str) -> Html:
 
 
 def _verdict(metrics: dict[str, Any]) -> str:
-    """Sentence on whether the run is complete."""
     tracked = f"{metrics.get('tracked', 0)} of {metrics.get('frames', 0)} frames were tracked"
     if metrics.get("complete"):
         return f"Processed to the end; {tracked}."
@@ -291,7 +289,6 @@ def _strip(run: RunFiles) -> Html:
 
 
 def _losses(metrics: dict[str, Any]) -> Html:
-    """Lost frames by reason, unreadable frames, and frames that are not in the map."""
     lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
     notes = [
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),

@@ -100,7 +100,6 @@ class RerunLog(RunObserver):
             stream.log(f"images/{kind}", rr.EncodedImage(contents=jpeg(pictures[kind]), media_type="image/jpeg"))
 
     def _log_map(self, changes: MeshChanges) -> None:
-        """Log the changed parts of the map and the trajectory."""
         assert self._slam is not None
         if changes.reset:
             for part in self._parts:

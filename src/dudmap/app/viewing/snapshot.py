@@ -219,7 +219,6 @@ def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
 
 
 def _far(frames: list[Frame]) -> float:
-    """Depth at the end of the colour scale, metres."""
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     return float(np.percentile(readings, 99)) if len(readings) else 1.0
 

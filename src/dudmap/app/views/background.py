@@ -148,8 +148,6 @@ class BackgroundRenderer:
         return out, counts > 0
 
     def _nearest(self, T_world_color: NDArray[np.float64]) -> list[Source]:
-        """Sources by increasing distance of their poses."""
-
         def distance(source: Source) -> float:
             T = se3.inverse(T_world_color) @ source.T_world_color
             return float(np.linalg.norm(T[:3, 3])) + ANGLE_LENGTH * se3.rotation_angle(T)

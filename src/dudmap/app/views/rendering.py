@@ -225,7 +225,6 @@ def view_camera(run: RunContent, size: tuple[int, int] | None) -> Camera:
 
 
 def _farthest(run: RunContent, trajectory: Trajectory) -> float:
-    """Largest depth of the mesh in the views of a trajectory, metres."""
     points = run.surface.vertices.astype(np.float64)
     return max(float(((points - T[:3, 3]) @ T[:3, 2]).max()) for T in trajectory.Ts_world_camera)
 

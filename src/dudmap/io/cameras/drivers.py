@@ -81,7 +81,6 @@ class _PolledCamera(LiveCamera):
                 self._pipeline.stop()
 
     def _rectified(self, depth: NDArray, color: NDArray, times: tuple[float, float]) -> Frame:
-        """Frame of depth in metres and colour as recorded, with their times in seconds."""
         depth, color = self._lenses[0].rectify(depth, depth=True), self._lenses[1].rectify(color, depth=False)
         return Frame(times[0], depth, color, times[1])
 
@@ -161,7 +160,6 @@ class RealSenseCamera(_PolledCamera):
         return self._rectified(metres, image, (1e-3 * depth.get_timestamp(), 1e-3 * color.get_timestamp()))
 
     def _lens(self, stream: Any) -> Lens:  # noqa: ANN401
-        """Lens of a stream, from its factory intrinsics."""
         own = stream.as_video_stream_profile().get_intrinsics()
         camera = Camera(own.fx, own.fy, own.ppx, own.ppy, own.width, own.height)
         return Lens.of(camera, str(own.model).removeprefix("distortion."), tuple(own.coeffs))
@@ -224,7 +222,6 @@ def _rational_lens(own: Any, lens: Any) -> Lens:  # noqa: ANN401
 
 
 def _motion(R: Any, t: Any) -> NDArray[np.float64]:  # noqa: ANN401
-    """Rigid motion (4, 4) of a factory calibration."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = se3.nearest_rotation(np.asarray(R, np.float64)), t
     return T

@@ -195,6 +195,5 @@ def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
 
 
 def _grid(run: RunContent, options: ExportOptions) -> tuple[Mesh, SpaceGrid, Up]:
-    """Chosen part of the surface, grid around it, and upward direction."""
     mesh, up = edited(run.surface, options), run_up(run, options)
     return mesh, SpaceGrid.of(run.volume, mesh, z_up(checked_floor(run, up)), options.resolution), up

@@ -120,5 +120,4 @@ def face_vectors(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _length(points: NDArray[np.float32]) -> float:
-    """Length of a closed line through points (n, 3)."""
     return float(np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1).sum())

@@ -100,7 +100,6 @@ def linear_light(values: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Linear colours (V, 4) with full opacity."""
     out = np.full((len(colors), 4), 65535, "<u2")
     out[:, :3] = np.rint(65535 * linear_light(np.arange(256, dtype=np.uint8))).astype(np.uint16)[colors]
     return out
@@ -142,7 +141,6 @@ LAS_STEP = 0.0001
 
 
 def _points(run: RunContent, options: ExportOptions) -> Mesh:
-    """The points with their colours and normals."""
     mesh = edited(run.surface, options)
     return replace(mesh, faces=np.empty((0, 3), np.int32))
 

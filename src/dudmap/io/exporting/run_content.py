@@ -178,7 +178,6 @@ def _index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
 
 
 def _numbers(version: str) -> list[int]:
-    """Major and minor number of a version."""
     return [int(number) for number in re.findall(r"\d+", version)[:2]]
 
 

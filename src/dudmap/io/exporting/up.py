@@ -151,7 +151,6 @@ def find_up(
 
 
 def _by_gravity(mesh: Mesh | None, measured: MeasuredUp, guess: tuple[Floor, float] | None) -> Up:
-    """The measured direction, refined by the floor if it is level."""
     limit = max(ACCURACY, 3 * measured.sigma_deg)
     level = None if mesh is None else _floor(mesh, measured.direction, limit)
     evidence = f"gravity of {measured.source}, {measured.readings} readings"
@@ -167,7 +166,6 @@ def _by_gravity(mesh: Mesh | None, measured: MeasuredUp, guess: tuple[Floor, flo
 
 
 def _floor(mesh: Mesh, near: NDArray[np.float64], limit: float | None = None) -> tuple[Floor, float] | None:
-    """The floor whose normal is near a direction (3,), and its unevenness in degrees."""
     level = level_normal(mesh, near) if limit is None else level_normal(mesh, near, float(np.cos(np.radians(limit))))
     height = None if level is None else floor_height(mesh, level)
     if level is None or height is None:
@@ -194,14 +192,12 @@ def _against(measured: MeasuredUp | None, direction: NDArray[np.float64], name: 
 
 
 def _facing(mesh: Mesh, direction: NDArray[np.float64]) -> float:
-    """Surface that faces a direction (3,), square metres."""
     vectors = face_vectors(mesh)
     areas = np.linalg.norm(vectors, axis=1)
     return float(areas[vectors @ direction > LEVEL * areas].sum())
 
 
 def _contradiction(mesh: Mesh | None, poses: Trajectory, held: NDArray[np.float64], guess: Up) -> str:
-    """Sentence against a guess, with the direction that is more likely; else nothing."""
     if mesh is not None:
         upward = _facing(mesh, guess.direction)
         below = _floor(mesh, -held)
@@ -237,5 +233,4 @@ def _numbers(direction: Iterable[float]) -> str:
 
 
 def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Angle between unit vectors, degrees."""
     return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))

@@ -105,7 +105,6 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def _folders(parent: Path, *names: str) -> list[Path]:
-    """Image folders, created if missing."""
     for name in names:
         (parent / name).mkdir(exist_ok=True)
     return [parent / name for name in names]
@@ -147,7 +146,6 @@ def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
 
 
 def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
-    """Frames that have a pose and a mask."""
     other = None
     if sequence.calibration is not None:
         other = OtherView(Lens(sequence.camera), Lens(run.color_camera(sequence)))

@@ -346,7 +346,6 @@ def _places_by_content(path: Path) -> list[Path]:
 
 
 def _unknown(path: Path) -> str:
-    """Sentence on a folder or file that no reader recognises."""
     from dudmap.io.sequences.image_series import unknown as images_in
 
     listed = [name for name in ("rgb.txt", "depth.txt") if (path / name).is_file()]

@@ -97,7 +97,6 @@ class AzureKinectRecording(Recording):
         return color
 
     def _tracks(self) -> list[_Track]:
-        """Colour and depth track."""
         found = {s.metadata.get("title"): s for s in self._container.streams.video}
         if "COLOR" not in found or "DEPTH" not in found:
             raise DatasetError(
@@ -114,7 +113,6 @@ class AzureKinectRecording(Recording):
         ]
 
     def _passing(self, _: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
-        """All images, starting at a time in nanoseconds."""
         streams = {track.stream.index: name for name, track in (("COLOR", self._color), ("DEPTH", self._depth))}
         first = self._depth.stream
         self._container.seek(max(0, int((start - BEFORE) * 1e-9 / first.time_base)), stream=first)

@@ -73,7 +73,6 @@ class RosBag(Recording):
             self._find_frames(chosen, camera)
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
-        """Set topics, times and pairs of messages, and the cameras."""
         self._topics = bag_messages.find_topics(self._bag.connections, chosen, str(self.path), self._bag.first)
         self.has_color = self._topics.color is not self._topics.depth
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
@@ -117,7 +116,6 @@ class RosBag(Recording):
         return Frame(seconds_of(depth), values, image, seconds_of(color))
 
     def _decoded(self, index: int, depth_scale: float) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
-        """Depth and colour message of a frame, each with its image."""
         topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
         with foreign(FrameError, name):
             wanted = [(topics.color, color_time)] if self.has_color else []
@@ -153,7 +151,6 @@ class RosBag(Recording):
         return self._tree(None).trajectory(world, frame, self.timestamps)
 
     def _times(self, connection: "Connection") -> MessageTimes:
-        """Times of the messages of a topic."""
         found = self._bag.times(connection)
         if np.mean(np.diff(found.stamps, prepend=-np.inf) > 0) < 0.9:  # a driver that does not fill the headers
             return found._replace(stamps=1e-9 * found.recorded, exact=True)
@@ -173,7 +170,6 @@ class RosBag(Recording):
         return pairs
 
     def _find_cameras(self, given: Camera | str | None) -> None:
-        """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
         topics = self._topics
         depth, values, color, image = self._probe()
         depth_size, color_size = values.shape[::-1], image.shape[1::-1]
@@ -213,7 +209,6 @@ class RosBag(Recording):
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
     def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
-        """First frame that can be decoded."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -223,7 +218,6 @@ class RosBag(Recording):
         raise DatasetError(f"no frame of {self.path} is usable; {problem}")
 
     def _between(self, depth: Lens, color: Lens, color_frame: str) -> Calibration | None:
-        """Calibration of the colour camera, None if its images are registered to depth."""
         same_frame = color_frame.lstrip("/") == self._depth_frame.lstrip("/") or self._topics.registered
         T = np.eye(4) if same_frame else self._T_color_depth(color_frame)
         if T is None:
@@ -242,7 +236,6 @@ class RosBag(Recording):
         return self._transforms.between(color_frame, self._depth_frame)
 
     def _units(self) -> float:
-        """Depth units per metre."""
         return MILLIMETRES
 
     def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
@@ -262,12 +255,10 @@ class RosBag(Recording):
         return Lens(camera) if rectified else Lens.of(camera, self._model_of(image, info), tuple(map(float, D)))
 
     def _without(self) -> str:
-        """Text on the camera_info that holds no intrinsics."""
         found = " and ".join(dict.fromkeys(self._uncalibrated))
         return f" with a focal length (K in {found} is all zeros: that camera is not calibrated)" if found else ""
 
     def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
-        """Model of the lens of an image with its camera_info."""
         return info.distortion_model
 
     @cached_property
@@ -287,7 +278,6 @@ class RosBag(Recording):
 
 
 def _equal(one: Lens, other: Lens) -> bool:
-    """Whether two lenses project alike, within the accuracy of drivers' intrinsics."""
     a, b = one.camera, other.camera
     numbers = [(c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)) for c in (a, b)]
     alike = len(numbers[0]) == len(numbers[1]) and np.allclose(*numbers, rtol=0, atol=1e-3)
@@ -345,7 +335,6 @@ class RealSenseRecording(RosBag):
         return motions[0] @ se3.inverse(motions[1])
 
     def _model_of(self, image: "Connection", info: Any) -> str:  # noqa: ANN401
-        """Model in the text topic of the stream, because the camera_info of .db3 files calls every model plumb_bob."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
         found = re.search(r"model=([^;]+)", self._bag.first(text).data) if text else None
         return found[1] if found else info.distortion_model

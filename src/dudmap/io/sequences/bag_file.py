@@ -140,7 +140,6 @@ class BagFile:
         return [self._decoded(data, connection) for data, (connection, _) in zip(raw, wanted, strict=True)]
 
     def _passing(self, topics: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
-        """All messages of some topics, starting at a time of recording."""
         chosen = [connection for connection in self.connections if connection.topic in topics]
         with closing(self._reader.messages(chosen, start=start)) as messages:
             yield from ((connection.topic, time, bytes(data)) for connection, time, data in messages)
@@ -150,7 +149,6 @@ class BagFile:
         return decode(raw, connection.msgtype)
 
     def _stamp(self, data: bytes) -> float:
-        """Time in seconds in the header of a serialised message."""
         seconds, nanoseconds = (ROS1_STAMP if self._ros1 else CDR_STAMP[data[1] & 1]).unpack_from(data)
         return seconds + 1e-9 * nanoseconds
 

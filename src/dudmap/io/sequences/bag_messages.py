@@ -245,7 +245,6 @@ class TransformTree:
         return Trajectory.from_poses(poses) if poses else None
 
     def _path(self, frame: str) -> list[str]:
-        """The frame and its ancestors."""
         path = [frame.lstrip("/")]
         while (parent := self._parents.get(path[-1])) is not None and parent not in path:
             path.append(parent)

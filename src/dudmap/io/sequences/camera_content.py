@@ -130,12 +130,10 @@ def _tokens(text: str) -> Any:  # noqa: ANN401
 
 
 def _name(text: str) -> str:
-    """A name in lower case with underscores: ``Camera.fx`` and ``focalLength`` become camera_fx and focal_length."""
     return re.sub(r"[\W_]+", "_", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text)).strip("_").lower()
 
 
 def _cameras(tree: Any, name: str) -> Iterator[tuple[str, Values]]:  # noqa: ANN401
-    """Names and values of all cameras in a tree."""
     if isinstance(tree, dict):
         yield from _of_dictionary({_name(str(key)): value for key, value in tree.items()}, name)
     elif isinstance(tree, list) and (values := _row(tree, name)) is not None:

@@ -212,14 +212,12 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
 
 
 def _are_settings(file: Path) -> bool:
-    """Whether a file holds settings of ORB-SLAM."""
     with file.open(encoding="utf-8", errors="replace") as text:
         head = text.read(LARGEST_SETTINGS)
     return any(f"\n{start}fx" in head for start in SETTINGS)
 
 
 def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  # noqa: ANN401
-    """Names and values of all cameras below a JSON value."""
     if isinstance(tree, list):
         for below in tree:
             yield from _cameras(below, name)

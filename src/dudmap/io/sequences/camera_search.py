@@ -111,7 +111,6 @@ def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
 
 
 def _candidates(place: Path) -> Iterator[Path]:
-    """Files at a place that may hold intrinsics."""
     for path in sorted(place.iterdir()):
         if FOLDERS.fullmatch(path.name) and path.is_dir():
             yield from (file for file in sorted(path.iterdir()) if _is_small(file))
@@ -159,7 +158,6 @@ def _is_multiple(given: Size, size: Size) -> bool:
 
 
 def _is_plausible(values: Values, size: Size) -> bool:
-    """Whether numbers are a plausible camera for images of a size."""
     focal, center = np.array([values["fx"], values["fy"]]), np.array([values["cx"], values["cy"]])
     if not (focal > 0).all():
         return False
@@ -170,7 +168,6 @@ def _is_plausible(values: Values, size: Size) -> bool:
 
 
 def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intrinsics:
-    """Intrinsics from the found cameras."""
     cameras: dict[str, Values] = {}
     for kind in ("depth", "color"):
         known = [camera for camera in found if camera.kind == kind]
@@ -204,7 +201,6 @@ def _decided(found: list[Found], folder: Path, depth: Size, color: Size) -> Intr
 
 
 def _distinct(cameras: list[Found]) -> list[Found]:
-    """Distinct cameras, each with its most complete values."""
     kept: list[Found] = []
     for camera in sorted(cameras, key=lambda camera: -len(camera.values)):
         if not any(_is_same(camera.values, other.values) for other in kept):
@@ -219,7 +215,6 @@ def _is_same(one: Values, other: Values) -> bool:
 
 
 def _source(found: list[Found], folder: Path) -> str:
-    """Text that names the files of cameras and the scaling of their numbers."""
     names = list(dict.fromkeys(_shown(camera.file, folder) for camera in found))
     scaled = next((camera for camera in found if camera.scaled), None)
     text = _listed(names)

@@ -170,7 +170,6 @@ class ImageFolder(Recording):
         return camera_search.known(self.path, self._published(), self._sizes)
 
     def _sizes(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
-        """Width and height of the depth and the colour images, from the first readable pair."""
         for color, depth in self._pairs[:PROBES]:
             try:
                 height, width = self._read_depth(depth.path, 1.0).shape
@@ -318,7 +317,6 @@ class ImageFolder(Recording):
 
 
 def _is_centered(camera: Camera) -> bool:
-    """Whether the principal point is near the image centre."""
     middle, size = np.array([camera.cx, camera.cy]) + 0.5, np.array([camera.width, camera.height])
     return bool(np.all(np.abs(middle / size - 0.5) < OFF_CENTER))
 

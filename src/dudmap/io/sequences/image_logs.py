@@ -47,7 +47,6 @@ class _FrameLog(Recording):
     _entries: list[FrameEntry]
 
     def _images(self, index: int) -> tuple[bytes, bytes]:
-        """Data of the two images of a frame, in the order of the file."""
         entry = self._entries[index]
         with open_plain(self.path) as file:
             file.seek(entry.offset)
@@ -185,7 +184,6 @@ class KlgRecording(_FrameLog):
         return Frame(float(self.timestamps[index]), depth, color)
 
     def _size(self, known: intrinsics.Intrinsics) -> tuple[int, int]:
-        """Width and height of the images."""
         if "width" in known.values:
             return int(known.values["width"]), int(known.values["height"])
         _, color = self._images(0)
@@ -195,7 +193,6 @@ class KlgRecording(_FrameLog):
         return 640, 480
 
     def _read_index(self) -> list[FrameEntry]:
-        """Offsets of the frames, without reading the images."""
         entries, end = [], self.path.stat().st_size
         with open_plain(self.path) as file:
             head = file.read(4)

@@ -197,7 +197,6 @@ def _folders(path: Path) -> list[tuple[str, list[Series]]]:
 
 
 def _below(folder: Path, name: str) -> list[Series]:
-    """Series in a folder and its folders."""
     further = [_series_in(folder / inner, f"{name}{inner}/") for inner in _folder_names(folder)]
     return [*_series_in(folder, name), *(one for series in further for one in series)]
 
@@ -208,7 +207,6 @@ def _folder_names(path: Path) -> list[str]:
 
 
 def _matching(path: Path, kind: str, pattern: str) -> Series:
-    """Numbered images of a pattern."""
     files = [file for file in sorted(path.glob(pattern)) if is_numbered_image(file.name)]
     if not files:
         raise DatasetError(
@@ -223,7 +221,6 @@ def _there(path: Path) -> str:
 
 
 def _everything(path: Path) -> list[Series]:
-    """Series of a folder and its folders."""
     return [*_series_in(path), *(one for name in _folder_names(path) for one in _below(path / name, f"{name}/"))]
 
 
@@ -250,7 +247,6 @@ def _surest(series: list[Series], kind: str) -> Series | None:
 
 
 def _is_recording(series: list[Series]) -> bool:
-    """Whether series of one folder hold both kinds."""
     return all(any(one.may_be(kind) for one in series) for kind in WORDS)
 
 

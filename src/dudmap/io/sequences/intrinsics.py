@@ -179,7 +179,6 @@ def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:
 
 
 def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
-    """Rigid motion of 12 or 16 numbers, row by row."""
     T = np.eye(4)
     if len(fields) in (12, 16) and all(map(_is_number, fields)):
         T[:3] = np.array(fields[:12], dtype=np.float64).reshape(3, 4)
@@ -190,7 +189,6 @@ def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
 
 
 def _is_number(text: str) -> bool:
-    """Whether a text is a finite number."""
     try:
         return math.isfinite(float(text))
     except ValueError:

@@ -106,7 +106,6 @@ def _of_one_form(files: list[Path]) -> list[Path]:
 
 
 def _core(file: Path) -> str:
-    """Name of a file without ``WORDS``."""
     return WORDS.sub("", file.stem)
 
 

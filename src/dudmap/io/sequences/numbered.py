@@ -90,7 +90,6 @@ class NumberedSequence(ImageFolder):
         return None
 
     def _matrices(self, file: Path) -> NDArray[np.float64]:
-        """Poses (N, 4, 4) of a file with one matrix per frame."""
         poses = read_matrices(file)
         if len(poses) != len(self):
             raise DatasetError(

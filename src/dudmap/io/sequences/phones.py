@@ -32,7 +32,6 @@ Y_UP, Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
-    """Times and rotations (3, 3) of poses."""
     return list(zip(poses.timestamps.tolist(), poses.Ts_world_camera[:, :3, :3], strict=True))
 
 
@@ -179,7 +178,6 @@ class PolycamSequence(ArkitFolder):
 
     @cached_property
     def _kind(self) -> str:
-        """First part of the names of the folders of images and cameras."""
         return "corrected_" if any(self.path.glob("corrected_images/*.jpg")) else ""
 
     @cached_property

@@ -264,7 +264,6 @@ def pair_misfits(first: Images, second: Images, motions: List[Motion]) -> NDArra
 
 
 def _moved(T: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Points (3, n) after a rigid motion (4, 4)."""
     R, t = T[:3, :3].astype(np.float32), T[:3, 3:].astype(np.float32)
     return R @ points + t
 

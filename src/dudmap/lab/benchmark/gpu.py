@@ -84,7 +84,6 @@ def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
-    """Milliseconds per kernel of an action, by events of the GPU; names lose Warp's prefix and hash."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)

@@ -69,7 +69,6 @@ def compare_with_open3d(python: Path, sequence: Sequence, frames: int, rounds: i
 
 
 def _median_ms(rows: list[Row]) -> float:
-    """Median of the times per frame of runs, without the first frames of each, milliseconds."""
     return float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows]))
 
 
@@ -105,7 +104,6 @@ def _run_ours(folder: Path) -> Row:
 
 
 def _run_open3d(python: Path, folder: Path) -> Row:
-    """Version, ms per frame and poses of Open3D's dense SLAM on the frames in a folder."""
     program = Path(__file__).with_name("open3d_slam.py").read_text(encoding="utf-8")
     arguments = [str(folder), str(Config().volume.voxel_size), str(Config().preprocess.depth_max)]
     command = [python, "-c", program, *arguments]

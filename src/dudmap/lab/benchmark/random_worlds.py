@@ -121,7 +121,6 @@ def report(rows: list[Row], seed: int) -> str:
 
 
 def _listed(title: str, rows: list[Row]) -> str:
-    """List of worlds, each with the command that measures it again and its parameters."""
     if not rows:
         return f"\n{title}: none.\n"
     text = f"\n{title}:\n"

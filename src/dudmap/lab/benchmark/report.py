@@ -96,7 +96,6 @@ def named_folders(assignments: list[str]) -> dict[str, Path]:
 
 
 def _scored(entry: Entry, folder: Path) -> Row:
-    """Figures of the trajectory and mesh of another system."""
     from dudmap.core.geometry.mesh import Mesh
     from dudmap.core.geometry.trajectory import Trajectory
 
@@ -120,7 +119,6 @@ def _scored(entry: Entry, folder: Path) -> Row:
 
 
 def _missing(suite: Suite) -> str:
-    """List of the recordings that were not found, with their addresses."""
     if not suite.missing:
         return ""
     lines = [f"- {entry.name}: {entry.address}" for entry in suite.missing]

@@ -129,7 +129,6 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
 
 
 def _true_poses(stream: FaultyStream) -> list[NDArray[np.float64]]:
-    """True pose (4, 4) of every frame of the recording."""
     truth: Trajectory | None = stream.ground_truth
     assert truth is not None
     first, last = float(truth.timestamps[0]), float(truth.timestamps[-1])

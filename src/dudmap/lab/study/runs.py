@@ -115,7 +115,6 @@ def _recording(entry: Entry) -> "Recording":
 
 @lru_cache(maxsize=4)
 def _surfaces(entry: Entry) -> "tuple[Surface, Surface] | None":
-    """True surfaces of a recording with their search trees."""
     from dudmap.evaluation.surface import Surface
 
     found: Any = entry.surfaces(entry.open())

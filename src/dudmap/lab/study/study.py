@@ -38,7 +38,6 @@ def run_study(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS)
 
 
 def _confirm(plan: Plan, predicted: "Prediction", out: Path, conduct: Conduct) -> "Confirmation | str":
-    """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
 
     from dudmap.lab.study.response_surface import confirm

@@ -20,7 +20,6 @@ half the step between two moments of the exposure bounds their error."""
 
 
 def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
-    """Field with the smallest and the largest accepted value."""
     return field(default=usual, metadata={"limits": (low, high)})
 
 

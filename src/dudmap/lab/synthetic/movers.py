@@ -160,7 +160,6 @@ def _wanderer(staging: Staging) -> list[SyntheticMover]:
 
 
 def _solids(name: str, size: float) -> list[Primitive]:
-    """Solids of a mover of ``solids.toml``, so many times as large as in life."""
     materials = {key: Material(**given) for key, given in SOLIDS["materials"].items()}
     return [solid.scaled(size) for solid in built(SOLIDS["movers"][name], materials)]
 

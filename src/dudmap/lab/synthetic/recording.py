@@ -179,7 +179,6 @@ class SyntheticSequence:
 
     @cached_property
     def _surface(self) -> Mesh:
-        """The whole of ``surface``."""
         end = float(self.timestamps[-1])
         resting = [
             primitive.moved(T)

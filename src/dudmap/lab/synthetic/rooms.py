@@ -131,7 +131,6 @@ def built(rows: Iterable[dict[str, Any]], materials: dict[str, Material]) -> lis
 
 
 def _solids(row: dict[str, Any], materials: dict[str, Material]) -> Iterator[Primitive]:
-    """Solids of a row."""
     row = dict(row)
     for number in np.arange(*row.pop("repeat")) if "repeat" in row else (None,):
         values: list[Any] = [

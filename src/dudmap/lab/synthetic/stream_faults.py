@@ -73,7 +73,6 @@ class FaultyStream:
 
 
 def _span(times: NDArray[np.float64]) -> tuple[int, int]:
-    """First frame with the fault, and the first one after it."""
     return round(SPAN[0] * len(times)), round(SPAN[1] * len(times))
 
 
@@ -82,7 +81,6 @@ def _plain(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _altered(times: NDArray[np.float64], alter: Alteration) -> list[Delivery]:
-    """Alter all frames of the span."""
     first, stop = _span(times)
     return [item._replace(alter=alter) if first <= item.number < stop else item for item in _plain(times)]
 
@@ -134,7 +132,6 @@ def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -
 
 
 def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Delivery]:
-    """Frames of the span repeat the image before it."""
     first, _ = _span(times)
     kept: list[Frame] = []
 
@@ -171,7 +168,6 @@ def _half_size(frame: Frame) -> Frame:
 
 
 def _invalid(frame: Frame) -> Frame:
-    """Set random pixels to NaN, infinities and negative lengths."""
     rng = np.random.default_rng(round(1000 * frame.timestamp))
     values = rng.choice(np.array([np.nan, np.inf, -np.inf, -1.0], np.float32), frame.depth.shape)
     return replace(frame, depth=np.where(rng.random(frame.depth.shape) < INVALID_SHARE, values, frame.depth))

@@ -171,7 +171,6 @@ def _cross(a: Points, b: Points) -> Points:
 
 
 def _within(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
-    """Whether points (3, N) lie between two corners (3,) of a box."""
     inside = np.ones(points.shape[1], dtype=bool)
     for values, least, most in zip(points, low, high, strict=True):
         inside &= (values > least) & (values < most)

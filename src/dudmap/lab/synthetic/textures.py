@@ -142,7 +142,6 @@ def _poster(rng: np.random.Generator) -> Image:
 
 
 def _books(rng: np.random.Generator) -> Image:
-    """Four shelves of book spines with labels."""
     x, y = _grid()
     image = np.full((SIZE, SIZE, 3), 0.12)
     for part, v in zip(np.split(image, 4), np.split(np.mod(y * 4, 1), 4), strict=True):

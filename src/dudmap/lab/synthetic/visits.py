@@ -335,7 +335,6 @@ def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
 
 
 def _moved(T: Array, oriented: Array) -> Array:
-    """Points and normals (n, 6) after a rigid motion (4, 4)."""
     return np.hstack([oriented[:, :3] @ T[:3, :3].T + T[:3, 3], oriented[:, 3:] @ T[:3, :3].T])
 
 
@@ -350,7 +349,6 @@ def _views(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
 
 
 def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.int32]:
-    """Number of frames (V,) whose rays continue behind each vertex."""
     counts, camera = np.zeros(len(surface.vertices), np.int32), recording.camera
     for T_world_camera, depth in _shots(recording):
         T = se3.inverse(T_world_camera)
