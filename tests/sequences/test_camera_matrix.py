@@ -228,7 +228,7 @@ def test_a_camera_of_another_resolution_is_scaled(folder, size, factor):
     np.testing.assert_allclose(intrinsics_of(sequence), CAMERA)
     expected = f"params.json, scaled from {size[0]}x{size[1]} to 64x48 pixels"
     assert sequence.sources["intrinsics"] == expected
-    assert any(said.startswith(f"the camera is that of {expected}; if") for said in inspect(sequence).warnings)
+    assert any(said.startswith(f"the camera is taken from {expected}; if") for said in inspect(sequence).warnings)
 
 
 @pytest.mark.parametrize(

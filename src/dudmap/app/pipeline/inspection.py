@@ -307,7 +307,7 @@ def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | Non
 def _focal_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[str]:
     intrinsics = sources.get("intrinsics", "")
     if SCALED in intrinsics:
-        yield f"the camera is that of {intrinsics}; if the images are cut out of larger ones, give --camera"
+        yield f"the camera is taken from {intrinsics}; if the images are cut out of larger ones, give --camera"
     if not intrinsics.endswith(BY_NAME) or sequence.calibration is not None:
         return
     if "TUM" in intrinsics and sequence.timestamps[0] > TUM_ENDED:

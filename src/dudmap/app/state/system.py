@@ -146,5 +146,5 @@ def check_code(meta: dict[str, Any], path: Path) -> None:
     if meta.get("code") != code_fingerprint():
         raise StateError(
             f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "
-            f"expected {versions()}, or begin anew with dudmap run"
+            f"expected {versions()}, or begin again with dudmap run"
         )

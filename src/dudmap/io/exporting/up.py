@@ -222,8 +222,8 @@ def _contradiction(mesh: Mesh | None, poses: Trajectory, held: NDArray[np.float6
         and (angle := min(_angle(axis, guess.direction), _angle(-axis, guess.direction))) > 45
     ):
         return (
-            f"the camera may have been rolled: it turns about an axis {angle:.0f} degrees off what would be up, if it "
-            f"was upright; the axis is --up {_numbers(axis)} or {_numbers(-axis)}"
+            f"the camera may have been rolled: its rotation axis is {angle:.0f} degrees off the vertical of an upright "
+            f"camera; the axis is --up {_numbers(axis)} or {_numbers(-axis)}"
         )
     return ""
 

@@ -48,7 +48,7 @@ class MaskFolder:
         masks = _of_one_form([mask for mask in there if re.search(r"\d", mask.stem)])
         if not masks:
             raise DatasetError(
-                f"{path} holds no masks; expected PNG images named like those of the recording, or <timestamp>.png"
+                f"{path} holds no masks; expected PNG images named like the recording's images, or <timestamp>.png"
             )
         self._shape = camera.shape
         self._files = _by_name(masks, images)
