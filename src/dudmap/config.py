@@ -23,7 +23,7 @@ from dudmap.thesis_config import ThesisConfig
 
 
 def reading_sigma(z: Any, base: Any, scale: Any) -> Any:  # noqa: ANN401 - numbers or arrays
-    """Standard deviation of a depth reading at depth ``z``, metres (thesis eq. 3.91); the kernels compile this text."""
+    """Standard deviation of a measurement at depth ``z``, metres (thesis eq. 3.91); the kernels compile this text."""
     return base + scale * (z * z)
 
 
@@ -49,11 +49,11 @@ class SensorConfig(ConfigSection):
 
     @property
     def reference_sigma(self) -> float:
-        """Standard deviation of a depth reading at ``reference_depth``, metres."""
+        """Standard deviation of a depth measurement at ``reference_depth``, metres."""
         return float(self.sigma(self.reference_depth))
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
-        """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
+        """Standard deviation of a depth measurement, metres, at depth ``z`` in metres (a number or an array)."""
         return reading_sigma(z, self.sigma_base, self.sigma_scale)
 
 
@@ -61,13 +61,13 @@ class PreprocessConfig(ConfigSection):
     """Depth range, hole filling and smoothing of the depth image (thesis section 4.3)."""
 
     depth_min: float = Field(default=0.2, ge=0)
-    """Smallest valid depth, metres; nearer readings are ignored."""
+    """Smallest valid depth, metres; nearer measurements are ignored."""
     depth_max: float = Field(default=6.0, gt=0)
-    """Largest valid depth, metres; farther readings are ignored."""
+    """Largest valid depth, metres; farther measurements are ignored."""
     drop_mixed: bool = False
-    """Drop readings between foreground and background at depth edges (flying pixels), for sensors that give many."""
+    """Drop depth between foreground and background at depth edges (flying pixels), for sensors with many."""
     fill_holes: bool = True
-    """Fill pixels without a reading with the mean of their 5x5 neighbours, where these lie on one surface."""
+    """Fill pixels without depth with the mean of their 5x5 neighbours, if these lie on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11) or no filter."""
     filter_alpha: float = Field(default=0.012, gt=0)
@@ -121,7 +121,7 @@ class VolumeConfig(ConfigSection):
     truncation_behind_voxels: float = Field(default=4.0, ge=1, le=64)
     """Truncation distance behind a surface, voxels."""
     truncation_noise: float = Field(default=3.0, ge=0)
-    """Smallest truncation distance in standard deviations of the depth reading; 0 keeps it fixed."""
+    """Smallest truncation distance in standard deviations of the depth measurement; 0 keeps it fixed."""
     take_turns: bool = True
     """Integrate into a block only every second frame, with double weight, if the noise exceeds the voxel size."""
     max_weight: int = Field(default=255, ge=1, le=255)
@@ -195,7 +195,7 @@ class TrackerConfig(ConfigSection):
     constant_velocity: bool = True
     """Predict the pose with a constant-velocity model; otherwise start from the last pose."""
     min_inliers: float = Field(default=0.15, ge=0, le=1)
-    """Smallest share of the readings that lie on the map in a tracked frame."""
+    """Smallest share of the measurements that lie on the map in a tracked frame."""
     max_residual: float = Field(default=4.0, gt=0)
     """Largest robust root mean square of the distance residuals of a tracked frame, in standard deviations sigma(z) of
     a measurement, with or without ``noise_weighting``."""
@@ -237,7 +237,7 @@ class DynamicsConfig(ConfigSection):
     """Distance to the map above which method ``threshold`` labels a pixel as dynamic, metres, limited to the truncation
     distance. ReFusion's published code uses 10 cm / sqrt 2."""
     noise_threshold: float = Field(default=0.03, gt=0)
-    """Smallest distance to the static map of a dynamic reading, metres (theta in thesis eq. 4.57)."""
+    """Smallest distance to the static map of a dynamic measurement, metres (theta in thesis eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
     """The same distance in standard deviations of the measurement; the larger of the two applies."""
     pieces: bool = True
@@ -245,7 +245,7 @@ class DynamicsConfig(ConfigSection):
     settle_time: float = Field(default=1.5, gt=0, le=60)
     """Time for which an object must be at rest before it counts as static again and is fused, seconds."""
     max_share: float = Field(default=0.9, gt=0, le=1)
-    """Largest share of dynamic readings in a tracked frame; above it the frame is lost."""
+    """Largest share of dynamic measurements in a tracked frame; above it the frame is lost."""
     start_seconds: float = Field(default=1.0, ge=0)
     """Time after the first frame in which motion between images, with compensated ego-motion, also detects objects,
     seconds; the map has no free space yet. It is extended while this finds objects that the map does not reveal; 0
@@ -317,7 +317,7 @@ class SubmapsConfig(ConfigSection):
     patience: float = Field(default=1.0, ge=0)
     """Time since tracking was lost before a new submap is started, seconds."""
     min_readings: float = Field(default=0.2, ge=0, le=1)
-    """Smallest share of valid depth readings in the first frame of a submap."""
+    """Smallest share of valid depth pixels in the first frame of a submap."""
 
 
 class MoversConfig(ConfigSection):

@@ -74,7 +74,7 @@ def speed(
 
 
 def compile_(as_json: o.JsonOption = False) -> None:
-    """Compile all kernels anew, in a process of its own, and print for each its seconds and its callers."""
+    """Compile all kernels again, in a separate process, and print the seconds and callers of each."""
     from dudmap.lab.benchmark.compiling import compile_warmup, table
     from dudmap.lab.benchmark.measure import in_own_process
 

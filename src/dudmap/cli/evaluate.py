@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dudmap.evaluation.trajectory import Align
 
 Figures = dict[str, Any]
-"""Figures by name and unit; None for a figure that could not be computed."""
+"""Metrics by name and unit; None for a metric that could not be computed."""
 
 
 app = typer.Typer(
@@ -323,7 +323,7 @@ def _write_json(file: Path, figures: Figures) -> None:
 
 
 def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, shown: dict[str, str]) -> None:
-    """Print the figures, those in ``shown`` as they stand there, and hints below the table."""
+    """Print the metrics, with the texts in ``shown`` where given, and hints below the table."""
     if as_json:
         say(json.dumps(figures, allow_nan=False))
         return
@@ -343,7 +343,7 @@ def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, 
 
 
 def _shown(key: str, value: object) -> tuple[str, str]:
-    """Name and value of a figure for people: errors of a trajectory in millimetres and degrees."""
+    """Displayed name and value of a metric: errors of a trajectory in millimetres and degrees."""
     match = re.fullmatch(r"((?:ate|rpe|drift|rotation)_\w+?)_(m|deg)(?:_per_(m|s))?", key)
     if not isinstance(value, float) or match is None:
         digits = 16 if key == "time_offset_s" else 6

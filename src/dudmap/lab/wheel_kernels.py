@@ -45,7 +45,7 @@ def export(kernel: Dispatcher, folder: Path) -> None:
 
 
 def compile_level(noted: Path, folder: Path) -> None:
-    """Compile all kernels for the processor that Numba was told, and write them into a folder.
+    """Compile all kernels for the processor in Numba's settings, and write them into a folder.
 
     ``noted`` is the file of the argument types; the first process writes it, the others read it.
     """
@@ -65,7 +65,7 @@ def compile_level(noted: Path, folder: Path) -> None:
 
 
 def main(out: Path) -> None:
-    """Compile for each level in a process of its own, whose Numba takes nothing from the processor at hand."""
+    """Compile for each level in a separate process, whose Numba ignores the present processor."""
     with tempfile.TemporaryDirectory() as temporary:
         for level in SHIPPED:
             folder = out / shipped_kernels.VERSIONS / level

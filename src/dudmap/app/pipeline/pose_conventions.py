@@ -36,7 +36,7 @@ FURTHEST = 90
 FARTHEST = 50.0
 """Extent of the positions in metres beyond which they may be millimetres: a desk would be 500 wide."""
 STRIDE = 6
-"""Every so many pixels, across and down, are compared."""
+"""Step between compared pixels, across and down."""
 TOLERANCE = 0.03
 """Largest difference of depths that agree, metres at 1 m and in proportion beyond."""
 CLEARLY = 0.12
@@ -154,7 +154,7 @@ def _pairs(poses: Trajectory) -> list[tuple[int, int]]:
 
 
 def _agreeing(depth: NDArray, other: NDArray, T_camera_other: NDArray[np.float64], camera: "Camera") -> float:
-    """Share of the readings of another image (H, W) that a depth image (H, W) confirms, by their relative pose."""
+    """Share of the measurements in another image (H, W) that a depth image (H, W) confirms, by their relative pose."""
     v, u = np.mgrid[0 : camera.height : STRIDE, 0 : camera.width : STRIDE].reshape(2, -1)
     z = other[v, u].astype(np.float64)
     u, v, z = u[z > 0], v[z > 0], z[z > 0]

@@ -43,7 +43,7 @@ class _News:
 
 
 class LiveView(RunObserver):
-    """Shows a run in a window while it goes on.
+    """Shows a running run in a window.
 
     The thread of the run copies data into a slot, and another thread shows it. Later images replace images that were
     not taken in time, so that the run never waits for the page.

@@ -1,4 +1,4 @@
-"""Recording of live frames into an MCAP file of ROS 2 messages, in threads of its own."""
+"""Recording of live frames into an MCAP file of ROS 2 messages, in separate threads."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""The table of exporters: the ending of the target, or its whole name, tells the format. Trajectories as text."""
+"""Table of exporters: the suffix of the target, or its whole name, selects the format. Trajectories as text."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -56,14 +56,14 @@ EXPORTERS: dict[str, Exporter] = {
     ".csv": Exporter("trajectory, EuRoC", "exporters:write_euroc", _UPRIGHT),
     ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "ros_messages:write"),
 }
-"""Exporters by the name of the file, or its ending."""
+"""Exporters by the name of the file, or its suffix."""
 
 
 def find_exporter(name: str) -> Exporter:
     """Exporter for a file name.
 
     Raises:
-        ConfigError: The ending is unknown.
+        ConfigError: The suffix is unknown.
     """
     found = [key for key in EXPORTERS if (name.lower().endswith(key) if key.startswith(".") else name == key)]
     if not found:
@@ -75,7 +75,7 @@ def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None
     """Write the results of a run folder in the format given by the name of ``to``; return the path.
 
     Raises:
-        ConfigError: The ending is unknown, an option does not fit, or the format needs a library that is not installed.
+        ConfigError: The suffix is unknown, an option does not fit, or the format needs a library that is not installed.
         DatasetError: The folder is no run folder, is incomplete, or was written by a newer version.
         MapError: The map or the mesh cannot be read, or is empty.
         OSError: The file cannot be written.

@@ -86,7 +86,7 @@ def border_loops(faces: NDArray[np.int32]) -> list[NDArray[np.int32]]:
 
 
 def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
-    """Mesh with at most so many triangles, by quadric edge collapse (Garland and Heckbert 1997).
+    """Mesh with at most ``max_triangles`` triangles, by quadric edge collapse (Garland and Heckbert 1997).
 
     Vertices take colour and normal of the nearest vertex of the given mesh.
     """

@@ -90,7 +90,7 @@ class Recording(ABC):
     format = ""
     options: tuple[str, ...] = ()
     truth = ""
-    """Conversion of the published poses into the ground truth, if they are no camera poses in our axes."""
+    """Conversion of the published poses into the ground truth, unless they are camera poses in dudmap's axes."""
     suffix = ""
     """Suffix of the files, for formats of single files."""
     layout: tuple[str, ...] = ()

@@ -35,7 +35,7 @@ def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64]
         rotation_of: Rotation (3, 3) of vectors in a named frame into the depth camera, None if it is unknown.
 
     Raises:
-        DatasetError: There are IMUs, but none can be used; the sentence tells why.
+        DatasetError: There are IMUs, but none can be used; the message says why.
     """
     problems = []
     for connection in bag.connections:

@@ -313,7 +313,7 @@ def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - th
 
 
 def depth_of(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth image (H, W), metres, 0 = no reading, of an Image or CompressedImage; ``name`` is used in messages."""
+    """Depth image (H, W), metres, 0 = missing, of an Image or CompressedImage; ``name`` is used in messages."""
     if hasattr(message, "format"):
         return _compressed_depth(message, depth_scale, name)
     if message.encoding not in DEPTH_ENCODINGS:

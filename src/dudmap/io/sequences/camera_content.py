@@ -26,7 +26,7 @@ ALIASES = {
     "width": ("width", "image_width", "img_width", "w"), "height": ("height", "image_height", "img_height", "h"),
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
 }  # fmt: skip
-"""Our keys and their names in other programs, in lower case with underscores."""
+"""dudmap's keys and their names in other programs, in lower case with underscores."""
 PAIRS = {
     ("fx", "fy"): ("focal_length", "focal"), ("cx", "cy"): ("principal_point", "optical_center"),
     ("width", "height"): ("resolution", "image_size", "img_size", "size"),
@@ -59,7 +59,7 @@ NO_NAMES = ("px", "pixel", "pixels")
 
 
 def cameras_in(file: Path) -> list[tuple[str, Values]]:
-    """Names (lower case) and values by our keys of all cameras in a file; empty for other files.
+    """Names (lower case) and values by dudmap's keys of all cameras in a file; empty for other files.
 
     Raises:
         DatasetError: A camera has an unsupported lens model.

@@ -15,9 +15,9 @@ class Gravity(NamedTuple):
     """Directions against gravity in the axes of the depth camera.
 
     Attributes:
-        timestamps: (N,) times of the readings, seconds.
+        timestamps: (N,) times of the measurements, seconds.
         ups: (N, 3) unit vectors against gravity in the axes of the depth camera (x right, y down, z forward).
-        source: Of the readings: a file or topic.
+        source: Of the measurements: a file or topic.
     """
 
     timestamps: NDArray[np.float64]
@@ -28,14 +28,14 @@ class Gravity(NamedTuple):
     def of_rotations(
         cls, rotations: list[tuple[float, NDArray[np.float64]]], up: tuple[float, float, float], source: str
     ) -> "Gravity | None":
-        """Readings of timed rotations (3, 3) of the camera into a world whose direction against gravity is known."""
+        """Measurements from timed rotations (3, 3) of the camera into a world with a known up direction."""
         if not rotations:
             return None
         ups = np.array([np.asarray(up) @ R for _, R in rotations])
         return cls(np.array([stamp for stamp, _ in rotations]), ups, source)
 
     def in_world(self, poses: Trajectory) -> "MeasuredUp | None":
-        """The mean direction in the world of a run with these poses; None if no reading is near one of them."""
+        """The mean direction in the world of a run with these poses; None if no measurement is near one of them."""
         if not len(poses) or not len(self.timestamps):
             return None
         stamps = poses.timestamps
@@ -56,8 +56,8 @@ class MeasuredUp(NamedTuple):
 
     Attributes:
         direction: (3,) unit vector.
-        sigma_deg: Root mean square angle of the readings to it, degrees.
-        source: Of the readings.
+        sigma_deg: Root mean square angle of the measurements to it, degrees.
+        source: Of the measurements.
         readings: Their number.
     """
 

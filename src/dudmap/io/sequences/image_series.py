@@ -1,7 +1,7 @@
 """Recognition of colour and depth among the numbered images of a folder, by names and by content.
 
 A series is the set of images in one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in the
-names of files and folders decide first. If they do not tell, or contradict the content, the content decides: one
+names of files and folders decide first. If they are ambiguous, or contradict the content, the content decides: one
 channel of 16 bits or floats is depth, 8-bit colours are colour.
 """
 
@@ -123,9 +123,9 @@ def by_names(path: Path) -> Found:
 
 
 def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
-    """Pairs of colour and depth images, by content if names do not tell; empty if there are none.
+    """Pairs of colour and depth images, by content if names are ambiguous; empty if there are none.
 
-    A subfolder with images of both kinds is a recording of its own.
+    A subfolder with images of both kinds is a separate recording.
 
     Raises:
         DatasetError: Several series may be meant.

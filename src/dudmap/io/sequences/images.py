@@ -41,7 +41,7 @@ def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
 
 
 def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats."""
+    """Depth image (H, W) in metres, 0 = missing: 16-bit values over ``depth_scale``, or metres as floats."""
     return decode_depth(_bytes(path), depth_scale, str(path))
 
 
@@ -57,7 +57,7 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
 
 
 def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.float32]:
-    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = no reading."""
+    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = missing."""
     if image.dtype == np.uint16:
         return image.astype(np.float32) / np.float32(depth_scale)
     if image.dtype.kind == "f":

@@ -35,10 +35,11 @@ class NumberedSequence(ImageFolder):
     Args:
         path: The folder.
         camera: As for ``ImageFolder``.
-        color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, where their names do not tell.
+        color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, for ambiguous names.
 
     Raises:
-        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the truth cannot be understood.
+        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the ground truth is
+            malformed.
     """
 
     format = "numbered images"
@@ -71,7 +72,7 @@ class NumberedSequence(ImageFolder):
         return pairs if found["color"] else self._alone([depth for _, depth in pairs])
 
     def set_rate(self, fps: float) -> None:
-        """As for ``ImageFolder``; groundtruth.txt has times of its own."""
+        """As for ``ImageFolder``; groundtruth.txt has its own times."""
         super().set_rate(fps)
         self._take_truth()
 

@@ -1,7 +1,7 @@
 """Recordings of phone applications: Stray Scanner, ARKitScenes, Polycam, exports of Record3D, nerfstudio's form.
 
-ARKit gives depth of 256x192 pixels that shows the view of the colour image, and the confidence of every reading, 0 for
-the lowest. Readings of confidence 0 are left out, as Polycam's documentation advises.
+ARKit gives depth of 256x192 pixels that shows the view of the colour image, and the confidence of every pixel, 0 for
+the lowest. Pixels of confidence 0 are omitted, as Polycam's documentation advises.
 """
 
 import math
@@ -54,7 +54,7 @@ class StrayScannerSequence(ArkitFolder):
 
     Layout: https://github.com/strayrobots/scanner/blob/main/docs/format.md. ``rgb.mp4``, ``depth/000000.png`` (mm),
     ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv``, which gives the time of each frame;
-    its poses are estimates of ARKit and no truth.
+    its poses are estimates of ARKit and no ground truth.
     """
 
     format = "Stray Scanner"
@@ -83,7 +83,7 @@ class StrayScannerSequence(ArkitFolder):
 
     @cached_property
     def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The world of the odometry has y up; its poses have our camera axes."""
+        """The world of the odometry has y up; its poses have dudmap's camera axes."""
         file = self.path / "odometry.csv"
         header, *rows = (line.replace(" ", "").split(",") for line in read_text(file).splitlines() if line.strip())
         if not {"qx", "qy", "qz", "qw"} <= set(header):

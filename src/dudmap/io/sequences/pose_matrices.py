@@ -15,7 +15,7 @@ from dudmap.errors import DatasetError
 from dudmap.input_files import read_text
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between the camera axes of OpenGL (y up, z backward) and ours (y down, z forward)."""
+"""Between the camera axes of OpenGL (y up, z backward) and dudmap (y down, z forward)."""
 
 
 def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ LEAST_READINGS, LEAST_VALUES = 1000, 32
 MOST = 0.95
 """Smallest share of the measurements with a property of the images: the others may be damaged."""
 NEAR_SHARE = 0.8
-"""Least share of the readings below 8.19 m; their low three bits are 0."""
+"""Smallest share of measurements below 8.19 m; their low three bits are 0."""
 FARTHEST = 10000
 """Largest distance that depth cameras for rooms measure, mm. Values with low bits must decode to nearer distances. Low
 bits that number persons (Microsoft's first driver) decode to farther ones. A unit is wrong if a twentieth of the

@@ -50,7 +50,7 @@ def _caller() -> str:
 
 
 def compile_all(steps: list[tuple[str, Callable[[], object]]]) -> dict[str, Any]:
-    """Compile the kernels of all parts of the system into an empty folder; runs in a process of its own.
+    """Compile the kernels of all parts of the system into an empty folder; runs in a separate process.
 
     Returns:
         ``rows`` by kernel, the longest first: ``seconds`` of its thread, number of argument ``types``, the first

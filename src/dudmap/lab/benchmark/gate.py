@@ -27,7 +27,7 @@ FIGURES: dict[str, tuple[str, float, float]] = {
     "mesh_completeness": (">=", 0.0, 0.01),
     "ghost_area_m2": ("<=", 0.20, 0.02),
 }
-"""Recorded figures: whether smaller or larger is better, and the margins of a new file, relative and absolute."""
+"""Recorded metrics: whether smaller or larger is better, and the margins of a new file, relative and absolute."""
 HEAD = """\
 # Recorded figures of the accuracy gate; written by `dudmap benchmark gate --update`, reviewed by a person.
 # A figure may become worse by relative * recorded + absolute.
@@ -42,7 +42,7 @@ def gate_entries(fixtures: Path) -> list[Entry]:
 
 
 def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
-    """Figures of every recording, measured in this process."""
+    """Metrics of every recording, measured in this process."""
     rows = []
     for entry in entries:
         sequence = entry.open()
@@ -52,7 +52,7 @@ def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
 
 
 def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
-    """Compare every recorded figure of the measured recordings with its measured value.
+    """Compare every recorded metric of the measured recordings with its measured value.
 
     Returns:
         ``sequence``, ``figure``, ``recorded``, ``bound`` (worst value that passes), ``measured`` and ``passed``.
@@ -75,7 +75,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
 
 
 def load_figures(path: Path) -> dict[str, Any]:
-    """Content of the file: ``margins`` by figure, and ``figures`` by recording and figure."""
+    """Content of the file: ``margins`` by metric, and ``figures`` by recording and metric."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:
@@ -86,7 +86,7 @@ def load_figures(path: Path) -> dict[str, Any]:
 
 
 def save_figures(path: Path, rows: list[Row], margins: Mapping[str, Any] | None = None) -> None:
-    """Write the measured figures as the recorded ones; given margins replace the default ones."""
+    """Write the measured metrics as the recorded ones; given margins replace the default ones."""
     default = {figure: {"relative": relative, "absolute": part} for figure, (_, relative, part) in FIGURES.items()}
     figures = {
         row["sequence"]: {key: round(row[key], 6) for key in FIGURES if row.get(key) is not None} for row in rows

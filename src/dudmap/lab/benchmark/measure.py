@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 Row = dict[str, Any]
-"""One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
+"""One row of a table: sequence, system and metrics by name, or ``error`` with a sentence."""
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
 """Metrics of a trajectory; the drift is measured after aligning the first pose only."""
 COMPLETE_WITHIN = 0.02

@@ -1,4 +1,4 @@
-"""Report of a suite: measured figures, results of other systems and published figures in one document."""
+"""Report of a suite: measured metrics, results of other systems and published metrics in one document."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -17,7 +17,7 @@ from dudmap.lab.data import tables
 
 
 class Published(NamedTuple):
-    """One published figure: recording, system, key of our tables, value in their unit (m, m/s, deg/s), publication."""
+    """One published metric: recording, system, key in tables, value in their unit (m, m/s, deg/s), publication."""
 
     sequence: str
     system: str
@@ -27,7 +27,7 @@ class Published(NamedTuple):
 
 
 def published(sequences: Collection[str] | None = None) -> list[Published]:
-    """Published figures (``published.toml``) of all or of the given recordings, in the order of the data file."""
+    """Published metrics (``published.toml``) of all or of the given recordings, in the order of the data file."""
     content = tables("benchmark/published.toml")
     sources = content["sources"]
     return [
@@ -126,7 +126,7 @@ def _missing(suite: Suite) -> str:
 
 
 def comparison_tables(rows: list[Row], printed: list[Published], suite: Suite) -> str:
-    """One Markdown table per published figure: measured systems in bold, then published ones with their source."""
+    """One Markdown table per published metric: measured systems in bold, then published ones with their source."""
     text, sources = "", list(dict.fromkeys(value.source for value in printed))
     for column in COLUMNS:
         values = [value for value in printed if value.metric == column.key]

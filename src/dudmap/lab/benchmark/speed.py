@@ -100,7 +100,7 @@ def _open3d_figures(python: Path, recording: Path | None, frames: int) -> list[S
 
 
 def markdown(figures: list[SpeedFigure]) -> str:
-    """The figures as a Markdown table."""
+    """Markdown table of the results."""
     body = []
     for what, unit, target, measured, remark in figures:
         reached = measured is not None and target is not None and measured <= target

@@ -49,7 +49,7 @@ RESPONSES = {
     "ms": Response("ms_per_frame_median", "time per frame", "ms"),
     "memory": Response("peak_rss_mb", "peak memory", "MB"),
 }
-"""Responses by name; ``docs/evaluation.md`` defines the figures."""
+"""Responses by name; ``docs/evaluation.md`` defines the metrics."""
 
 
 class Scale(NamedTuple):

@@ -1,4 +1,4 @@
-"""The runs of a study: each in a worker process, and its figures in the study folder as soon as it ends."""
+"""The runs of a study: each in a worker process, and its metrics in the study folder as soon as it ends."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence as Recording
 
 Conduct = Callable[[Sequence[Run]], list[Row]]
-"""Does runs, equal ones once, and returns the figures of each in their order."""
+"""Does runs, equal ones once, and returns the metrics of each in their order."""
 CACHED_BYTES = 300e6
 """Most bytes of frames of a recording that a worker keeps between runs."""
 PIXEL_BYTES = 8
@@ -44,9 +44,9 @@ def conduct(
     progress: Callable[[int, int], None] = lambda done, total: None,
     measure: Callable[[Job], Row] | None = None,
 ) -> list[Row]:
-    """Do all runs that have no figures yet, so many ``jobs`` at a time; see ``Conduct``.
+    """Do all runs that have no metrics yet, ``jobs`` at a time; see ``Conduct``.
 
-    ``runs.jsonl`` in the folder ``root`` holds the figures of all runs so far by their keys. A run that fails has the
+    ``runs.jsonl`` in the folder ``root`` holds the metrics of all runs so far by their keys. A run that fails has the
     sentence ``error`` instead. With ``keep`` the run folders stay in ``runs/``. ``measure`` replaces the system.
     """
     unique = {run.key: run for run in runs}
@@ -68,7 +68,7 @@ def conduct(
 
 
 def table_of(runs: Sequence[Run], rows: Sequence[Row]) -> Table:
-    """One row per run: number of the point, recording, replicate, values of the factors, figures or error."""
+    """One row per run: number of the point, recording, replicate, values of the factors, metrics or error."""
     import pandas as pd
 
     places = ({"point": run.point, "sequence": run.sequence, "replicate": run.replicate, **run.values} for run in runs)
@@ -76,7 +76,7 @@ def table_of(runs: Sequence[Run], rows: Sequence[Row]) -> Table:
 
 
 def measure_run(job: Job) -> Row:
-    """Figures of one run of the system.
+    """Metrics of one run of the system.
 
     Frames are not prepared ahead in a second thread, so that the time per frame is all the time a frame takes.
     """

@@ -1,4 +1,4 @@
-"""Simulation of a depth and colour sensor: seeded noise, quantisation, occlusion shadows and missing readings."""
+"""Simulation of a depth and colour sensor: seeded noise, quantisation, occlusion shadows and missing depth."""
 
 import numpy as np
 
@@ -16,10 +16,10 @@ def _mix(a, b, key):
 
 @compiled(fastmath=False)
 def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal, model, depth):
-    """Depth readings of a disparity sensor in the rows [row_from, row_to); ``model`` is ``sensors.SensorModel.row``.
+    """Depth measured by a disparity sensor in the rows [row_from, row_to); ``model`` is ``sensors.SensorModel.row``.
 
     exact, cosines (H, W) float32; smooth (S, S) float32 periodic correlated noise of unit variance, S a power of two;
-    offsets (4, 2) into it for this frame; key uint64; depth (H, W) float32 output, 0 = no reading.
+    offsets (4, 2) into it for this frame; key uint64; depth (H, W) float32 output, 0 = missing.
     """
     height, width = exact.shape
     wrap = smooth.shape[0] - 1
@@ -31,7 +31,7 @@ def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal,
     lit = np.empty(2 * width + 2, np.float32)
     for v in range(row_from, row_to):
         for u in range(width):
-            # Lateral noise: the reading belongs to a ray shifted by a fraction of a pixel.
+            # Lateral noise: the measurement belongs to a ray shifted by a fraction of a pixel.
             a = smooth[(v + offsets[0, 0]) & wrap, (u + offsets[0, 1]) & wrap]
             b = smooth[(v + offsets[1, 0]) & wrap, (u + offsets[1, 1]) & wrap]
             x = min(max(int(np.floor(u + lateral * a + 0.5)), 0), width - 1)
@@ -110,7 +110,7 @@ def measure_color(row_from, row_to, exact, table, key, sigma, color):
 
 @compiled(fastmath=False)
 def measure_range(row_from, row_to, exact, cosines, smooth, offsets, key, model, depth):
-    """Depth readings of a time-of-flight sensor in the rows; ``model`` is ``sensors.TimeOfFlightModel.row``.
+    """Depth measured by a time-of-flight sensor in the rows; ``model`` is ``sensors.TimeOfFlightModel.row``.
 
     Arguments as of ``measure_depth``. The standard deviation is (s0 + s1 z + s2 z^2) plus
     s_angle z^1.5 (theta / (pi/2 - theta))^2, theta the angle of incidence.
