@@ -1,1 +1,1 @@
-"""The operations on images and voxels (``spec.py``), on a CPU (``cpu``) and on an NVIDIA GPU (``warp``)."""
+"""Operations on images and voxels (``spec.py``), on a CPU (``cpu``) and on an NVIDIA GPU (``warp``)."""

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps of a registration on one level of the pyramid (Marquardt 1963)."""
+"""Levenberg-Marquardt descent of a registration on one pyramid level (Marquardt 1963)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from dudmap.core.formulas.damping import accelerated, damped_step, judged, moved
 
 
 class DescentRules(NamedTuple):
-    """How the steps of a registration begin, and when they end.
+    """Start and stop rules of a descent.
 
     Attributes:
         basis: (6, m) directions of a twist along which the pose may move.
         damping: First damping, relative to the diagonal of H.
-        max_steps: Largest number of steps that are tried.
+        max_steps: Largest number of trial steps.
         stop: Norm of a step (m, rad) below which it is the last one.
-        stop_gain: Relative change of the cost below which a short step is.
+        stop_gain: Relative change of the cost below which a short step is the last one.
     """
 
     basis: NDArray[np.float64]
@@ -29,11 +29,11 @@ class DescentRules(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """Result of the steps of a registration.
+    """Result of a descent.
 
     Attributes:
         T_world_camera: (4, 4) the last accepted pose.
-        equations: Normal equations of the last accepted step; the first ones where none was.
+        equations: Normal equations of the last accepted step; the first ones if no step was accepted.
         iterations: Number of linearisations.
         settled: Whether a stop criterion was met.
     """
@@ -50,19 +50,19 @@ def descend(
     first: NormalEquations | None,
     rules: DescentRules,
 ) -> Descent:
-    """Steps whose damping is scaled by the diagonal of H, accelerated; one is accepted if it decreases the cost.
+    """Accelerated Levenberg-Marquardt steps; a step is accepted if it decreases the cost.
 
-    Whether it does is said by the mean of the gradients before and after it (trapezoidal rule): the costs also change
-    by the readings that enter and leave the map, all of them together by half a percent, and short steps change them
-    by less.
+    The change of the cost is estimated from the mean of the gradients before and after the step (trapezoidal rule). The
+    costs are unsuitable: pixels that enter or leave the map change their sum by half a percent, more than short steps
+    do.
 
     The CPU has the same loop as one compiled call (``cpu/registration.py``).
 
     Args:
-        linearize: Gives the normal equations at a pose (4, 4).
+        linearize: Returns the normal equations at a pose (4, 4).
         T_world_camera: (4, 4) first pose.
-        first: Normal equations there; None where they are not known yet.
-        rules: Beginning and end.
+        first: Normal equations at the first pose; None if unknown.
+        rules: Start and stop rules.
     """
     T, damping, used = T_world_camera, rules.damping, int(first is None)
     system, last, taken = linearize(T) if first is None else first, np.zeros(6), np.zeros(6)

@@ -1,6 +1,6 @@
-"""Choice of the compute device: the CPU, or an NVIDIA GPU by Warp (extra ``gpu``).
+"""Choice of the compute device: the CPU, or an NVIDIA GPU with Warp (extra ``gpu``).
 
-Warp is imported only where a GPU is asked for or may be there; the driver is asked first, by its own library.
+Warp is imported only if a GPU is requested or may be present. The driver is checked first, through its own library.
 """
 
 import ctypes
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OLDEST_DRIVER = (13, 0)
-"""Version of CUDA that the driver must support for the wheels of Warp from 1.19 on."""
+"""CUDA version that the driver must support for the wheels of Warp from 1.19."""
 OLDEST_RELEASE = 580
-"""First driver that supports it."""
+"""First driver that supports this version."""
 OLDEST_GPU = 75
 """Oldest compute capability, times ten, that CUDA 13 compiles for."""
 
 
 class DeviceWarning(RuntimeWarning):
-    """The CPU computes what a GPU was to compute."""
+    """The CPU replaces an unusable GPU."""
 
 
 def make_backend(device: str) -> Backend:
     """A new back end on a device, or on the CPU if the device has failed in this process.
 
     Args:
-        device: As of ``resolve``.
+        device: As for ``resolve``.
 
     Raises:
-        ConfigError: There is no such device, or it does not work.
+        ConfigError: The device does not exist or does not work.
     """
     name = resolve(device)
     if name == "cpu":
@@ -53,15 +53,15 @@ def make_backend(device: str) -> Backend:
 
 
 def resolve(device: str, *, adaptive: bool = False) -> str:
-    """Name of the device that is meant, "cpu", "warp-cpu" or "cuda:N"; "cpu" for one that has failed in this process.
+    """Name of the selected device, "cpu", "warp-cpu" or "cuda:N"; "cpu" for a device that has failed in this process.
 
     Args:
-        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
-            the CPU; "warp-cpu" for the kernels of the GPU on the CPU, for tests.
-        adaptive: Whether it is for a map with several voxel sizes, which the CPU alone computes.
+        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU if one works, else
+            the CPU; "warp-cpu" for the GPU kernels on the CPU, for tests.
+        adaptive: Whether the map has several voxel sizes, which only the CPU supports.
 
     Raises:
-        ConfigError: There is no such device, or it does not work, or not with such a map.
+        ConfigError: The device does not exist, does not work, or does not support such a map.
     """
     if adaptive and device not in ("cpu", "auto"):
         raise ConfigError(
@@ -74,7 +74,6 @@ def resolve(device: str, *, adaptive: bool = False) -> str:
 
 @cache
 def _resolved(device: str) -> str:
-    """Name of the device that is meant."""
     if device == "cpu":
         return device
     if device == "warp-cpu":
@@ -96,7 +95,7 @@ def _resolved(device: str) -> str:
 
 
 def _first_that_starts() -> str:
-    """The first GPU, or the CPU where that does nothing, with a warning."""
+    """The first GPU, or with a warning the CPU if the GPU does not work."""
     name = f"cuda:{supported_gpus()[0]}"
     if failure := start_failure(name):
         warnings.warn(f"{name} cannot be used ({failure}); the CPU is", DeviceWarning, stacklevel=5)
@@ -105,7 +104,7 @@ def _first_that_starts() -> str:
 
 
 def obstacle() -> str:
-    """Why no GPU can be used, as part of a sentence; empty where one can."""
+    """Reason why no GPU can be used, as part of a sentence; empty if one can."""
     version = driver_version()
     if version is None:
         return "no NVIDIA driver was found"
@@ -128,7 +127,7 @@ def obstacle() -> str:
 
 @cache
 def start_failure(device: str) -> str:
-    """Why a device does nothing, such as one whose memory other programs fill; empty where it works."""
+    """Reason why a device does not start, for example because other programs fill its memory; empty if it works."""
     _load_warp()
     import warp as wp  # pyright: ignore[reportMissingImports]
 
@@ -140,7 +139,7 @@ def start_failure(device: str) -> str:
 
 
 def _driver() -> ctypes.CDLL | None:
-    """Library of the NVIDIA driver; None where there is none."""
+    """Library of the NVIDIA driver; None without a driver."""
     try:
         return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -149,7 +148,7 @@ def _driver() -> ctypes.CDLL | None:
 
 @cache
 def driver_version() -> tuple[int, int] | None:
-    """Newest version of CUDA that the driver supports; None without a driver."""
+    """Newest CUDA version that the driver supports; None without a driver."""
     library, version = _driver(), ctypes.c_int(0)
     if library is None or library.cuDriverGetVersion(ctypes.byref(version)) != 0:
         return None
@@ -158,7 +157,7 @@ def driver_version() -> tuple[int, int] | None:
 
 @cache
 def warp_failure() -> str:
-    """Why Warp, which is installed, does not start, as part of a sentence; empty where it does."""
+    """Reason why the installed Warp does not start, as part of a sentence; empty if it does."""
     try:
         _load_warp()
     except (ImportError, OSError, RuntimeError) as error:
@@ -168,7 +167,7 @@ def warp_failure() -> str:
 
 @cache
 def supported_gpus() -> list[int]:
-    """Numbers of the GPUs that Warp finds and supports."""
+    """Numbers of the GPUs that Warp supports."""
     _load_warp()
     import warp as wp  # pyright: ignore[reportMissingImports]
 
@@ -185,7 +184,7 @@ def _need_warp(device: str) -> None:
 
 @cache
 def _load_warp() -> None:
-    """Start Warp without its greeting, and without its warning where there is no driver."""
+    """Start Warp without its greeting, and without its warning if there is no driver."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING
@@ -195,7 +194,7 @@ def _load_warp() -> None:
 
 @contextmanager
 def _silent_stderr(silent: bool) -> "Iterator[None]":
-    """Discard what a library writes to the standard error, if ``silent``."""
+    """Discard output of a library to the standard error, if ``silent``."""
     if not silent:
         yield
         return

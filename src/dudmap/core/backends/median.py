@@ -1,4 +1,4 @@
-"""Median of few values, ten times as fast as NumPy's, and what kernels find it with."""
+"""Median of few values, ten times as fast as NumPy's, and selection for kernels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,10 @@ def median(rows: NDArray) -> NDArray:
 
 @scalar
 def nth(values: NDArray[np.floating], k: int) -> float:
-    """Value number ``k`` of finite ones (n,) in ascending order, by Hoare's selection; compiles in a tenth of the time
-    of NumPy's partition."""
+    """Value number ``k`` of finite values (n,) in ascending order, by Hoare's selection.
+
+    It compiles in a tenth of the time of NumPy's partition.
+    """
     left, right, v = 0, len(values) - 1, values.copy()
     while left < right:
         pivot, i, j = v[(left + right) // 2], left, right

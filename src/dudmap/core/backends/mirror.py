@@ -1,4 +1,4 @@
-"""An array in the host's memory of which a back end may keep a copy on a device."""
+"""Host array with an optional copy on a device."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ from numpy.typing import NDArray
 
 
 class Mirror:
-    """An array, and the copy of it that a back end may attach; rows move when one side needs what the other wrote.
+    """Host array and the copy that a back end may attach; rows are transferred when the other side needs them.
 
-    On the CPU there is no copy, and this is the array alone.
+    On the CPU there is no copy.
 
     Args:
-        array: The array in the host's memory.
+        array: The array in host memory.
 
     Attributes:
-        array: The array without what only the device has written.
-        used: Number of rows in use, from the first on; the others are spare, and a device needs no copy of them.
+        array: The host array, without rows that only the device has written.
+        used: Number of leading rows in use; the device needs no copy of the others.
         copy: Copy on a device (``RowCopy``); None = none.
     """
 
@@ -26,13 +26,13 @@ class Mirror:
 
     @property
     def host(self) -> NDArray:
-        """The array, up to date; whoever writes to it calls ``wrote``."""
+        """The array, up to date; call ``wrote`` after changing it."""
         if self.copy is not None:
             self.copy.pull(self.array)
         return self.array
 
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
-        """Rows (n,), or all of them, have been written in the host's memory."""
+        """Mark rows (n,), or all rows, as written in host memory."""
         if self.copy is not None:
             self.copy.host_wrote(rows)
 
@@ -42,19 +42,19 @@ class Mirror:
         self.wrote(rows)
 
     def grow(self, capacity: int) -> None:
-        """Make room for ``capacity`` rows, the new ones holding 0."""
+        """Grow to ``capacity`` rows; new rows are 0."""
         self.array = grown(self.array, capacity, 0)
 
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
-    """An array as it is, and a mirror's array up to date."""
+    """An array unchanged, or the up-to-date array of a mirror."""
     if not isinstance(array, Mirror):
         return array
     return array.array if array.copy is None else array.host
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:
-    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
+    """Copy of ``array`` with ``capacity`` rows; new rows hold ``value``."""
     shape = (capacity, *array.shape[1:])
     out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
     out[: len(array)] = array

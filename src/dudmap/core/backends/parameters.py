@@ -1,7 +1,7 @@
-"""Named inputs, parameters and results of the operations of a back end (``core/backends/spec.py``).
+"""Inputs, parameters and results of the back-end operations (``core/backends/spec.py``).
 
-Numba compiles named tuples as they are. Tuples of parameters hold floats only: ``single`` makes them the float32 values
-that the loops calculate with.
+Numba compiles named tuples directly. Tuples of parameters hold only floats; ``single`` converts them to float32 for
+loops.
 """
 
 from functools import lru_cache
@@ -15,25 +15,25 @@ from dudmap.core.backends.mirror import Mirror, on_host
 BLOCK = 8
 """Voxels along the edge of a block."""
 UNKNOWN, SURFACE, FREE = 0, 1, 2
-"""Occupancy of a point: unknown, near a surface, in confirmed free space."""
+"""Occupancy of a point: unknown, near a surface, in known free space."""
 
 Parameters = TypeVar("Parameters", bound=tuple)
 
 
 @lru_cache(maxsize=64, typed=True)
 def single(parameters: Parameters) -> Parameters:
-    """The same tuple, also of nested ones, with every number as float32; made once for equal ones of one type."""
+    """The tuple, including nested ones, with every number as float32; cached per type and value."""
     make: Any = type(parameters)
     return make(*(single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters))
 
 
 class SensorNoise(NamedTuple):
-    """Standard deviation of a depth reading: sigma(z) = base + scale z^2 (thesis eq. 3.91).
+    """Standard deviation of a depth measurement: sigma(z) = base + scale z^2 (thesis eq. 3.91).
 
     Attributes:
         base: Metres.
         scale: 1/m.
-        reference: Depth, metres, of the readings whose noise others are compared with.
+        reference: Reference depth, metres, at which noise is compared.
     """
 
     base: float
@@ -42,13 +42,13 @@ class SensorNoise(NamedTuple):
 
 
 class TruncationBand(NamedTuple):
-    """Band around a reading in which distances are stored; ``core/formulas/pixel.py`` has its width at a depth.
+    """Band around a surface in which distances are stored; ``core/formulas/pixel.py`` computes its width at a depth.
 
     Attributes:
         front, behind: Smallest width on either side of the surface, metres.
-        sigmas: The band is at least this many standard deviations of the reading wide.
+        sigmas: Smallest width, standard deviations of the depth.
         limit: Largest distance that a voxel can store, metres.
-        noise: Of the sensor.
+        noise: Noise of the sensor.
     """
 
     front: float
@@ -65,11 +65,11 @@ class FusionParameters(NamedTuple):
         band: Truncation band.
         voxel_size: Edge of a voxel, metres.
         sdf_unit: Metres per step of the stored distance.
-        depth_unit: Metres per step of a reading in its 16-bit form.
+        depth_unit: Metres per step of 16-bit depth.
         max_weight: Cap of a voxel's weight.
-        max_readings: A reading raises a voxel's weight to at most this many times its own.
+        max_readings: Cap of a voxel's weight as a multiple of the weight of the fused measurement.
         carve_rate: Weight of an observation of emptiness in a voxel that holds a surface.
-        depth_min, depth_max: Range of the readings, metres.
+        depth_min, depth_max: Depth range, metres.
     """
 
     band: TruncationBand
@@ -87,9 +87,10 @@ class RegistrationParameters(NamedTuple):
     """Parameters of the robust cost of a registration (thesis eq. 4.32-4.46).
 
     Attributes:
-        band: Truncation band; readings farther from the surface are outliers.
+        band: Truncation band; pixels farther from the surface are outliers.
         huber, tukey: Constants of the distance residual, metres at the reference depth; tukey = 0 selects Huber.
-        color_weight, color_huber: Of the intensity residual (0..1), in the range from ``darkest`` to ``brightest``.
+        color_weight, color_huber: Weight and Huber constant of the intensity residual (0..1), used in the range from
+            ``darkest`` to ``brightest``.
         sigma_at_reference, noise_weighting: 1 scales each distance residual by this sigma (m) / sigma(z), 0 does not.
     """
 
@@ -105,16 +106,16 @@ class RegistrationParameters(NamedTuple):
 
 
 class ColorProjection(NamedTuple):
-    """How points of the depth camera reach the image of the colour camera (``cpu/color_registration.py``).
+    """Projection of points of the depth camera into the colour image (``cpu/color_registration.py``).
 
     Attributes:
-        place, speed, bend: (3, 4) float32; a point X lies at place X - tau speed X + tau^2 / 2 bend X at the time tau.
+        place, speed, bend: (3, 4) float32; point X is at place X - tau speed X + tau^2 / 2 bend X at time tau.
         intrinsics: (4,) float32 of the colour camera.
         distortion: (5,) float32 k1, k2, p1, p2, k3 of the colour camera.
-        offset: Time of the middle row of the colour image minus that of the depth image, s.
+        offset: Time of the middle row of the colour image minus time of the middle row of the depth image, s.
         readout: Time from the first to the last row of the colour image, s.
         height: Rows of the colour image.
-        vignetting: Logarithm of the brightness in the middle of the colour image over that in its corners.
+        vignetting: Logarithm of the brightness in the middle of the colour image over the brightness in its corners.
     """
 
     place: NDArray[np.float32]
@@ -142,8 +143,8 @@ class MeshParameters(NamedTuple):
     Attributes:
         voxel_size: Edge of a voxel, metres.
         sdf_unit: Metres per step of the stored distance.
-        min_weight: Cells with a corner of less weight are left out (at least 1).
-        max_jump: Cells across which the distance changes by more than this hold no surface, metres.
+        min_weight: Smallest weight of the corners of a meshed cell (at least 1).
+        max_jump: Largest change of the distance within a meshed cell, metres.
     """
 
     voxel_size: float
@@ -156,13 +157,13 @@ class FilterParameters(NamedTuple):
     """Parameters of the preprocessing of a depth image (thesis section 4.3).
 
     Attributes:
-        depth_min, depth_max: Range of the readings that are kept, metres.
-        drop_mixed: Whether readings between foreground and background are dropped.
+        depth_min, depth_max: Depth range that is kept, metres.
+        drop_mixed: Whether pixels between foreground and background are dropped.
         steepest: Depth step per pixel of the steepest surface that is kept, as a share of the depth.
         fill_holes: Whether small holes are filled.
-        hole_noise: Readings around a small hole may always differ by this much, metres.
+        hole_noise: Depth difference around a small hole that is always allowed, metres.
         smooth: Whether the bilateral filter is applied.
-        alpha: sigma_c = alpha z^2 of the bilateral filter, and the spread allowed around a hole likewise, 1/m.
+        alpha: sigma_c = alpha z^2 of the bilateral filter, and allowed depth difference around a hole, 1/m.
         sigma_px: Spatial standard deviation, pixels.
         radius: Half width of the window, pixels.
     """
@@ -187,7 +188,7 @@ class FilterParameters(NamedTuple):
 class VoxelGrid(NamedTuple):
     """The blocks of the map around the view.
 
-    Voxels and window are arrays, or mirrors of arrays of which a back end may keep a copy on a device.
+    Voxels and window are arrays, or mirrors with a copy on a device.
 
     Attributes:
         window: (Wx * Wy * Wz,) int32: slot of the voxels of a block; -1 = unknown; -2 - entry = without voxels.
@@ -227,10 +228,10 @@ def to_lattice(
 
 
 class DepthTiles(NamedTuple):
-    """Nearest and farthest reading and share of pixels with one, per tile of 8x8 pixels.
+    """Depth range and share of pixels with depth, per tile of 8x8 pixels.
 
     Attributes:
-        nearest, farthest: (h, w) float32, metres; inf and 0 without a reading.
+        nearest, farthest: (h, w) float32, metres; inf and 0 without depth.
         valid: (h, w) float32 in [0, 1].
     """
 
@@ -240,16 +241,16 @@ class DepthTiles(NamedTuple):
 
 
 class DepthView(NamedTuple):
-    """A depth image to be fused, at a known pose.
+    """A depth image to fuse, at a known pose.
 
     Attributes:
         depth: (H, W) float32, metres, 0 = none.
         color: (H, W, 3) uint8.
-        used: (H, W) bool, readings to be fused; the others change nothing.
-        weights: (H, W) uint8 weight of each reading; None = cos(theta) / sigma(z) (thesis eq. 4.20).
+        used: (H, W) bool, pixels to fuse; the others change nothing.
+        weights: (H, W) uint8 weight of each pixel; None = cos(theta) / sigma(z) (thesis eq. 4.20).
         intrinsics: (4,) float32 fx, fy, cx, cy.
         T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
-        T_camera_world: (3, 4) float32, world to camera, metres, from the local origin of the window.
+        T_camera_world: (3, 4) float32, world to camera, metres, relative to the local origin of the window.
         T_world_camera: (4, 4) float64, camera to the world of the map.
     """
 
@@ -269,7 +270,7 @@ class LevelImage(NamedTuple):
     Attributes:
         depth: (h, w) float32, metres, 0 = none.
         intensity: (h, w) float32 in [0, 1].
-        weights: (h, w) float32 static weights in [0, 1]; ``sample`` needs none.
+        weights: (h, w) float32 static weights in [0, 1]; not used by ``sample``.
         intrinsics: (4,) float32 fx, fy, cx, cy.
     """
 
@@ -280,7 +281,7 @@ class LevelImage(NamedTuple):
 
 
 class FreeSpace(NamedTuple):
-    """Which blocks without voxels are observed to be empty: those in every second plane of the window.
+    """Selection of blocks without voxels that are observed as empty: every second plane of the window.
 
     Attributes:
         parity: 0 or 1, the first plane.
@@ -298,8 +299,8 @@ class BlockVisit(NamedTuple):
         candidates: (n,) int32 slots that may be in view.
         fused: (slots,) uint8 frames that were fused into each slot.
         turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
-        repeats: Number of equal frames that this one stands for.
-        free_space: Which empty blocks to observe; None = none.
+        repeats: Number of equal frames that this frame stands for.
+        free_space: Selection of the empty blocks to observe; None = none.
     """
 
     candidates: NDArray[np.int32]
@@ -310,12 +311,12 @@ class BlockVisit(NamedTuple):
 
 
 class TouchedBlocks(NamedTuple):
-    """An image prepared for the fusion, and what it touches.
+    """An image prepared for fusion, and the blocks that it touches.
 
     Attributes:
         cells: (n,) int32, ascending, window cells of blocks without voxels that its truncation bands touch.
-        depth: (H, W) float32, metres, the readings to be fused, 0 = none.
-        weights: (H, W) uint8, weight of each.
+        depth: (H, W) float32, metres, depth to fuse, 0 = none.
+        weights: (H, W) uint8, weight of each pixel.
         tiles: Depth ranges of the tiles of the image.
     """
 
@@ -330,9 +331,8 @@ class FusedBlocks(NamedTuple):
 
     Attributes:
         slots: (n,) int32.
-        occupied: (n,) int32 voxels of each that hold a surface or were never seen.
-        empty: (m,) int32 window cells without an entry that were seen to be empty; their observations are the
-            caller's to store.
+        occupied: (n,) int32 voxels of each that hold a surface or were never observed.
+        empty: (m,) int32 window cells without an entry that were observed as empty; the caller stores them.
     """
 
     slots: NDArray[np.int32]
@@ -341,7 +341,7 @@ class FusedBlocks(NamedTuple):
 
 
 class ImageStack(Protocol):
-    """Images of one size by number: an array (n, h, w), or images on a device, each brought over when it is read."""
+    """Images of one size by number: an array (n, h, w), or images on a device, downloaded when they are read."""
 
     def __getitem__(self, number: int, /) -> NDArray[np.float32]:
         """Image (h, w)."""
@@ -354,10 +354,10 @@ class NormalEquations(NamedTuple):
     Attributes:
         H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
         b: (6,) float64, gradient of the cost.
-        cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
-        num_inliers: Readings on the map.
-        readings: Sum of the static weights of all readings.
-        weight: Sum of the static weights of the readings on the map.
+        cost: Robust cost; pixels off the map add a constant, so that poses can be compared.
+        num_inliers: Number of pixels on the map.
+        readings: Sum of the static weights of all pixels with depth.
+        weight: Sum of the static weights of the pixels on the map.
         chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
         residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
     """
@@ -376,9 +376,9 @@ class MapSample(NamedTuple):
     """The map at the points of a depth image.
 
     Attributes:
-        distance: (h, w) float32 signed distance in metres, NaN where the map has none.
-        difference: (h, w) float32 map minus image intensity (0..1), NaN where the map has none.
-        occupancy: (h, w) uint8: UNKNOWN (also without a reading), SURFACE or FREE.
+        distance: (h, w) float32 signed distance in metres, NaN if unknown.
+        difference: (h, w) float32 map minus image intensity (0..1), NaN if unknown.
+        occupancy: (h, w) uint8: UNKNOWN (also without depth), SURFACE or FREE.
     """
 
     distance: NDArray[np.float32]
@@ -387,12 +387,12 @@ class MapSample(NamedTuple):
 
 
 class RaycastResult(NamedTuple):
-    """The map seen from a pose: the thesis' artificial camera view.
+    """The map rendered at a pose: the thesis' artificial camera view.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 where no surface is hit.
+        depth: (H, W) float32, metres, 0 = no surface.
         color: (H, W, 3) uint8.
-        normals: (H, W, 3) float32, world frame, unit length, 0 where no surface is hit.
+        normals: (H, W, 3) float32, world frame, unit length, 0 = no surface.
     """
 
     depth: NDArray[np.float32]

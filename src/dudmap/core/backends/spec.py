@@ -1,4 +1,4 @@
-"""The operations that the system asks of a compute device: arrays and one tuple of parameters in, arrays out."""
+"""Operations of a compute device: arrays and one tuple of parameters in, arrays out."""
 
 from typing import Protocol
 
@@ -23,9 +23,9 @@ from dudmap.core.backends.parameters import (
 class Backend(Protocol):
     """Operations of a compute device.
 
-    A back end may reuse buffers between calls, so each map has one of its own, and calls on one must not run at the
-    same time. Results do not depend on the number of threads. Images are prepared, labels found, meshes and views of
-    the map made on the CPU, whatever the device.
+    A back end may reuse buffers between calls. Therefore each map has its own back end, and calls on one must not run
+    concurrently. Results do not depend on the number of threads. The CPU prepares images, finds labels, and makes
+    meshes and views on every device.
     """
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -39,20 +39,22 @@ class Backend(Protocol):
         frame_number: int,
         parameters: FusionParameters,
     ) -> TouchedBlocks:
-        """Prepare an image for the fusion, and find the blocks without voxels that its truncation bands touch.
+        """Prepare an image for fusion, and find the blocks without voxels that its truncation bands touch.
 
-        ``stamps`` (cells,) hold the numbers, which increase, of the frames that last found a cell, and are changed;
-        ``free_after`` observations make a block known free space.
+        Args:
+            stamps: (cells,) number of the last frame that found each cell, increasing; changed here.
+            free_after: Observations that make a block known free space.
         """
         ...
 
     def fuse(
         self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
-        """Average an image into the voxels in view (eq. 4.18-4.23), and observe the space in front of its readings.
+        """Average an image into the voxels in view (eq. 4.18-4.23), and observe the free space in front of its
+        surfaces.
 
-        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``. ``touched`` is what ``touch`` found for the
-        image.
+        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``. ``touched`` is the result of ``touch`` for
+        the image.
         """
         ...
 
@@ -67,13 +69,13 @@ class Backend(Protocol):
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps from a pose on (eq. 4.43 with the weights of 4.46); see ``descent.py``.
+        """Levenberg-Marquardt steps (eq. 4.43 with the weights of 4.46); see ``descent.py``.
 
         Args:
-            image: Image of a level of the pyramid.
-            T_world_camera: (4, 4) pose at which the steps begin.
-            first: Normal equations there; None where they are not known yet.
-            rules: Beginning and end; without steps the result are the normal equations at the pose.
+            image: Image of a pyramid level.
+            T_world_camera: (4, 4) first pose.
+            first: Normal equations at the first pose; None if unknown.
+            rules: Start and stop rules; without steps the result contains the normal equations at the pose.
         """
         ...
 
@@ -82,7 +84,7 @@ class Backend(Protocol):
     ) -> MapSample:
         """Signed distance, intensity difference and occupancy of the map at the points of an image.
 
-        ``T_grid_camera`` (3, 4) float32 is the motion from the camera to the window's lattice (voxels); ``free_after``
-        observations make free space.
+        ``T_grid_camera`` (3, 4) float32 maps the camera to the window's lattice (voxels). ``free_after`` observations
+        make free space.
         """
         ...

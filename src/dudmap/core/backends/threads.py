@@ -1,7 +1,7 @@
-"""Bands of rows in a thread pool, and the decorator that compiles all kernels.
+"""Thread pool for bands of rows, and the decorators that compile kernels.
 
-Kernels are serial and release the GIL; a call is cut into bands that do not depend on the number of threads, and
-sums are added in band order, so that the result is the same, bit for bit, on one core and on sixteen.
+Kernels are serial and release the GIL. A call is divided into bands that do not depend on the number of threads, and
+sums are added in band order. Therefore the result is bit for bit the same on one core and on sixteen.
 """
 
 import atexit
@@ -23,16 +23,16 @@ from dudmap.core.kernel_cache import store
 
 
 def _import_numba() -> None:
-    """Import what Numba needs before its first kernel, without SciPy's linear algebra.
+    """Import the parts of Numba that its first kernel needs, without SciPy's linear algebra.
 
-    Numba imports it only to learn whether there is a BLAS, for products of vectors, which no kernel has. That takes as
-    long as loading all kernels of the first frames.
+    Numba imports SciPy only to detect a BLAS for vector products, which no kernel uses. The import takes as long as
+    loading all kernels of the first frames.
     """
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # pyright: ignore[reportArgumentType] - so that its import fails
         try:
-            vars(import_module("numba.np.arraymath"))["_HAVE_BLAS"] = True  # as others find it
+            vars(import_module("numba.np.arraymath"))["_HAVE_BLAS"] = True  # the value that other users of Numba expect
         finally:
             del sys.modules[blas]
 
@@ -49,11 +49,11 @@ _OPTIONS: dict[str, Any] = {
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a kernel and stores it until its text or that of a function it inlines changes."""
+    """Decorator that compiles a kernel and caches it until its code or the code of an inlined function changes."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = njit(**(_OPTIONS | options))(function)
-        if isinstance(kernel, Dispatcher):  # and not the function itself, with NUMBA_DISABLE_JIT
+        if isinstance(kernel, Dispatcher):  # not the plain function of NUMBA_DISABLE_JIT
             store(kernel)
         return kernel
 
@@ -61,13 +61,13 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class Scalar:
-    """What kernels call: it is inlined there, and becomes a kernel of its own only where Python calls it.
+    """Device function: inlined into kernels; compiled on its own only when Python calls it.
 
-    Numba would make each callable from Python and C, and store it, which can take longer than to compile it.
+    Numba would make each function callable from Python and C and store it, which can take longer than compiling it.
 
     Attributes:
-        py_func: The function as it was written.
-        inlined: What Numba compiles for kernels.
+        py_func: The Python function.
+        inlined: The dispatcher that Numba compiles into kernels.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
@@ -78,7 +78,7 @@ class Scalar:
 
     @property
     def _numba_type_(self) -> Any:
-        """What Numba takes this for in a kernel."""
+        """Numba type of this object inside kernels."""
         return self.inlined._numba_type_
 
     @cached_property
@@ -86,30 +86,32 @@ class Scalar:
         return compiled(**self._options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the kernel of its own."""
+        """Call the separately compiled kernel."""
         return self._alone(*arguments)
 
 
 kernel = compiled()
 exact = compiled(fastmath=False)
-"""Compiles loops over small images whose arithmetic rounds as NumPy's does, operation by operation."""
+"""Decorator for loops over small images that round like NumPy, operation by operation."""
 exact_scalar = partial(Scalar, fastmath=False)
-"""Compiles what such loops call; ``py_func`` is the same formula for whole images."""
+"""Decorator for device functions of such loops; ``py_func`` is the same formula for whole images."""
 scalar = Scalar
-"""Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
-function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
-of the two is called depends on whether the caller was compiled in this process or loaded from the cache."""
+"""Decorator for device functions that are always inlined, because a call ends the vectorisation of the surrounding
+loop. Without inlining a function would exist in two forms with different rounding, optimised alone and with its
+caller. The cache state would decide which one is called."""
 written_out = compiled(inline="always")
-"""Compiles scalar mathematics as if it were written out where it is called, so that the compiler orders its sums and
-products together with those around it; takes longer to compile than ``scalar``."""
+"""Decorator for scalar formulas that are inlined as source, so that the compiler orders their sums and products
+together with the surrounding ones. It takes longer to compile than ``scalar``."""
 
 Result = TypeVar("Result")
 
 
 @cache
 def num_threads() -> int:
-    """Cores this process may use; the environment variable DUDMAP_THREADS overrides. It is read once, since a frame
-    asks twenty times."""
+    """Number of cores this process may use; the environment variable DUDMAP_THREADS overrides it.
+
+    It is read once, because a frame needs it twenty times.
+    """
     override = os.environ.get("DUDMAP_THREADS", "")
     return int(override) if override.isdigit() and int(override) > 0 else _num_cores()
 
@@ -121,10 +123,11 @@ def _num_cores() -> int:
 
 @cache
 def _tasks() -> SimpleQueue[Callable[[], object] | None]:
-    """Tasks of the other threads, one for each core but one. An executor would take ten times as long to wake one.
+    """Task queue of the other threads, one thread for each core but one. An executor would take ten times as long to
+    wake one.
 
-    The threads end when the interpreter does. One that was still in compiled code then would be ended there, which C++
-    answers by ending the process with an error.
+    The threads end before the interpreter does. Otherwise a thread in compiled code would be terminated, which aborts
+    the process with a C++ error.
     """
     tasks: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
 
@@ -147,25 +150,25 @@ def _tasks() -> SimpleQueue[Callable[[], object] | None]:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_tasks.cache_clear)  # a forked process has none of the threads
-    os.register_at_fork(after_in_child=num_threads.cache_clear)  # and may be given fewer
+    os.register_at_fork(after_in_child=num_threads.cache_clear)  # and may have fewer cores
 
 
 def submit(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Start ``function`` in another thread if there is a core for it.
+    """Start ``function`` in another thread if a core is available.
 
     Returns:
-        A function that waits for the result; where no thread has come to it yet, it is computed by who asks first.
+        A function that waits for the result; if no thread has started yet, the caller computes it.
     """
     if num_threads() <= 1:
         result = function()
         return lambda: result
     future: Future[Result] = Future()
-    waiting = deque([function])  # it is let go with all that it holds as soon as it is called
+    waiting = deque([function])  # releases the function and its data as soon as it is called
 
     def fulfil() -> None:
         try:
             task = waiting.pop()
-        except IndexError:  # another thread has come to it
+        except IndexError:  # another thread has taken it
             return
         try:
             future.set_result(task())
@@ -181,7 +184,7 @@ def submit(function: Callable[[], Result]) -> Callable[[], Result]:
 
 
 def also_in_other_threads(function: Callable[[], object], count: int) -> None:
-    """Have ``count`` other threads call a function that may be called late, when nothing is left to do."""
+    """Make ``count`` other threads call a function; it may be called late, when no work is left."""
     for _ in range(count):
         _tasks().put(function)
 
@@ -199,7 +202,7 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)
     order = iter(range(len(calls)))  # shared by all threads; next() is atomic, so no band runs twice
-    finished: SimpleQueue[int] = SimpleQueue()  # number of bands that another thread has finished
+    finished: SimpleQueue[int] = SimpleQueue()  # number of bands finished by another thread
     errors: list[BaseException] = []
 
     def work() -> int:
@@ -213,7 +216,7 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
             count += 1
         return count
 
-    # the calling thread works too, and each other one is woken once, not once per band; one that comes late finds none
+    # the calling thread works too; each other thread is woken once, not once per band
     also_in_other_threads(lambda: finished.put(work()), threads - 1)
     count = work()
     while count < len(calls):

@@ -146,7 +146,6 @@ class Camera:
 
 @lru_cache(maxsize=32)  # used in every frame
 def _scaled(camera: Camera, level: int) -> Camera:
-    """See ``Camera.scaled``."""
     factor = 1.0 / (1 << level)
     return replace(
         camera,

@@ -184,11 +184,9 @@ def _finite(fields: list[str]) -> list[float]:
 
 
 def _holds_rotation(row: list[float]) -> bool:
-    """Whether a row begins with the 12 numbers of a rigid motion."""
     return len(row) >= 12 and _is_rotation(np.array(row[:12]).reshape(3, 4)[:, :3])
 
 
 def _is_rotation(R: NDArray[np.float64]) -> bool:
-    """Whether a matrix (3, 3) is a rotation, within ``LARGEST_ERROR``."""
     small = np.abs(R).max() <= 1 + LARGEST_ERROR  # products of larger numbers may overflow
     return bool(small and np.abs(R @ R.T - np.eye(3)).max() < LARGEST_ERROR and np.linalg.det(R) > 0)

@@ -123,7 +123,6 @@ class BlockPager(Stateful):
             self._bring_back(tree, region, frame_number)
 
     def _stored_in(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> list[Region]:
-        """Regions of the box from ``first`` to ``last`` that are in the store."""
         if np.prod(last - first + 1) > len(self._away):
             (x0, y0, z0), (x1, y1, z1) = _key(first), _key(last)
             return [(x, y, z) for x, y, z in self._away if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1]

@@ -361,7 +361,6 @@ def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geom
 
 
 def _row_bytes(array: NDArray) -> int:
-    """Memory of one element along the first axis."""
     return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
 
 
@@ -382,7 +381,6 @@ def records_of(rows: Sequence[Sequence[bytes]]) -> BlockRecords:
 
 
 def _level_of(blobs: Sequence[bytes]) -> BlockRecords:
-    """The blocks of one level; see ``records_of``."""
     arrays = {}
     for name, blob in zip(COLUMNS, blobs, strict=True):
         kind, width = _TYPES[name]

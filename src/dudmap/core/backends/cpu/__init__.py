@@ -1,4 +1,4 @@
-"""The operations of a back end as Numba kernels; the only place that knows Numba and threads.
+"""Back-end operations as Numba kernels; the only package that uses Numba and threads.
 
-``backend.py`` cuts each operation into bands and owns the buffers.
+``backend.py`` divides each operation into bands and owns the buffers.
 """

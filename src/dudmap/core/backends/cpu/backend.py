@@ -1,6 +1,6 @@
-"""The CPU back end: Numba kernels over bands of rows, planes or blocks in a thread pool.
+"""CPU back end: Numba kernels over bands of rows, planes or blocks in a thread pool.
 
-Bands do not depend on the number of threads, and sums are added in their order (``threads.py``).
+Bands do not depend on the number of threads, and sums are added in band order (``threads.py``).
 """
 
 import numpy as np
@@ -91,10 +91,10 @@ class CpuBackend:
         *,
         averages: bool = True,
     ) -> tuple[FusedBlocks, NDArray[np.float32], NDArray[np.int32]]:
-        """The blocks in view, the number of frames (n,) that this one stands for in each, and the packed pixels; see
+        """Blocks in view, number of frames (n,) that this frame stands for in each, and packed pixels; see
         ``Backend.fuse``.
 
-        Without ``averages`` the voxels, which another device then changes, stay as they are.
+        Without ``averages`` the voxels do not change; another device then fuses them.
         """
         candidates, fused, turn, count, free_space = visit
         n, parity, after = len(candidates), *((-1, 0) if free_space is None else free_space)
@@ -113,7 +113,7 @@ class CpuBackend:
         return FusedBlocks(slots[:total], occupied[:total], _concatenated(found, counts)), repeats[:total], pixels
 
     def _pixel_buffer(self, size: tuple[int, ...]) -> NDArray[np.int32]:
-        """Words (H * W + 1, 2) of the pixels; the last row, of a voxel without a pixel, is 0."""
+        """Words (H * W + 1, 2) of the pixels; the last row, for voxels without a pixel, is 0."""
         rows = size[0] * size[1] + 1
         if len(self._pixels) != rows:
             self._pixels = np.zeros((rows, 2), dtype=np.int32)
@@ -167,5 +167,5 @@ class CpuBackend:
 
 
 def _concatenated(found: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The first ``counts[n]`` entries of each array, as one."""
+    """The first ``counts[n]`` entries of each array, concatenated."""
     return np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)])

@@ -1,7 +1,7 @@
-"""Loops over points that two frames see: intensity and depth differences, and their derivatives.
+"""Loops over points seen by two frames: intensity and depth differences, and their derivatives.
 
-Points are worked through in stages like the rows of a registration: loads and the tests that leave points out are loops
-of their own, so that the arithmetic on what is left, which fills rows of numbers without gaps, is vectorised.
+Points are processed in stages, like the rows of a registration. Loads and rejection tests are separate loops. The
+remaining points fill rows without gaps, so that their arithmetic is vectorised.
 """
 
 import numpy as np
@@ -15,20 +15,20 @@ UNKNOWNS = 21
 SHARED, POSE = 13, 6
 """Parameters of the calibration (13), relative pose as a twist (6), gain and offset of the intensities (2)."""
 MARGIN = f32(8)
-"""Border of the colour images that is not used, pixels: twice the wider Gaussian of their filter."""
+"""Unused border of the colour images, pixels: twice the wider Gaussian of their filter."""
 NEAREST = f32(0.05)
-"""Depth in the colour camera below which a point is not seen, metres."""
+"""Smallest depth in the colour camera at which a point is visible, metres."""
 POINTS, PADDED = 1040, 16
-"""Points that are worked through together, whose rows of numbers begin at different places of a cache; and in what
-portions: what is left of a row beyond the points is no point."""
+"""Points processed together, whose rows begin at different cache positions, and size of a portion. The rest of the
+last portion contains no points."""
 
 
 @scalar
 def _central(image, u, v):
-    """Value of an image at a place that has sixteen neighbours, and its interpolated central differences.
+    """Value of an image at a position with sixteen neighbours, and its interpolated central differences.
 
-    The noise of these derivatives is uncorrelated with that of the value, which the slopes between the four nearest
-    pixels are not: at whole pixels their product has the mean of the noise's variance, a bias of all estimates.
+    The noise of central differences is uncorrelated with the noise of the value. Slopes between the four nearest pixels
+    are correlated with it: at whole pixels the mean of their product is the noise variance, which biases all estimates.
     """
     i, j = int(u), int(v)
     a, b = u - f32(i), v - f32(j)
@@ -48,7 +48,7 @@ def _central(image, u, v):
 
 @scalar
 def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
-    """Where a colour image shows a point of its depth camera.
+    """Projection of a point of the depth camera into a colour image.
 
     Args:
         place: Elements of T_color_depth.
@@ -56,12 +56,12 @@ def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
         intrinsics: (4) at the size of the image.
         lens: (5) k1, k2, p1, p2, k3.
         offset, readout: Seconds.
-        height: Of the image.
+        height: Height of the image.
         x, y, z: The point.
 
     Returns:
-        Pixel u, v; then for ``_derivatives`` the point in the colour camera; the motion of its place per second of
-        delay; its coordinates at depth 1; the radial factor of the lens, its growth; the share of the readout.
+        Pixel u, v. Then, for ``_by_point`` and ``_by_parameters``: point in the colour camera; its motion per second of
+        delay; its coordinates at depth 1; radial factor of the lens and its growth; share of the readout.
     """
     ax = twist[0] + twist[4] * z - twist[5] * y
     ay = twist[1] + twist[5] * x - twist[3] * z
@@ -92,7 +92,7 @@ def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
 
 @scalar
 def _by_point(seen, intrinsics, lens, su, sv):
-    """Derivatives of su u + sv v, of the pixel u, v at which a point is ``seen``, by the point in the colour camera."""
+    """Derivatives of su u + sv v by the point in the colour camera; u, v is the pixel of ``seen``."""
     qz, a, d, radial, growth = seen[4], seen[8], seen[9], seen[10], seen[11]
     across = f32(2) * (a * d * growth + lens[2] * a + lens[3] * d)
     along_x = radial + f32(2) * (a * a * growth + lens[2] * d) + f32(6) * lens[3] * a
@@ -104,7 +104,7 @@ def _by_point(seen, intrinsics, lens, su, sv):
 
 @scalar
 def _by_parameters(seen, place, intrinsics, scale, su, sv, g):
-    """Derivatives of su u + sv v by the 13 parameters, ``g`` those by the point in the colour camera."""
+    """Derivatives of su u + sv v by the 13 parameters; ``g`` are the derivatives by the point in the colour camera."""
     u, v, a, d, share = seen[0], seen[1], seen[8], seen[9], seen[12]
     rx, ry, rz = seen[2] - place[3], seen[3] - place[7], seen[4] - place[11]
     r2 = a * a + d * d
@@ -119,7 +119,7 @@ def _by_parameters(seen, place, intrinsics, scale, su, sv, g):
 
 @scalar
 def _back(place, g):
-    """Derivatives by a point in the depth camera, from those by the point in the colour camera."""
+    """Derivatives by a point in the depth camera, from the derivatives by the point in the colour camera."""
     return (
         place[0] * g[0] + place[4] * g[1] + place[8] * g[2],
         place[1] * g[0] + place[5] * g[1] + place[9] * g[2],
@@ -129,13 +129,13 @@ def _back(place, g):
 
 @scalar
 def _along(g, a, b, c, d, e, f):
-    """Derivatives along both tangents of the surface, from those by a point of it."""
+    """Derivatives along both tangents of the surface, from the derivatives by a surface point."""
     return g[0] * a + g[1] * b + g[2] * c, g[0] * d + g[1] * e + g[2] * f
 
 
 @scalar
 def _padded(count):
-    """Length of rows of so many numbers that are worked through in whole portions."""
+    """Smallest multiple of ``PADDED`` that is not smaller than ``count``."""
     return (count + PADDED - 1) & -PADDED
 
 
@@ -147,8 +147,8 @@ def _six(values):
 
 @scalar
 def _add_products(rows, count, begin, place, H, b):
-    """Add the products of all rows, of which the last one holds the residuals, to the normal equations; unknowns from
-    ``begin`` on are wanted, the first of which is number ``place + begin`` of ``H``, ``b``."""
+    """Add the products of all rows to the normal equations; the last row holds the residuals. Unknowns before ``begin``
+    are omitted; unknown k is number ``place + k`` of ``H`` and ``b``."""
     last, padded = len(rows) - 1, _padded(count)
     for k in range(begin, last + 1):
         for n in range(count, padded):
@@ -166,10 +166,10 @@ def _add_products(rows, count, begin, place, H, b):
 
 @scalar
 def _measured_points(start, stop, points, T, depth, intrinsics, step, residuals, number, at):
-    """Points ``start`` to ``stop`` where the second depth image shows the same surface; returns how many there are.
+    """Points ``start`` to ``stop`` at which the second depth image shows the same surface; returns their number.
 
-    ``number`` and the rows of ``at`` are filled: their places in both depth cameras, the depth difference, and the
-    slopes of the depth along u and v.
+    Fills ``number`` and the rows of ``at``: positions in both depth cameras, depth difference, and slopes of the depth
+    along u and v.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -203,8 +203,8 @@ def _measured_points(start, stop, points, T, depth, intrinsics, step, residuals,
 
 @scalar
 def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
-    """Derivatives of the depth differences of ``_measured_points`` by the pose, and the differences themselves, times
-    the root of their weights, into ``rows``; the differences over ``noise`` into ``plain``."""
+    """Derivatives of the depth differences of ``_measured_points`` by the pose, and the differences, times the root of
+    their weights, into ``rows``; the differences over ``noise`` into ``plain``."""
     fx, fy = intrinsics[0], intrinsics[1]
     for n in range(_padded(count)):
         x, y, z, difference = at[3, n], at[4, n], at[5, n], at[6, n]
@@ -224,10 +224,10 @@ def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
 
 @scalar
 def _colored_points(count, tangents, first, second, number, at, pixels, shades):
-    """Of so many points those that both colour images show, at ``pixels``; returns how many there are.
+    """Keep the first ``count`` points that both colour images show at ``pixels``; returns their number.
 
-    They move to the front of ``number`` and ``at``, whose rows from 6 on receive their tangents. ``shades`` receives
-    the value and the slopes of either image.
+    The points move to the front of ``number`` and ``at``, whose rows from 6 receive the tangents. ``shades`` receives
+    value and slopes of both images.
     """
     height, width = f32(first.shape[0]) - MARGIN, f32(first.shape[1]) - MARGIN
     left = 0
@@ -240,7 +240,7 @@ def _colored_points(count, tangents, first, second, number, at, pixels, shades):
         before, fu, fv = _central(first, u, v)
         after, gu, gv = _central(second, s, t)
         slopes = fu + fv + gu + gv
-        # NaN beside what moves; of sums, the compiler may take isfinite() apart
+        # NaN next to moving pixels; for sums, the compiler may decompose isfinite()
         if not (np.isfinite(before) & np.isfinite(after) & (slopes == slopes)):
             continue
         m = number[n]
@@ -262,34 +262,34 @@ def linearize_pair(
 ):  # fmt: skip
     """Normal equations of the differences between two frames at the points of the first.
 
-    Both intensities show the same texture, so their derivatives are taken from it once, as the mean of those of both
-    images in the second: a step d_i in the first image is a step A d_i in the second, with the affinity A that the
-    surface's tangents give. The derivative by a parameter is then that of the difference of two displacements,
-    g (d_j - A d_i). The difference of the two images' own derivatives would be mostly their noise, which makes the
-    normal equations too large, and steps and covariances too small.
+    Both intensities show the same texture. Therefore the texture gradient in the second image is the mean of both
+    images' gradients. With the affinity A given by the surface tangents, a step d_i in the first image is a step A d_i
+    in the second. The derivative by a parameter is g (d_j - A d_i), with the texture gradient g. The difference of the
+    separate derivatives would consist mostly of noise. It would make the normal equations too large, and steps and
+    covariances too small.
 
     Args:
         points: (n, 3) float32, camera of the first depth image.
-        tangents: (n, 6) float32, two directions of the surface at each.
+        tangents: (n, 6) float32, two directions of the surface at each point.
         T: (3, 4) float32, first to second depth camera.
         depth: (h, w) float32 of the second frame, metres, 0 = none.
         depth_intrinsics: (4,) float32.
-        first, second: (h, w) float32 colour intensities as recorded, NaN where they are not to be used.
+        first, second: (h, w) float32 recorded colour intensities, NaN = unused.
         first_twist, second_twist: (6,) float32, motion of the depth camera per second.
         first_offset, second_offset: Delay of the middle row of each colour image, s.
         place: (3, 4) float32 T_color_depth.
         intrinsics: (4,) float32 at the size of the colour images.
         lens: (5,) float32 k1, k2, p1, p2, k3.
         scale: Size of the colour images over their full size.
-        readout: Of the colour images, s.
+        readout: Readout of the colour images, s.
         gain, bias: The second intensity is gain times the first plus bias.
-        step: Depth differences beyond this share of the depth are another surface.
+        step: Depth differences beyond this share of the depth belong to another surface.
         noise: SensorNoise, of float32.
         by_color: Reciprocal standard deviation of the intensity difference.
         by_depth: Reciprocal standard deviation of the depth difference in units of ``noise``.
         huber: Constant of the robust weight, standard deviations.
-        begin: First unknown that is wanted: 0, or SHARED for a calibration that is known; what is before it stays 0.
-        residuals: (2, n) float32 out: intensity difference, depth difference over ``noise``; NaN where there is none.
+        begin: First unknown to compute: 0, or SHARED for a known calibration; earlier ones stay 0.
+        residuals: (2, n) float32 out: intensity difference, depth difference over ``noise``; NaN = none.
         H: (UNKNOWNS, UNKNOWNS) float64 out.
         b: (UNKNOWNS,) float64 out, gradient.
     """
@@ -300,7 +300,7 @@ def linearize_pair(
     height, half, zero = f32(first.shape[0]), f32(0.5), f32(0)
     number, at, plain = np.empty(POINTS, np.int64), np.empty((12, POINTS), f32), np.empty(POINTS, f32)
     pixels, shades = np.empty((4, POINTS), f32), np.empty((6, POINTS), f32)
-    # derivatives and, last, residuals times the root of their weights, unknown by unknown
+    # derivatives and, last, residuals, unknown by unknown, each times the root of its weight
     distance, color = np.empty((POSE + 1, POINTS), f32), np.empty((UNKNOWNS + 1, POINTS), f32)
     H[:], b[:] = 0.0, 0.0
     for start in range(0, points.shape[0], POINTS):
@@ -322,7 +322,7 @@ def linearize_pair(
             after, gu, gv = shades[3, n], shades[4, n], shades[5, n]
             seen = _seen(place, own, intrinsics, lens, first_offset, readout, height, X, Y, Z)
             seen_after = _seen(place, other, intrinsics, lens, second_offset, readout, height, x, y, z)
-            # derivatives of the pixels along the tangents, in the first image and, with these turned, in the second
+            # pixel derivatives along the tangents in the first image and, along the rotated tangents, in the second
             a, c, d = at[6, n], at[7, n], at[8, n]
             e, f, g = at[9, n], at[10, n], at[11, n]
             p0, p1 = _along(_back(place, _by_point(seen, intrinsics, lens, f32(1), zero)), a, c, d, e, f, g)
@@ -337,9 +337,9 @@ def linearize_pair(
             a0, a1 = (q0 * p3 - q1 * p2) * by_det, (q1 * p0 - q0 * p1) * by_det
             a2, a3 = (q2 * p3 - q3 * p2) * by_det, (q3 * p0 - q2 * p1) * by_det
             area = a0 * a3 - a1 * a2
-            alike &= (area > f32(0.25)) & (area < f32(4))  # else seen too differently to look alike
+            alike &= (area > f32(0.25)) & (area < f32(4))  # otherwise the views differ too much
             by_area = f32(1) / (area if alike else f32(1))
-            # mean derivative of the texture in the second image: A^-T takes that of the first there
+            # mean texture gradient in the second image; A^-T transforms the gradient of the first
             gu = half * (gu + gain * (a3 * fu - a2 * fv) * by_area)
             gv = half * (gv + gain * (a0 * fv - a1 * fu) * by_area)
             difference = after - gain * before - bias
@@ -377,13 +377,13 @@ def linearize_pairs(
 
     Args:
         pairs: (P, 2) int64, numbers of the first and the second frame of each.
-        starts: (F + 1,) int64, where the points of each frame begin in ``points`` and ``tangents``.
+        starts: (F + 1,) int64, first point of each frame in ``points`` and ``tangents``.
         points, tangents: (n, 3) and (n, 6) float32 of all F frames.
         Ts: (P, 3, 4) float32.
         depths, images: (F, h, w) float32.
         twists, offsets: (F, 6) and (F,) float32, motion and delay of the middle row of the colour image of each frame.
         lights: (P, 2) float32, gain and bias.
-        residual_starts: (P + 1,) int64, where the residuals of each pair begin.
+        residual_starts: (P + 1,) int64, first residual of each pair.
         residuals: (2, r) float32 out.
         Hs, bs: (P, UNKNOWNS, UNKNOWNS) and (P, UNKNOWNS) float64 out.
 

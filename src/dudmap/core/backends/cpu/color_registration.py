@@ -1,6 +1,6 @@
-"""Loop over the pixels of a depth image: what each shows in the image of another camera, taken at another time.
+"""Loop over the pixels of a depth image: colour of each in the image of another camera, taken at another time.
 
-A row is worked through in stages, see ``registration.py``.
+A row is processed in stages, see ``registration.py``.
 """
 
 import numpy as np
@@ -11,12 +11,12 @@ from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import project, ray
 
 NEAREST = np.float32(0.05)
-"""Depth in the colour camera below which a point is projected as if it were at this depth, metres."""
+"""Smallest depth in the colour camera, metres; nearer points are projected at this depth."""
 
 
 @scalar
 def fill_gaps(source, fallback, target):
-    """Depths of a row with gaps filled by the last reading before them, at its start by the first after them."""
+    """Fill the gaps in a row of depths with the last depth before them, and a gap at the start with the first depth."""
     first = fallback
     for u in range(source.size):
         if source[u] > np.float32(0):
@@ -31,7 +31,7 @@ def fill_gaps(source, fallback, target):
 
 @scalar
 def _along_row(T, y):
-    """A motion (3, 4) of the points (x, y, 1) z of a row: factors of x z, factors of z, and shifts."""
+    """Motion (3, 4) of the points (x, y, 1) z of a row: factors of x z, factors of z, and shifts."""
     return (
         T[0, 0], T[1, 0], T[2, 0], T[0, 1] * y + T[0, 2], T[1, 1] * y + T[1, 2], T[2, 1] * y + T[2, 2],
         T[0, 3], T[1, 3], T[2, 3],
@@ -46,12 +46,12 @@ def _moved(t, x, z):
 
 @scalar
 def color_places(v, depth, intrinsics, projection, size, first, across, down, gain):
-    """Where the pixels of a row of a depth image lie in the colour image, which is continued at its borders.
+    """Positions of a row of depth pixels in the colour image, clamped at its borders.
 
     A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera, the
-    second-order expansion of T_color_depth exp(-tau xi) X. The row gives tau, and tau the row: a step of a fixed point
-    from the row of the depth image on, which contracts by readout times the image speed over the height: with 20 rows
-    between the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels are left.
+    second-order expansion of T_color_depth exp(-tau xi) X. tau depends on the row and the row on tau. One fixed-point
+    step from the row of the depth image solves this. It contracts by readout times image speed over height. With 20
+    rows between the images, 30 ms and 1 rad/s at 480 rows, an error of 0.02 pixels remains.
 
     Args:
         v: Row.
@@ -60,8 +60,8 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down, ga
         projection: ColorProjection.
         size: Heights of the depth image and of the colour image, width of the colour image.
         first: (w,) int32 out, number of the upper left of the four colour pixels around the point.
-        across, down: (w,) float32 out, its place between them, 0 to 1.
-        gain: (w,) float32 out, what vignetting leaves of the brightness there, inverted.
+        across, down: (w,) float32 out, position between them, 0 to 1.
+        gain: (w,) float32 out, factor that compensates vignetting.
     """
     zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
     y_ray = ray(v, intrinsics[3], intrinsics[1])
@@ -83,7 +83,7 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down, ga
     for u in range(depth.size):
         x, z = (np.float32(u) - center) * by_fx, depth[u]
         row = project((y0 * x + y1) * z + y2, one / max((z0 * x + z1) * z + z2, NEAREST), fy, cy)
-        # one long loop would neither fill the registers nor keep the processor's units busy
+        # one long loop would exceed the registers and leave execution units idle
         across[u], down[u] = x, offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
     for u in range(depth.size):
         x, z, tau = across[u], depth[u], down[u]
@@ -108,14 +108,14 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down, ga
 
 @scalar
 def blended(a, b, c, d, across, down):
-    """Value between four pixels, the upper two first, at a place from 0 to 1 across and down."""
+    """Bilinear interpolation between four pixels, the upper two first, at a position from 0 to 1 across and down."""
     upper, lower = a + across * (b - a), c + across * (d - c)
     return upper + down * (lower - upper)
 
 
 @scalar
 def blended_byte(a, b, c, d, shift, across, down, gain):
-    """The same of one byte of four words times a gain, rounded."""
+    """Bilinear interpolation of one byte of four words times a gain, rounded."""
     byte = np.int32(255)
     value = blended(
         np.float32((a >> shift) & byte), np.float32((b >> shift) & byte), np.float32((c >> shift) & byte),
@@ -126,7 +126,7 @@ def blended_byte(a, b, c, d, shift, across, down, gain):
 
 @scalar
 def load_around(words, first, next_row, around):
-    """The four pixels around each point of a row, as ``color_places`` finds them, into ``around`` (4, w)."""
+    """Load the four pixels around each point of a row (``color_places``) into ``around`` (4, w)."""
     for u in range(first.size):
         n = np.uintp(first[u])
         around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
@@ -136,7 +136,7 @@ def load_around(words, first, next_row, around):
 
 @scalar
 def blend_colors(around, across, down, gain, mixed, target):
-    """Colours between such pixels into a row of 3 w bytes; ``mixed`` (w,) int32 is overwritten."""
+    """Interpolate colours between these pixels into a row of 3 w bytes; ``mixed`` (w,) int32 is overwritten."""
     for u in range(mixed.size):
         a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
         red = blended_byte(a, b, c, d, 0, across[u], down[u], gain[u])
@@ -176,14 +176,13 @@ def register(leads, team, rows, depth, intrinsics, projection, fallback, size, w
     """Interpolated colour or intensity of each pixel of a depth image, for a team of threads (``teams.py``).
 
     Args:
-        leads, team: As for ``run_team``.
         rows: Rows of a band.
         depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
         intrinsics, projection, size: As for ``color_places``.
-        fallback: Float32, depth of rows without a reading, metres.
+        fallback: Float32, depth of rows without any depth, metres.
         words: (h * w,) int32 of the colour image: red, green and blue in the lowest bytes, or the bits of a float32.
-        shades: (H, W) float32 out; of size 0 where the words are colours.
-        colors: (H, W, 3) uint8 out; of size 0 where they are not.
+        shades: (H, W) float32 out; of size 0 if the words are colours.
+        colors: (H, W, 3) uint8 out; of size 0 if the words are intensities.
     """
     wide_vectors()
     num_bands = -(-depth.shape[0] // rows)

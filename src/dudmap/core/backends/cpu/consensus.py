@@ -1,5 +1,5 @@
 """Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, Gauss-Newton on the inliers, and
-votes of the nearest ones."""
+votes of the nearest neighbours."""
 
 from typing import NamedTuple
 
@@ -11,27 +11,27 @@ from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.geometry.se3 import SMALL
 
 BANDS = 12
-"""Bands of a search: the same number of hypotheses in each, and of motions that are refined."""
+"""Bands of a search, with equal numbers of hypotheses and of refined motions."""
 REFINED = 5
-"""Hypotheses of each noise level that are refined: three noisy corners seldom give the best one outright."""
+"""Refined hypotheses per noise level, because three noisy corners seldom give the best motion directly."""
 ROUNDS = 2.0, 1.0, 1.0
-"""Inlier thresholds of the rounds of refinement, as multiples of the usual one: a hypothesis comes from three noisy
-corners, so begin with a wider one."""
+"""Inlier thresholds of the refinement rounds, as multiples of the usual threshold. The first is wider because a
+hypothesis comes from three noisy corners."""
 REGULAR = 1e-9
-"""Added to the diagonals of systems of equations: of samples with a repeated point, whose hypotheses have no support,
-and relative to the trace, of least squares."""
+"""Added to the diagonals of linear systems: absolutely for samples with a repeated point, whose hypotheses get no
+support; relative to the trace for least squares."""
 VOTED = 1024
 """Queries of one band of votes."""
 CHUNK = 32
-"""Points whose distances are looked at together."""
+"""Points whose distances are computed together."""
 
 
 class ConsensusParams(NamedTuple):
     """Scales of the consensus, pixels.
 
     Attributes:
-        inlier_px: Reprojection errors from which on a correspondence is an outlier, one per noise level.
-        gain: Log-likelihood ratio of a correspondence without error to an outlier, one per noise level.
+        inlier_px: Smallest reprojection error of an outlier, one per noise level.
+        gain: Log-likelihood ratio of an error-free correspondence to an outlier, one per noise level.
         prior_px: Mean distance from the expected image positions at which the prior of a motion is 3/4.
     """
 
@@ -41,12 +41,12 @@ class ConsensusParams(NamedTuple):
 
 
 class Correspondences(NamedTuple):
-    """Points and where they are found after a motion.
+    """Points and their observed image positions after a motion.
 
     Attributes:
         points: (3, n) float64, metres, first camera's frame.
         targets: (2, n) float64, their pixels in the second image.
-        expected: (2, n) float64, their pixels there by the expected motion.
+        expected: (2, n) float64, their pixels in the second image for the expected motion.
         weights: (n,) float64, weight of each point in a score.
         intrinsics: (4,) fx, fy, cx, cy.
     """
@@ -61,7 +61,7 @@ class Correspondences(NamedTuple):
 def best_motion(
     draws: NDArray[np.int64], found: Correspondences, params: ConsensusParams, T_expected: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Motion (4, 4) of the highest score among hypotheses, the expected one, and both refined.
+    """Motion (4, 4) of the highest score among the best hypotheses and the expected motion, all refined.
 
     Args:
         draws: (g, 3) correspondences of each hypothesis.
@@ -80,8 +80,11 @@ def best_motion(
 
 @kernel
 def search(leads, team, draws, found, params, T_expected, motions, scores, refined, refined_scores):
-    """Loop of ``best_motion``, for a team of threads: the first step makes and scores the hypotheses, the
-    second refines the best ones of each noise level and the expected motion, and scores them."""
+    """Loop of ``best_motion``, for a team of threads.
+
+    The first step makes and scores the hypotheses. The second refines and scores the best ones of each noise level and
+    the expected motion.
+    """
     step, levels = 0, scores.shape[1]
     while step < 2:
         band, number = first_band(leads, team, step, BANDS)
@@ -120,7 +123,7 @@ def search(leads, team, draws, found, params, T_expected, motions, scores, refin
 
 @scalar
 def highest(scores):
-    """Number of the highest score (n,), the first of equal ones; NaN is none."""
+    """Index of the highest score (n,), the first of equal ones; NaN is ignored."""
     best, most = 0, -np.inf
     for n in range(len(scores)):
         if scores[n] > most:
@@ -130,7 +133,7 @@ def highest(scores):
 
 @scalar
 def solved(A, b):
-    """Solution (n,) of A x = b; both are overwritten. Gauss' elimination with pivots from the columns."""
+    """Solution (n,) of A x = b by Gaussian elimination with partial pivoting; both are overwritten."""
     n = len(b)
     for i in range(n):
         pivot = i
@@ -153,7 +156,7 @@ def solved(A, b):
 
 @scalar
 def exponential(twist, T):
-    """Write the rigid motion (4, 4) of a twist (6,), as by ``se3.exp``."""
+    """Write the rigid motion (4, 4) of a twist (6,), see ``se3.exp``."""
     x, y, z = twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
     a, b, c = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
@@ -201,7 +204,7 @@ def hypothesis(draw, found, T):
 
 @scalar
 def refine(T, found, inlier_px):
-    """Replace a motion (4, 4) by the least-squares one of its inliers, whose error is below ``inlier_px``."""
+    """Replace a motion (4, 4) by the least-squares motion of its inliers, with errors below ``inlier_px``."""
     for scale in ROUNDS:
         H, gradient, inliers = linearized(T, found, scale * inlier_px)
         if inliers < 6:
@@ -225,7 +228,7 @@ def score(start, stop, motions, found, params, scores):
     """MSAC scores (g, k) of the motions ``start`` to ``stop`` at each noise level (Torr and Zisserman 2000), times a
     prior.
 
-    They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)), where e_n is the
+    The score is gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)). e_n is the
     reprojection error and d the mean distance of the pixels from the expected ones.
     """
     points, targets, expected, weights, intrinsics = found
@@ -253,16 +256,16 @@ def score(start, stop, motions, found, params, scores):
 
 @scalar
 def linearized(T, found, inlier_px):
-    """Normal equations of the reprojection error at a motion (4, 4), without points from an error of ``inlier_px`` on.
+    """Normal equations of the reprojection error at a motion (4, 4), without errors of ``inlier_px`` or more.
 
     Returns:
-        H (6, 6) and gradient (6,), whose solution ``solve(H, gradient)`` is the twist (v, omega) of the update
-        exp(twist) @ T; number of the inliers.
+        H (6, 6) and gradient (6,), number of inliers. ``solve(H, gradient)`` is the twist (v, omega) of the update
+        exp(twist) @ T.
     """
     points, targets, intrinsics = found.points, found.targets, found.intrinsics
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     size = points.shape[1]
-    rows = np.zeros((7, 2, size))  # derivatives of the pixels u, v by the twist, and their errors; of outliers 0
+    rows = np.zeros((7, 2, size))  # derivatives of the pixels u, v by the twist, and their errors; 0 for outliers
     products, H, gradient = rows.reshape(7, 2 * size), np.empty((6, 6)), np.empty(6)
     limit, count = inlier_px * inlier_px, 0.0
     for n in range(size):
@@ -298,11 +301,11 @@ def neighbour_votes(
     moving: NDArray[np.bool_],
     neighbours: int,
 ) -> NDArray[np.int64]:
-    """Number (q,) of the nearest points of the same group that move.
+    """Number (q,) of moving points among the nearest points of the same group.
 
     Args:
-        queries, groups: (q, 3) positions, and the group (q,) of each, which has ``neighbours`` points or more.
-        points, group_of, moving: (n, 3), (n,), (n,): the points, their groups, and which move.
+        queries, groups: (q, 3) positions, and the group (q,) of each, which has at least ``neighbours`` points.
+        points, group_of, moving: (n, 3), (n,), (n,): the points, their groups, and whether they move.
         neighbours: Number of points that vote.
     """
     order = np.argsort(group_of, kind="stable")
@@ -314,8 +317,8 @@ def neighbour_votes(
 
 @kernel
 def count_votes(leads, team, queries, groups, points, first, moving, neighbours, votes):
-    """Loop of ``neighbour_votes``, for a team of threads; points (3, n) are sorted by group, of which each begins at
-    ``first``."""
+    """Loop of ``neighbour_votes``, for a team of threads; points (3, n) are sorted by group, and ``first`` holds the
+    start of each group."""
     num_bands = -(-len(queries) // VOTED)
     band, _ = first_band(leads, team, 0, num_bands)
     while band != NO_BAND:
@@ -332,7 +335,7 @@ def count_votes(leads, team, queries, groups, points, first, moving, neighbours,
 def vote(start, stop, queries, groups, points, first, moving, neighbours, votes):
     """Votes of the queries ``start`` to ``stop``.
 
-    The voters of the query before, a neighbour in the image, give a bound of the distances of this one's.
+    The voters of the previous query, a neighbour in the image, bound the distances of the current one.
     """
     squares, group = np.empty(CHUNK), -1
     distances, voters = np.empty(neighbours), np.zeros(neighbours, np.int64)

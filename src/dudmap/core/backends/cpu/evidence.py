@@ -1,6 +1,6 @@
-"""Evidence of motion at single pixels, in two compiled calls: what residuals are usual, and which pixels move.
+"""Evidence of motion at single pixels, in two compiled calls: residual statistics, and moving pixels.
 
-The formulas stand first: arithmetic on numbers or images.
+The formulas come first: arithmetic on numbers or images.
 """
 
 from typing import Any, NamedTuple
@@ -15,27 +15,27 @@ from dudmap.core.backends.threads import exact, exact_scalar, written_out
 BINS = 128
 """Bins of the histogram of normalised residuals."""
 MAX_RESIDUAL = 16.0
-"""Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
+"""Upper edge of the histogram, standard deviations of the depth; larger residuals count in the last bin."""
 EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
 """Edges of the bins."""
 CENTERS = (EDGES[:-1] + EDGES[1:]) / 2
-"""Middles of the bins."""
+"""Centres of the bins."""
 LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
-"""Residual that larger ones are counted as."""
+"""Value to which larger residuals are clipped."""
 BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
-"""Bins per standard deviation of a reading."""
+"""Bins per standard deviation of the depth."""
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class NoiseParameters(NamedTuple):
-    """What the noise of a reading follows from.
+    """Parameters of the noise model of a pixel.
 
     Attributes:
-        base, scale: Of the sensor, sigma(z) = base + scale z^2 (thesis eq. 3.91), metres and 1/m.
-        map_variance: Of the surface of the map, m^2.
-        edge_sigmas, edge_slope: Largest depth step to a neighbour of the same surface: standard deviations, and a share
+        base, scale: Sensor noise, sigma(z) = base + scale z^2 (thesis eq. 3.91), metres and 1/m.
+        map_variance: Variance of the map's surface, m^2.
+        edge_sigmas, edge_slope: Largest depth step to a neighbour of the same surface: standard deviations, and share
             of the depth.
-        floor, sigmas: As of ``noise_limit``.
+        floor, sigmas: As for ``noise_limit``.
     """
 
     base: float
@@ -58,16 +58,16 @@ class MixtureRules(NamedTuple):
 
 
 class RegionRules(NamedTuple):
-    """How regions of moving pixels form.
+    """Rules for regions of moving pixels.
 
     Attributes:
-        limit: Log odds of a pixel that is certain.
-        coupling, sweeps: As of ``labeling.mean_field``.
-        half_seam: Half width of the seams that are no seeds, pixels.
-        min_area: Fewest pixels of a region.
-        seeded_share: Least share of seeds in a region.
-        free_space: Whether a pixel in space that the map knows to be free is certain to move.
-        regions: Whether regions grow from seeds; else every pixel is decided alone.
+        limit: Log odds of a certain pixel.
+        coupling, sweeps: As for ``labeling.mean_field``.
+        half_seam: Half width of seams that are not seeds, pixels.
+        min_area: Smallest number of pixels of a region.
+        seeded_share: Smallest share of seeds in a region.
+        free_space: Whether pixels in known free space certainly move.
+        regions: Whether regions grow from seeds; otherwise every pixel is decided alone.
     """
 
     limit: float
@@ -81,12 +81,12 @@ class RegionRules(NamedTuple):
 
 
 exact_sigma = written_out(reading_sigma)
-"""Of a reading, rounded as the kernel rounds that it is written out in."""
+"""Standard deviation of the depth, rounded like the surrounding kernel."""
 
 
 @exact_scalar
 def static_sigma(sigma: Any, map_variance: Any) -> Any:
-    """Standard deviation of the distance of a static point, metres: of the reading, ``sigma``, and of the map."""
+    """Standard deviation of the distance of a static point, metres, from depth noise ``sigma`` and map noise."""
     return np.sqrt(sigma * sigma + map_variance)
 
 
@@ -98,13 +98,13 @@ def edge_tolerance(sigma: Any, z: Any, edge_sigmas: Any, edge_slope: Any) -> Any
 
 @exact_scalar
 def mixture_log_odds(square: Any, offset: Any, slope: Any) -> Any:
-    """Log odds static : dynamic of a squared normalised residual: of two half-normal densities (thesis eq. 4.56)."""
+    """Log odds static : dynamic of a squared normalised residual under two half-normal densities (thesis eq. 4.56)."""
     return np.float32(offset + square * slope)
 
 
 @exact_scalar
 def noise_limit(sigma: Any, floor: Any, sigmas: Any) -> Any:
-    """Distance to the map below which nothing is called motion (theta in eq. 4.57), metres."""
+    """Smallest distance to the map that counts as motion (theta in eq. 4.57), metres."""
     return np.maximum(floor, sigmas * sigma)
 
 
@@ -114,9 +114,9 @@ def surface_log_odds(distance, sigma, noise, offset, slope, limit):
 
     Args:
         distance, sigma: Distance to the map and its standard deviation, metres.
-        noise: Distance below which nothing is called motion, metres.
-        offset, slope: Of ``mixture_log_odds``.
-        limit: Log odds of a pixel that is certain.
+        noise: Smallest distance that counts as motion, metres.
+        offset, slope: As for ``mixture_log_odds``.
+        limit: Log odds of a certain pixel.
     """
     residual = abs(distance) / sigma
     odds = min(max(mixture_log_odds(residual * residual, offset, slope), -limit), limit)
@@ -125,21 +125,21 @@ def surface_log_odds(distance, sigma, noise, offset, slope, limit):
 
 @exact
 def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tolerance, histogram):
-    """Noise of the readings of an image, and the mixture of their residuals.
+    """Noise of the pixels of an image, and the mixture of their residuals.
 
     Args:
         depth: (h, w) float32, metres, 0 = none.
         distance, occupancy: (h, w) of the map at the points of the image, see ``MapSample``.
         noise: NoiseParameters, all float32.
         rules: MixtureRules.
-        centers: (BINS,) float64, middles of the bins of the histogram.
+        centers: (BINS,) float64, centres of the histogram bins.
         sigma: (h, w) float32 out, standard deviation of the distance of a static point, metres.
         tolerance: (h, w) float32 out, largest depth step to a neighbour of the same surface, metres.
-        histogram: (BINS,) int64 out, counts of the normalised residuals at the surfaces of the map; 0 before.
+        histogram: (BINS,) int64 out, counts of the normalised residuals at the surfaces of the map; initially 0.
 
     Returns:
-        Share of the readings in space unknown to the map; prior of the dynamic density, standard deviations of the
-        static and of the dynamic one.
+        Share of depth pixels in unknown space; prior of the dynamic density, standard deviations of the static and of
+        the dynamic density.
     """
     h, w = depth.shape
     readings, unknown = 0, 0
@@ -163,20 +163,20 @@ def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tol
 def moving_pixels(
     depth, distance, occupancy, sigma, tolerance, seen_free, offset, slope, noise, rules, dynamic, seeds, probability
 ):  # fmt: skip
-    """Pixels that move by themselves, or in regions that grow from them over the surface.
+    """Pixels that move, alone or in regions that grow from them over the surface.
 
-    1. Log odds static : dynamic of each pixel alone, 0 = unknown (eq. 4.56, 4.57), and their mean field.
-    2. Seeds are the dynamic pixels but for thin seams along depth edges, and those in free space.
-    3. Regions grow from seeds up to depth edges and pixels whose own log odds are 1; small ones and those of few seeds
-       do not move.
+    1. Compute the log odds static : dynamic of each pixel, 0 = unknown (eq. 4.56, 4.57), and their mean field.
+    2. Seeds are the dynamic pixels except thin seams along depth edges; dynamic pixels in free space are always seeds.
+    3. Regions grow from seeds up to depth edges and up to pixels with log odds of at least 1. Small regions and regions
+    with few seeds are static.
 
     Args:
-        depth, distance, occupancy, sigma, tolerance: As of ``weigh_readings``.
-        seen_free: (h, w) bool, pixels in space that single frames have seen to be free; of size 0 for none.
-        offset, slope: Float64 and float32, as of ``Mixture.coefficients``.
+        depth, distance, occupancy, sigma, tolerance: As for ``weigh_readings``.
+        seen_free: (h, w) bool, pixels in space that single frames observed as free; of size 0 for none.
+        offset, slope: Float64 and float32, as in ``Mixture.coefficients``.
         noise: NoiseParameters, all float32.
         rules: RegionRules.
-        dynamic, seeds: (h, w) bool out; ``seeds`` only where regions grow.
+        dynamic, seeds: (h, w) bool out; ``seeds`` only if regions grow.
         probability: (h, w) float32 out, static probability of the mean field.
     """
     h, w = depth.shape

@@ -1,4 +1,4 @@
-"""Robust fit of gain and offset between the intensities of an image and those of the map."""
+"""Robust fit of gain and offset between the intensities of an image and of the map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from dudmap.core.backends.threads import scalar
 LARGE_GAIN = 1.25
 """A gain beyond this factor, up or down, is a change of the light."""
 FEWEST = 100
-"""Pixels that two numbers are fitted to at least."""
+"""Smallest number of pixels for a fit."""
 LOWEST, HIGHEST = 0.5 / 255, 254.5 / 255
 """Intensities between which an 8-bit image is not saturated."""
 
@@ -23,12 +23,13 @@ def fit_exposure(
 ) -> tuple[float, float]:
     """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
 
-    Auto-exposure changes all intensities at once; without this model such a change would look like motion. Saturated
-    pixels tell nothing and are left out. If the fit changes the median or the contrast by more than LARGE_GAIN, the
-    light has changed, or the image shows something else: the prior of the fit outweighs the low contrast of a dark
-    image, and pixels off their place flatten it. The quartiles of both images then give another gain and offset
-    wherever the pixels lie, which a second fit corrects by less than LARGE_GAIN, or not at all. The pair with the
-    smaller median error is returned.
+    Auto-exposure changes all intensities at once; without this model it would look like motion. Saturated pixels are
+    excluded.
+
+    If the fit changes the median or the contrast by more than LARGE_GAIN, it is unreliable: its prior outweighs the low
+    contrast of a dark image, and misaligned pixels flatten it. A second candidate then comes from the quartiles of both
+    images, which do not depend on alignment. A second fit corrects it, if the correction is below LARGE_GAIN. The
+    candidate with the smaller median error is returned.
 
     Args:
         intensity: (h, w) float32 of the image.
@@ -84,12 +85,12 @@ def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
         scale = max(1.5 * nth(errors, middle), 0.01)
         total = x_sum = y_sum = 0.0
         for n in range(count):
-            errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # the weight from here on
+            errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # now the weight
             total += errors[n]
             x_sum += errors[n] * x[n]
             y_sum += errors[n] * y[n]
         x_mean, y_mean = x_sum / total, y_sum / total
-        # prior of the gain at 1: worth a tenth of the pixels at a contrast of 0.2
+        # prior of the gain at 1: equals a tenth of the pixels at a contrast of 0.2
         variance = covariance = 0.1 * total * 0.04
         for n in range(count):
             variance += errors[n] * (x[n] - x_mean) ** 2

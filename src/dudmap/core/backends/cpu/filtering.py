@@ -1,7 +1,7 @@
 """Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, intensities, halving.
 
-Rows are cut into slices before the inner loop: an index that the compiler cannot prove positive costs numba's
-wrap-around test, and with it the vectorisation (measured: a factor 4).
+Rows are sliced before the inner loop. An index that the compiler cannot prove positive needs Numba's wrap-around test,
+which prevents vectorisation (measured: a factor 4).
 """
 
 import numpy as np
@@ -13,20 +13,20 @@ from dudmap.core.backends.threads import bands, kernel, run_bands, scalar, writt
 
 f32 = np.float32
 ABSENT = np.float32(-1e9)
-"""Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
+"""Filter depth of a pixel without measurement: so distant that its range weight vanishes."""
 OUTSIDE = np.float32(-2e9)
-"""Depth of a pixel outside the image inside the filter."""
+"""Filter depth of a pixel outside the image."""
 LONGEST_RUN = 3
 """Longest run of missing pixels, in the row or the column, of a small hole."""
 MIN_NEIGHBOURS = 8
-"""Readings that the 5x5 neighbourhood of a filled pixel must hold."""
+"""Smallest number of measurements in the 5x5 neighbourhood of a filled pixel."""
 FILTER_ROWS = 120
 """Image rows of one band of the filter."""
 
 
 @kernel
 def limit_depth(depth, low, high, out):
-    """Readings of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
+    """Keep depths of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
     source, target = depth.reshape(-1), out.reshape(-1)
     for n in range(source.size):
         z = source[n]
@@ -35,24 +35,23 @@ def limit_depth(depth, low, high, out):
 
 @scalar
 def between(z, a, b, gap):
-    """Whether a reading ``z`` lies between two others by more than ``gap`` of both; none of them may be missing."""
+    """Whether a depth ``z`` lies between two others by more than ``gap`` of both; missing values give False."""
     low, high = min(a, b), max(a, b)
     return (low > np.float32(0)) & (z > low + gap) & (z < high - gap)
 
 
 @kernel
 def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
-    """Readings of ``depth`` (H, W) without those between a foreground and a background (flying pixels), which become 0.
+    """Remove flying pixels, which lie between a foreground and a background; they become 0.
 
-    A pixel whose light comes from two surfaces reads a depth between them. It lies behind the one neighbour and in
-    front of the other, one or two pixels away in its row or column, by more than ``max(noise_floor, noise z^2) + slope
-    z``, which no readable surface does.
+    A pixel that receives light from two surfaces measures a depth between them. It lies behind one neighbour and in
+    front of the other, one or two pixels away in its row or column. The test requires differences above
+    ``max(noise_floor, noise z^2) + slope z``, which no measurable surface has.
 
     Args:
-        row_start, row_stop: Rows.
         depth: (H, W) float32, metres, 0 = none.
         noise, noise_floor: Tolerance, 1/m and metres.
-        slope: Step per pixel of the steepest surface that a sensor still reads, as a share of the depth.
+        slope: Step per pixel of the steepest measurable surface, as a share of the depth.
         out: (H, W) float32 out.
     """
     h, w = depth.shape
@@ -81,8 +80,8 @@ def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
     """Whether the run of missing pixels around a missing pixel is short and its two ends lie on one surface.
 
     Args:
-        a1, a2, a3: Readings one, two and LONGEST_RUN = three pixels before it, 0 = none.
-        b1, b2, b3: Likewise after it.
+        a1, a2, a3: Depths one, two and LONGEST_RUN = three pixels before it, 0 = none.
+        b1, b2, b3: Depths after it.
         slope, noise_floor: See ``fill_holes``.
     """
     zero, one, two, three = f32(0), f32(1), f32(2), f32(3)
@@ -100,16 +99,17 @@ def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
 def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
 
-    A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
-    is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least MIN_NEIGHBOURS
-    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus depth edges, whose sides
-    differ by more, are not bridged, and large holes, whose runs are longer in both directions, keep their border.
+    A missing pixel is filled under two conditions:
+    1. Its run of missing pixels, in the row or the column, is at most LONGEST_RUN long and ends on one surface.
+    2. Its 5x5 neighbourhood has at least MIN_NEIGHBOURS measurements within ``max(noise_floor, slope z^2)``.
+
+    Therefore depth edges, with larger differences, are not bridged. Large holes keep their border, because their runs
+    are longer in both directions.
 
     Args:
-        row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
-        slope: Largest spread over squared depth, 1/m.
-        noise_floor: Largest spread near the lens, metres.
+        slope: Largest depth range over squared depth, 1/m.
+        noise_floor: Largest depth range near the camera, metres.
         out: (H, W) float32 out.
     """
     wide_vectors()
@@ -124,7 +124,7 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
             line[np.uintp(u + LONGEST_RUN)] = target[u] = row[u]
         above, above2, above3 = depth[max(v - 1, 0)], depth[max(v - 2, 0)], depth[max(v - 3, 0)]
         below, below2, below3 = depth[min(v + 1, h - 1)], depth[min(v + 2, h - 1)], depth[min(v + 3, h - 1)]
-        # rows outside the image have no reading
+        # rows outside the image have no depth
         i1, i2, i3 = one if v > 0 else zero, one if v > 1 else zero, one if v > 2 else zero
         j1, j2, j3 = one if v + 1 < h else zero, one if v + 2 < h else zero, one if v + 3 < h else zero
         for u in range(w):
@@ -168,10 +168,10 @@ def range_weight(difference, inverse):
 
 @scalar
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
-    """Add one tap on each side of every pixel of a line to the sums of the filter, none where one lies outside.
+    """Add one tap on each side of every pixel of a line to the sums of the filter, or none if one lies outside.
 
-    The sum over a pair of opposite taps is free of the slope of the surface; a single tap at the border of the image,
-    where new surface enters the map, would pull every slanted surface towards the side that remains.
+    The sum over a pair of opposite taps is independent of the surface slope. A single tap at the image border would
+    bias slanted surfaces, exactly where new surface enters the map.
     """
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]
@@ -195,16 +195,15 @@ def _start(middle, alpha, inverse, numerator, denominator):
 
 @kernel
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
-    """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
+    """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: columns first, then rows.
 
-    Unlike in the thesis, taps whose opposite lies outside the image are left out (``_accumulate``).
+    Unlike the thesis, taps whose opposite lies outside the image are omitted (``_accumulate``).
 
     Args:
-        row_start, row_stop: Rows of the band.
-        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading, OUTSIDE in the border of r pixels.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT = no measurement, OUTSIDE in the border of r pixels.
         alpha: sigma_c over squared depth, 1/m.
         spatial: (r + 1,) float32 weights by pixel distance.
-        out: (H, W) float32 out; 0 where there is no reading.
+        out: (H, W) float32 out; 0 = no measurement.
     """
     r = spatial.size - 1
     w = padded.shape[1] - 2 * r
@@ -233,7 +232,7 @@ def bilateral(row_start, row_stop, padded, alpha, spatial, out):
 
 @kernel
 def pad(row_start, row_stop, depth, margin, out):
-    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for no reading."""
+    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for missing depth."""
     w = depth.shape[1]
     for v in range(row_start, row_stop):
         source, target = depth[v], out[v + margin][margin : margin + w]
@@ -267,7 +266,7 @@ def halve_intensity(row_start, row_stop, image, out):
 
 @written_out
 def foreground_mean(a, b, c, d, band, least):
-    """Mean of those of four readings that lie within ``band max(least, z)`` behind the nearest z; 0 without any."""
+    """Mean of the depths within ``band max(least, z)`` behind the nearest depth z of four; 0 without depth."""
     zero, one, far = f32(0), f32(1), f32(1e9)
     a, b = a if a > zero else far, b if b > zero else far
     c, d = c if c > zero else far, d if d > zero else far
@@ -281,9 +280,9 @@ def foreground_mean(a, b, c, d, band, least):
 
 @kernel
 def halve_depth(row_start, row_stop, depth, band, least, out):
-    """Mean of the readings of each 2x2 block that lie within ``band max(least, z)`` behind its nearest reading z.
+    """Mean of the depths of each 2x2 block within ``band max(least, z)`` behind its nearest depth z.
 
-    Foreground and background are never mixed; a block without a reading gives 0.
+    Foreground and background are never mixed; a block without depth gives 0.
     """
     for v in range(row_start, row_stop):
         upper, lower, target = depth[2 * v], depth[2 * v + 1], out[v]
@@ -294,10 +293,10 @@ def halve_depth(row_start, row_stop, depth, band, least, out):
 
 
 def filter_depth(depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
-    """Depth (H, W) in metres, limited, with small holes filled and smoothed (thesis section 4.3).
+    """Depth (H, W) in metres, limited, with small holes filled, and smoothed (thesis section 4.3).
 
     Args:
-        depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
+        depth: (H, W) float32, metres; NaN and values outside the limits count as missing.
         parameters: Limits and filter.
     """
     p, (height, width), ranges = parameters, depth.shape, bands(depth.shape[0], FILTER_ROWS)
@@ -327,8 +326,10 @@ def intensity(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def halve(
     depth: NDArray[np.float32], intensity: NDArray[np.float32], band: float, least: float = 1.0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
-    ``band max(least, z)`` behind the nearest one z."""
+    """Depth and intensity (H // 2, W // 2): means over 2x2 blocks.
+
+    Depth is averaged within ``band max(least, z)`` behind the nearest depth z.
+    """
     small_depth, small_intensity = np.empty((2, depth.shape[0] // 2, depth.shape[1] // 2), dtype=np.float32)
     halve_depth(0, len(small_depth), depth, np.float32(band), np.float32(least), small_depth)
     halve_intensity(0, len(small_intensity), intensity, small_intensity)

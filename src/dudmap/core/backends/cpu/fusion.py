@@ -1,7 +1,7 @@
-"""Fusion of a depth image in two compiled calls: what it touches, and its average into the blocks in view.
+"""Fusion of a depth image in two compiled calls: the blocks that it touches, and averaging into the blocks in view.
 
-Between the two the map provides voxels for the blocks that were touched. Threads share the bands of each step
-(``teams.py``); all steps have ``BANDS`` of them.
+Between the calls the map allocates voxels for the touched blocks. Threads share the bands of each step (``teams.py``);
+all steps have ``BANDS`` of them.
 """
 
 import numpy as np
@@ -15,20 +15,20 @@ from dudmap.core.backends.parameters import BLOCK, SensorNoise, single
 from dudmap.core.backends.threads import kernel, scalar
 
 BANDS = 16
-"""Bands of a step: the work of one differs from that of another by much less than with one per thread."""
+"""Bands of a step; the load varies much less between them than between one band per thread."""
 MAX_FOUND = 1 << 16
-"""Most cells that one band may find."""
+"""Largest number of cells that one band may find."""
 FRONTAL_WEIGHT = np.float32(4)
-"""Weight of a frontal reading at the reference depth, weighted by angle and noise: four steps down to the least
-weight 1."""
+"""Weight at normal incidence and the reference depth, if weighted by angle and noise. It leaves four steps down to
+the smallest weight 1."""
 LEAST_DEPTH = 0.05
-"""Least depth of the farthest reading for the step between pixels, metres."""
+"""Smallest value of the largest depth in ``pixel_step``, metres."""
 
 
 def reading_weights(
     depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise
 ) -> NDArray[np.uint8]:
-    """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` for a frontal one at the
+    """Weight (H, W) of each pixel: cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` at normal incidence and the
     reference depth."""
     weights = np.ones(depth.shape, dtype=np.uint8)
     observation_weights(0, len(depth), depth, intrinsics, single(noise), FRONTAL_WEIGHT, weights)
@@ -37,7 +37,7 @@ def reading_weights(
 
 @scalar
 def part(size, band):
-    """First element of a band, of ``size`` that all bands share evenly."""
+    """First element of a band if ``size`` elements are divided evenly."""
     return size * band // BANDS
 
 
@@ -46,25 +46,24 @@ def touch(
     leads, team, image, used, given, T_blocks_camera, intrinsics, shape, window, free_count, free_after, frame_number,
     stamps, p, depth, nearest, farthest, valid, weights, found, counts, largest,
 ):  # fmt: skip
-    """Prepare an image for the fusion, and find the window cells without voxels that its truncation bands touch.
+    """Prepare an image for fusion, and find the window cells without voxels that its truncation bands touch.
 
-    The first step of the team takes the readings that are used and the depth ranges of the tiles, the second weighs
-    them and marks the cells.
+    The first step of the team copies the used depths and computes the depth tiles. The second computes weights and
+    marks the cells.
 
     Args:
-        leads, team: As for ``run_team``.
         image: (H, W) float32, metres, 0 = none.
-        used: (H, W) bool, readings to be fused.
-        given: Whether ``weights`` holds the weights of the readings; else they are calculated.
+        used: (H, W) bool, pixels to fuse.
+        given: Whether ``weights`` is input; otherwise it is computed.
         T_blocks_camera: (3, 4) float32, camera to window blocks.
         intrinsics: (4,) float32 fx, fy, cx, cy.
         shape, window, free_count, free_after, frame_number, stamps: As for ``mark_blocks``.
         p: FusionParameters.
-        depth: (H, W) float32 out, the readings that are used.
+        depth: (H, W) float32 out, the used depths.
         nearest, farthest, valid: Depth tiles out, see ``tile_ranges``.
         weights: (H, W) uint8 in or out.
-        found: (BANDS, n) int32 out, cells; ``counts`` (BANDS,) int64 out, number of those that each band found.
-        largest: (BANDS,) float32 out, largest reading of each band, metres.
+        found: (BANDS, n) int32 out, cells; ``counts`` (BANDS,) int64 out, number of cells of each band.
+        largest: (BANDS,) float32 out, largest depth of each band, metres.
     """
     wide_vectors()
     h, tiles = image.shape[0], nearest.shape[0]
@@ -101,7 +100,7 @@ def touch(
 
 @scalar
 def pixel_step(largest, fx, block_size):
-    """Step between the pixels that are looked at: half a block at the farthest reading, 1 to 8 pixels."""
+    """Stride of the pixels that mark blocks: half a block at the largest depth, 1 to 8 pixels."""
     farthest = LEAST_DEPTH
     for band in range(BANDS):
         farthest = max(farthest, np.float64(largest[band]))
@@ -114,26 +113,26 @@ def fuse(
     farthest, valid, pixels, words, geometry, colors, parameters, parity, window, shape, origin, free_count,
     free_after, slots, repeats, visible, occupied, found, counts,
 ):  # fmt: skip
-    """Average an image into the blocks in view, and observe the space that it shows to be empty.
+    """Average an image into the blocks in view, and observe free space.
 
-    The first step of the team packs the pixels and finds the blocks in view; the second fuses into them and visits
-    every second plane of the window, where blocks without voxels may be seen to be empty.
+    The first step of the team packs the pixels and finds the blocks in view. The second fuses into them and visits
+    every second plane of the window for empty blocks.
 
     Args:
-        leads, team: As for ``run_team``.
         candidates, fused, turn: As for ``visible_slots``.
-        count: Number of equal frames that this one stands for.
-        averages: Whether to fuse; else the blocks in view are only found.
+        count: Number of equal frames that this frame stands for.
+        averages: Whether to fuse; otherwise the blocks in view are only found.
         T, intrinsics, size, coords: As for ``visible_slots``.
         nearest, farthest, valid: Depth tiles, see ``tile_ranges``.
-        depth, rgb, weights, pixels: As for ``pack_pixels``; ``words`` are the pixels as one array.
+        depth, rgb, weights, pixels: As for ``pack_pixels``; ``words`` is the flat view of ``pixels``.
         geometry, colors, parameters: As for ``integrate_blocks``.
-        parity: First plane of those that are visited; negative = none are.
+        parity: First visited plane; negative = none.
         window, shape, origin, free_count, free_after: As for ``observe_free``.
-        slots, repeats: (n,) int32 and float32 out, blocks in view and the frames that this one stands for in each.
-        visible: (BANDS + 1,) int64 out, blocks in view that each band found, and their number.
+        slots, repeats: (n,) int32 and float32 out, blocks in view, and number of frames that this frame stands for in
+            each.
+        visible: (BANDS + 1,) int64 out, blocks in view per band, and their total.
         occupied: (n,) int32 out, see ``integrate_blocks``.
-        found: (BANDS, n) int32 out, cells without an entry that were seen to be empty; ``counts`` (BANDS,) int64 out.
+        found: (BANDS, n) int32 out, empty cells without an entry; ``counts`` (BANDS,) int64 out.
     """
     wide_vectors()
     block_size = np.float32(BLOCK) * parameters.voxel_size
@@ -176,7 +175,7 @@ def fuse(
 
 @scalar
 def joined(size, count, slots, repeats, visible):
-    """Move what the bands wrote together, in their order; the frames are counted ``count`` times."""
+    """Move the results of all bands together, in their order; multiply the frames by ``count``. Returns the total."""
     total = 0
     for band in range(BANDS):
         first = part(size, band)
@@ -189,7 +188,7 @@ def joined(size, count, slots, repeats, visible):
 
 @scalar
 def farthest_tile(nearest):
-    """Largest of the finite depths of tiles: nothing farther lies in front of all readings."""
+    """Largest finite depth of the tiles; nothing beyond lies in front of all surfaces."""
     largest = np.float32(0)
     for z in nearest.flat:
         if np.isfinite(z):

@@ -1,5 +1,4 @@
-"""Sums over an image from which the noise of the gradients in the normal equations is computed
-(``core/tracking/observability.py``)."""
+"""Image sums for the noise of the gradients in the normal equations (``core/tracking/observability.py``)."""
 
 import numpy as np
 
@@ -10,8 +9,8 @@ from dudmap.core.formulas.residual import weigh
 NUM_MOMENTS = 10
 """Sums of w, w x, w y, w z, w xx, w xy, w xz, w yy, w yz and w zz over points."""
 NUM_SUMS = 3 + 2 * NUM_MOMENTS
-"""Readings on the map, their depths, the weights of their distances; moments of the noise of distances and intensities.
-"""
+"""Number of pixels on the map, sum of their depths, sum of their distance weights; moments of the noise of distances
+and of intensities."""
 
 
 @scalar
@@ -19,7 +18,7 @@ def noise_sums(
     stride, depth, residuals, weights, intrinsics, parameters, filter_px, scale_px, voxel_size, interpolated, steepest,
     sums,
 ):  # fmt: skip
-    """Add what every ``stride``-th reading, across and down, says of the noise of the gradients to ``sums``.
+    """Add the gradient noise of every ``stride``-th pixel, in rows and columns, to ``sums``.
 
     Args:
         stride: Pixels.
@@ -29,9 +28,9 @@ def noise_sums(
         intrinsics: (4,) float32 fx, fy, cx, cy.
         parameters: RegistrationParameters.
         filter_px: Standard deviation of the depth filter, pixels of this image.
-        scale_px: Pixels of this image per pixel of those that the map was made of.
+        scale_px: Pixels of this image per pixel of the images fused into the map.
         voxel_size: Metres.
-        interpolated: Variance of a component of the gradient of the trilinear interpolation of independent values.
+        interpolated: Variance of a gradient component of the trilinear interpolation of independent values.
         steepest: Largest tangent of the angle of incidence.
         sums: (NUM_SUMS,) float64 in and out; points about the camera's centre, camera axes.
     """
@@ -74,13 +73,13 @@ def noise_sums(
 
 @scalar
 def isotropic(moments, R, share, regular, out):
-    """Sum of w J' J with J = [I, -hat(p)] over points turned by a rotation, of which ``noise_sums`` gave the moments.
+    """Sum of w J' J with J = [I, -hat(p)] over rotated points, from the moments of ``noise_sums``.
 
     Args:
         moments: (NUM_MOMENTS,) float64.
         R: (3, 3) float64.
         share: Factor of the result.
-        regular: Share by which the diagonal is raised: readings in one line leave a rotation without any.
+        regular: Share by which the diagonal is raised, because collinear points leave one rotation undetermined.
         out: (6, 6) float64 out.
     """
     second = np.empty((3, 3))
@@ -114,14 +113,14 @@ def noise_information(
 ):  # fmt: skip
     """Sums of ``noise_sums``, and the information (2, 6, 6) that the noise of distances and of intensities adds to H.
 
-    Returns whether H has more than ``least`` times the information of the noise on every direction: whether their
-    difference is positive definite.
+    Returns whether H exceeds ``least`` times the noise information in every direction, that is, whether the difference
+    is positive definite.
 
     Args:
         stride, depth, residuals, weights, intrinsics, parameters, sums: As for ``noise_sums``.
-        numbers: Its other arguments.
+        numbers: The other arguments of ``noise_sums``.
         R: (3, 3) float64, camera to world.
-        of_intensity: Variance of a component of the gradient of intensities.
+        of_intensity: Variance of a component of the intensity gradient.
         regular: As for ``isotropic``.
         H: (6, 6) normal equations of both terms, world axes.
         least: Factor of the noise.
@@ -135,7 +134,7 @@ def noise_information(
     for term in range(2):
         share = stride * stride * (1.0 if term == 0 else of_intensity)
         isotropic(sums[3 + NUM_MOMENTS * term : 3 + NUM_MOMENTS * (term + 1)], R, share, regular, out[term])
-    L = np.empty((6, 6))  # Cholesky factor of the difference, while there is one
+    L = np.empty((6, 6))  # Cholesky factor of the difference, if it exists
     for j in range(6):
         for i in range(j, 6):
             value = H[i, j] - least * (out[0, i, j] + out[1, i, j])

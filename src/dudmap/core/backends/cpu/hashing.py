@@ -1,7 +1,7 @@
 """Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
 
-Open addressing with linear probing over a table of any size; a cell holds an entry's number or -1. Entries are
-never removed: a block that becomes free space keeps its entry and releases its voxels.
+Open addressing with linear probing and any table size; a cell holds an entry's number or -1. Entries are never removed:
+a block that becomes free space keeps its entry and releases its voxels.
 """
 
 import numpy as np
@@ -14,14 +14,16 @@ EMPTY = -1
 
 @kernel
 def _cell(x, y, z, size):
-    """First cell of block (x, y, z): the thesis' hash, mixed (Knuth's multiplicative method), scaled to the table."""
+    """First cell of block (x, y, z): the thesis' hash, mixed by Knuth's multiplicative method and scaled to the
+    table.
+    """
     mixed = ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) * np.int64(-7046029254386353131)
     return (((mixed >> 32) & 0xFFFFFFFF) * size) >> 32
 
 
 @kernel
 def place_of(table, coords, x, y, z):
-    """Cell of the table that holds the entry of block (x, y, z), or is free for it."""
+    """Cell of the table that holds the entry of block (x, y, z), or the free cell for it."""
     cell = _cell(x, y, z, table.size)
     while table[cell] != EMPTY:
         entry = table[cell]
@@ -33,7 +35,7 @@ def place_of(table, coords, x, y, z):
 
 @kernel
 def find_all(table, coords, wanted):
-    """Entries (n,) int32 of blocks ``wanted`` (n, 3), -1 where there is none."""
+    """Entries (n,) int32 of blocks ``wanted`` (n, 3), -1 = none."""
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
         out[n] = table[place_of(table, coords, np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2]))]
@@ -60,7 +62,7 @@ def insert_all(table, coords, num_entries, wanted):
 
 @kernel
 def rebuild(table, coords, num_entries):
-    """Fill an all-empty ``table`` with entries 0 to ``num_entries``."""
+    """Fill an empty ``table`` with entries 0 to ``num_entries``."""
     for entry in range(num_entries):
         x, y, z = np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2])
         table[place_of(table, coords, x, y, z)] = entry
@@ -68,7 +70,7 @@ def rebuild(table, coords, num_entries):
 
 @kernel
 def in_use(slots, entry_of):
-    """Slots among these (n,) that belong to an entry."""
+    """The slots (n,) that belong to an entry."""
     kept, count = np.empty_like(slots), 0
     for slot in slots:
         kept[count] = slot
@@ -78,11 +80,10 @@ def in_use(slots, entry_of):
 
 @kernel
 def fill_window(window, origin, coords, slot_of, num_entries, inside):
-    """Write every entry that lies in the window: its voxel slot, or ``-2 - entry`` for one without voxels.
+    """Write every entry inside the window: its voxel slot, or ``-2 - entry`` without voxels.
 
     Args:
-        window: (Wx, Wy, Wz) int32 in and out.
-        origin: (3,) int64 coordinates of its first block.
+        window, origin: (Wx, Wy, Wz) int32 in and out, and (3,) int64 coordinates of its first block.
         coords, slot_of, num_entries: The entries.
         inside: (num_entries,) int32 out, the slots in the window.
 

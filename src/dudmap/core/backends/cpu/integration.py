@@ -11,9 +11,10 @@ from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, is_occupied, pack
 
 @scalar
 def used_readings(row_start, row_stop, depth, used, farthest, out):
-    """Readings of ``depth`` (H, W) up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0.
+    """Copy depths of ``depth`` (H, W) up to ``farthest`` metres at the pixels ``used`` (H, W) bool; the others become
+    0.
 
-    Returns the largest of those in the rows from ``row_start`` up to ``row_stop``.
+    Returns the largest copied depth in rows ``row_start`` to ``row_stop``.
     """
     largest = np.float32(0)
     for v in range(row_start, row_stop):
@@ -28,18 +29,16 @@ def used_readings(row_start, row_stop, depth, used, farthest, out):
 
 @scalar
 def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
-    """Pack what the fusion reads of each pixel into two words (``core/formulas/voxel.py``), so that it loads little.
+    """Pack the fusion's input of each pixel into two words (``core/formulas/voxel.py``), to reduce loads.
 
-    The depth up to which a pixel certainly sees free space is the nearest reading of its 3x3 neighbourhood less the
-    truncation band there.
+    The free depth of a pixel is the nearest depth of its 3x3 neighbourhood minus the truncation band there.
 
     Args:
-        row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
         rgb: (H, W, 3) uint8.
-        weights: (H, W) uint8, weight of each reading.
+        weights: (H, W) uint8, weight of each pixel.
         parameters: FusionParameters.
-        pixels: (H * W + 1, 2) int32 out; the last row is left as it is.
+        pixels: (H * W + 1, 2) int32 out; the last row does not change.
     """
     wide_vectors()
     h, w = depth.shape
@@ -73,18 +72,17 @@ def integrate_blocks(
     """Fuse one frame into blocks ``slots[start:stop]`` (eq. 4.18-4.23).
 
     Args:
-        start, stop: Range of blocks.
         slots: (n,) int32.
-        repeats: (n,) float32, number of frames that this one stands for.
-        coords: (num_slots, 3) int32 from the origin of T.
+        repeats: (n,) float32, number of frames that this frame stands for.
+        coords: (num_slots, 3) int32 relative to the origin of T.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
         pixels: (2 * (H * W + 1),) int32, the words of ``pack_pixels``.
-        map_geometry, map_colors: (num_slots * 512,) int32.
+        map_geometry, map_colors: (num_slots * 512,) int32, packed.
         parameters: FusionParameters.
-        occupied: (n,) int32 out: voxels that hold a surface or were never observed; 1 for any number of them where
-            the image changes none.
+        occupied: (n,) int32 out: number of voxels that hold a surface or were never observed. For blocks that the image
+            does not change, 1 stands for any positive number.
     """
     wide_vectors()
     voxel_size = parameters.voxel_size
@@ -108,12 +106,12 @@ def integrate_blocks(
                 local_y[n] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
                 local_z[n] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
                 lowest = min(lowest, local_z[n])
-    # few arrays, since the compiler vectorises no loop that needs many checks whether two of them overlap
+    # few arrays, because the compiler vectorises no loop that needs many overlap checks
     pixel = np.empty(512, np.int32)
     seen = np.empty(512, np.int64)
-    words = seen.view(np.int32)  # reading and colour of the voxel's pixel, side by side
-    parts = np.empty((2, 512), np.int32)  # the same apart, without which half as many voxels are fused at a time
-    known = np.empty((2, 512), np.float32)  # depth of the voxel; share in which it takes on the pixel's colour
+    words = seen.view(np.int32)  # depth and colour word of the voxel's pixel, side by side
+    parts = np.empty((2, 512), np.int32)  # the same words in separate rows, for full vector width
+    known = np.empty((2, 512), np.float32)  # depth of the voxel; share of the pixel's colour
     max_u, max_v = np.float32(width), np.float32(height)
 
     # the voxels of the next block are prefetched a quarter at a time, between the loops
@@ -148,10 +146,10 @@ def integrate_blocks(
         first = np.int64(slot) * 512
         geometry = map_geometry[first : first + 512]
         count = repeats[block]
-        num_occupied = painted = zero  # counted in float32: an integer sum has 64 bits, half as many in a register
+        num_occupied = painted = zero  # in float32: an integer sum has 64 bits, half as many per register
         behind = min(band_behind(farthest, parameters.band), parameters.band.limit)
         if (farthest == zero) | (farthest - (bz + lowest) <= -behind):
-            # no voxel has a reading, or all lie behind the band of the farthest: the image changes none of them
+            # no voxel projects to a depth, or all lie behind the farthest band: the image changes none of them
             occupied[block] = 0
             for n in range(512):
                 if is_occupied(geometry[n], parameters):
@@ -175,16 +173,15 @@ def integrate_blocks(
 
 @scalar
 def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out):
-    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal one at the reference depth gets
-    ``best``.
+    """Weight of each pixel: cos(theta) / err(z) (eq. 4.20), scaled to ``best`` at normal incidence and the reference
+    depth.
 
     Args:
-        row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
         intrinsics: (4,) float32.
         noise: SensorNoise, whose sigma(z) is err(z).
-        best: Weight of a frontal reading at the reference depth.
-        out: (H, W) uint8 out, at least 1 where there is a reading.
+        best: Weight at normal incidence and the reference depth.
+        out: (H, W) uint8 out, at least 1 for pixels with depth.
     """
     wide_vectors()
     h, w = depth.shape

@@ -1,6 +1,6 @@
 """Label images: mixture of residual densities, mean-field smoothing, region growing, upsampling to full resolution.
 
-The scalar formulas stand first, each in a function of its own; the loops over histograms and images follow.
+The scalar formulas come first; the loops over histograms and images follow.
 """
 
 import numpy as np
@@ -13,12 +13,12 @@ f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
 """Image rows per band of the upsampling."""
 DISTANCE_COST = np.float32(1e-4)
-"""Cost of one low-resolution pixel of image distance in the upsampling, metres of depth difference: less than a depth
-sensor resolves, so that the distance decides between equal depths only."""
+"""Cost of one low-resolution pixel of image distance in the upsampling, metres of depth difference. It is below the
+resolution of depth sensors, so that image distance decides only between equal depths."""
 SMALLEST = np.float64(1e-300)
-"""Least sum of two densities: keeps the quotient of two that vanish finite."""
+"""Smallest sum of two densities; keeps the quotient finite if both vanish."""
 MISSING_COST = np.float32(64)
-"""Cost of pairing a pixel that has a depth with one that has none, metres: more than any depth difference."""
+"""Cost of pairing a pixel with depth and a pixel without, metres: more than any depth difference."""
 
 
 @scalar
@@ -27,8 +27,7 @@ def half_normal(square, prior, sigma):
 
     Args:
         square: Squared normalised residual.
-        prior: Prior of the component.
-        sigma: Its standard deviation.
+        prior, sigma: Prior and standard deviation of the component.
     """
     return prior / sigma * exp(f64(-0.5) * square / (sigma * sigma))
 
@@ -76,15 +75,15 @@ def mean_spin(log_odds):
 
 @scalar
 def same_surface(z, z_neighbour, tolerance):
-    """Whether two neighbouring pixels both have a depth, and depths that differ by no more than ``tolerance``."""
+    """Whether two neighbouring pixels both have depth, and depths that differ by at most ``tolerance``."""
     zero = np.float32(0)
     return (z_neighbour > zero) & (z > zero) & (abs(z_neighbour - z) <= tolerance)
 
 
 @scalar
 def depth_cost(z, z_low):
-    """Cost of giving a full-resolution pixel of depth ``z`` the label of a low-resolution one: their depth difference,
-    metres, or ``MISSING_COST`` where only one of them has a depth."""
+    """Cost of giving a full-resolution pixel of depth ``z`` a low-resolution label: depth difference, metres, or
+    ``MISSING_COST`` if only one has depth."""
     zero = np.float32(0)
     return abs(z_low - z) if (z > zero) == (z_low > zero) else MISSING_COST
 
@@ -96,16 +95,16 @@ def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds,
     Args:
         counts: (n,) float64.
         centers: (n,) float64, normalised residuals.
-        iterations: Most iterations.
-        start: First prior of the dynamic density, standard deviations of the static and of the dynamic one.
+        iterations: Largest number of iterations.
+        start: Initial prior of the dynamic density, standard deviations of the static and of the dynamic density.
         prior_bounds: Bounds of the prior of the dynamic density.
         static_bounds: Bounds of the standard deviation of the static density.
-        separation: Least ratio of the standard deviations, dynamic : static.
+        separation: Smallest ratio of the standard deviations, dynamic : static.
         max_sigma: Largest standard deviation of the dynamic density.
 
     Returns:
-        Prior of the dynamic density, standard deviations of the static and of the dynamic one; ``start`` where the
-        histogram is empty.
+        Prior of the dynamic density, standard deviations of the static and of the dynamic density; ``start`` for an
+        empty histogram.
     """
     total = counts.sum()
     prior, static, dynamic = start
@@ -136,7 +135,7 @@ def grow_regions(seeds, open_pixels, depth, tolerance):
 
     Args:
         seeds: (h, w) bool.
-        open_pixels: (h, w) bool, pixels a region may grow into.
+        open_pixels: (h, w) bool, pixels that a region may grow into.
         depth: (h, w) float32, metres, 0 = none.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
 
@@ -228,14 +227,15 @@ def mean_field(evidence, depth, tolerance, coupling, iterations):
 def upsample_labels(
     low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32], stride: int
 ) -> NDArray[np.bool_]:
-    """Labels at full resolution: each pixel takes that of the adjacent low-resolution pixel with the nearest depth.
+    """Labels at full resolution: each pixel takes the label of the adjacent low-resolution pixel with the nearest
+    depth.
 
     Args:
         low: (h, w) bool.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
-        stride: Full-resolution pixels per low-resolution pixel; low-resolution pixel k covers the columns (and rows)
-            from k * stride to (k + 1) * stride - 1.
+        stride: Full-resolution pixels per low-resolution pixel; low-resolution pixel k covers columns (and rows) k *
+            stride to (k + 1) * stride - 1.
 
     Returns:
         (H, W) bool.
@@ -264,13 +264,13 @@ def upsample(leads, team, low, low_depth, depth, stride, out):
 
 @scalar
 def opened(mask, half):
-    """Mask (h, w) bool without parts narrower than a square of 2 ``half`` + 1 pixels: eroded, then dilated by it.
+    """Morphological opening of a mask (h, w) bool with a square of 2 ``half`` + 1 pixels.
 
-    What lies outside of the image neither erodes nor dilates.
+    Pixels outside the image neither erode nor dilate.
     """
     h, w = mask.shape
     across, out = np.empty((h, w), np.bool_), mask.copy()
-    for turn in range(2):  # the pixels outside are dilated, then those inside
+    for turn in range(2):  # the outside is dilated, then the inside
         for v in range(h):
             for u in range(w):
                 across[v, u] = out[v, u] == (turn == 1)
@@ -303,7 +303,7 @@ def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
     for u in range(width):
         across[0, u] = DISTANCE_COST * np.float32((2 * u + 1 - stride) % (2 * stride)) / np.float32(2 * stride)
         across[1, u] = DISTANCE_COST - across[0, u]
-    # depth and label of the four low-resolution pixels whose centres surround each pixel, from the upper left on
+    # depth and label of the four low-resolution pixels around each pixel, starting at the upper left
     adjacent, marks = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
     last = np.int64(-(2**31))
     first, stop = 0, 0
@@ -325,7 +325,7 @@ def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
                 adjacent[2, u], marks[2, u] = low_depth[lower, left], np.float32(low[lower, left])
                 adjacent[3, u], marks[3, u] = low_depth[lower, right], np.float32(low[lower, right])
         target = out[v]
-        target[:] = 0  # what has no marked pixel beside it
+        target[:] = 0  # pixels without a marked neighbour
         row = depth[v]
         below = DISTANCE_COST * np.float32((2 * v + 1 - stride) % (2 * stride)) / np.float32(2 * stride)
         for u in range(first, stop):

@@ -1,4 +1,4 @@
-"""Dense systems of equations of some hundred unknowns, on one thread."""
+"""Dense linear systems of a few hundred unknowns, on one thread."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from dudmap.core.backends.threads import kernel
 def solved(H: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solution (n,) or (n, k) of ``H x = right`` with a symmetric positive definite H (n, n).
 
-    The threads of a BLAS would keep the cores that the tracking needs busy for 50 ms after every call.
+    A BLAS is not used, because its threads keep the cores of the tracking busy for 50 ms after every call.
     """
     columns = np.array(right.T.reshape(-1, len(H)), order="C")
     solve(np.array(H, order="C"), columns)

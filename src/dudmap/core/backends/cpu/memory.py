@@ -8,15 +8,17 @@ from numba.extending import intrinsic
 from dudmap.core.backends.threads import scalar
 
 LINES = 16
-"""Cache lines of one call of ``prefetch_quarter``: as many as a core of most processors can wait for; more of them at
-once hold up the loads that follow. They are a quarter of the words of a block, of 512."""
+"""Cache lines per call of ``prefetch_quarter``, a quarter of a block of 512 words. Most cores can have this many
+loads pending; more would delay the following loads."""
 LINE = 64
 """Bytes of a cache line of most processors."""
 
 
 @intrinsic
 def load_pair(typing_context, words, index):
-    """Two consecutive elements of a flat int32 array, from ``index`` on, as one int64; the first is its lower half."""
+    """Two consecutive elements of a flat int32 array, starting at ``index``, as one int64; the first is its lower
+    half.
+    """
 
     def generate(context, builder, signature, arguments):
         pair = ir.IntType(64)
@@ -27,7 +29,7 @@ def load_pair(typing_context, words, index):
 
 @intrinsic
 def prefetch(typing_context, array, index):
-    """Prefetch the cache line of an element of a flat array: a hint, which changes no result."""
+    """Prefetch the cache line of an element of a flat array: a hint that changes no result."""
 
     def generate(context, builder, signature, arguments):
         byte_pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -50,6 +52,6 @@ def _place(context, builder, signature, arguments):
 
 @scalar
 def prefetch_quarter(words, index):
-    """Prefetch a quarter of a block of a flat array of 32-bit words, from an index on."""
+    """Prefetch a quarter of a block of a flat array of 32-bit words, starting at an index."""
     for line in range(LINES):
         prefetch(words, index + np.uintp(line * LINE // 4))

@@ -1,9 +1,10 @@
 """Marching cubes over voxel blocks with shared vertices (Lorensen & Cline 1987; thesis section 4.5).
 
-A vertex belongs to the lattice edge it lies on and an edge to the voxel at its lower end, so that every vertex exists
-once, also where blocks meet. Four passes over the blocks: the case of each cell, the vertices that each voxel
-owns, and, once the offset of each block is known, vertices and triangles. The tables are arguments, not globals: a
-global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
+A vertex belongs to its lattice edge, and an edge to the voxel at its lower end, so that every vertex exists once, even
+between blocks. There are four passes over the blocks: cases of the cells, vertices owned by each voxel, and then, with
+the block offsets known, vertices and triangles.
+
+The tables are arguments, because a global array is frozen into compiled code and Numba's cache ignores its changes.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ BAND = 256
 
 @kernel
 def _corner_words(geometry, near, row, words):
-    """Words (9, 9, 9) of a block's voxels and of those one step beyond its upper sides; 0 where there is no block."""
+    """Words (9, 9, 9) of a block's voxels and of the voxels one step beyond its upper sides; 0 without a block."""
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
         slot = near[row, 13 + 9 * dx + 3 * dy + dz]
@@ -39,10 +40,10 @@ def _corner_words(geometry, near, row, words):
 
 @kernel
 def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
-    """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or a trusted corner keep their 0.
+    """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or with an untrusted corner keep 0.
 
-    A cell across which the distance jumps by more than ``max_jump`` steps is an occlusion boundary, where the band
-    behind one object meets the free space beside it, and holds no surface.
+    A cell with a distance jump above ``max_jump`` steps holds no surface. It is an occlusion boundary between the band
+    behind one object and adjacent free space.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -89,7 +90,7 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
 
 @scalar
 def _edge(row, n, corner, near, row_of):
-    """Row of the block, and number there, of the voxel at a corner of cell ``n`` of the block in ``row``."""
+    """Row of the block, and number in it, of the voxel at a corner of cell ``n`` of the block in ``row``."""
     i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
     if (i | j | k) & 8:
         row = np.int64(row_of[near[row, 13 + 9 * (i >> 3) + 3 * (j >> 3) + (k >> 3)]])
@@ -98,8 +99,8 @@ def _edge(row, n, corner, near, row_of):
 
 @kernel
 def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned):
-    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a triangle, and count
-    them block by block."""
+    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex, and count the
+    vertices per block."""
     for row in range(len(cases)):
         for n in range(512):
             case = cases[row, n]
@@ -121,7 +122,7 @@ def _write_vertices(
     start, stop, geometry, colors, slots, coords, near, flags, begin, voxel_size, first, vertices, vertex_colors,
     normals,
 ):  # fmt: skip
-    """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
+    """Position, colour and normal of each vertex; ``first`` receives each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
     for row in range(start, stop):
@@ -172,7 +173,7 @@ def _write_vertices(
 
 @kernel
 def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, begin, triangle_count, triangles, faces):
-    """Triangles of the cells of blocks ``start`` to ``stop`` as numbers of vertices."""
+    """Triangles of the cells of blocks ``start`` to ``stop`` as vertex numbers."""
     for row in range(start, stop):
         number = begin[row]
         if number == begin[row + 1]:
@@ -191,13 +192,13 @@ def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, b
 
 @kernel
 def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
-    """Copy shared vertices for each chunk: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
+    """Copy shared vertices for each chunk; chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
 
     Args:
         begin: (chunks + 1,) int64.
         num_vertices: Number of shared vertices.
         faces: (F, 3) int32.
-        vertex_ids: (>= sum of the chunks' vertices,) int32 out: the shared vertex that each vertex is a copy of.
+        vertex_ids: (>= sum of the chunks' vertices,) int32 out: shared vertex of each copy.
         local_faces: (F, 3) int32 out, vertices numbered within the chunk.
         first_vertex: (chunks + 1,) int64 out, into ``vertex_ids``.
     """
@@ -235,9 +236,9 @@ def extract_chunks(
         slots: (n,) int32 of the blocks.
         coords: (slots, 3) block coordinates.
         near: (n, 27) int32, see ``VoxelBlocks.neighbourhood``.
-        parameters: Of the extraction.
-        chunks: (n,) group of each block; -1 = it only lends its voxels.
-        covered: (n, 8) octants, number 4 dx + 2 dy + dz, whose cells are left out; None = none.
+        parameters: Parameters of the extraction.
+        chunks: (n,) group of each block; -1 = it only provides border voxels.
+        covered: (n, 8) octants, number 4 dx + 2 dy + dz, whose cells are omitted; None = none.
     """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
@@ -246,7 +247,7 @@ def extract_chunks(
         geometry, colors, slots[order], coords, near[order], parameters, int(per_chunk.sum()),
         None if covered is None else covered[order],
     )  # fmt: skip
-    if num_chunks == 1 and per_chunk[0] == len(slots):  # no vertex is only lent
+    if num_chunks == 1 and per_chunk[0] == len(slots):  # all blocks belong to the chunk
         return [Mesh(vertices, faces, vertex_colors, normals)]
     begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
@@ -272,12 +273,12 @@ def _extract(
     num_meshed: int,
     covered: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
-    face (n + 1,) of each block."""
+    """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the first face (n +
+    1,) of each block."""
     n = len(slots)
     slots, row_of = np.ascontiguousarray(slots, dtype=np.int32), np.full(len(geometry), -1, dtype=np.int32)
     row_of[slots] = np.arange(n, dtype=np.int32)
-    near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))  # blocks that are not listed count as absent
+    near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))  # unlisted blocks count as absent
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.zeros((n, 512), dtype=np.uint8)
@@ -317,5 +318,5 @@ def _extract(
 
 
 def _offsets(counts: list[NDArray]) -> NDArray[np.int64]:
-    """Offset of the first item of each block, and the number of all items at the end."""
+    """Offset of the first item of each block, and the total at the end."""
     return np.concatenate([[0], *counts]).astype(np.int64).cumsum()

@@ -1,8 +1,8 @@
-"""The eight voxels around points of the map: what a trilinear interpolation loads.
+"""The eight voxels around points of the map, for trilinear interpolation.
 
-For two thirds of all points one block holds all eight, and four loads of two words fetch them. A branch on that is
-mispredicted for every third point: of a row of points, those of the other third are listed first, without a branch, and
-looked up once more on their own. The voxels of points that come later in the row are prefetched.
+For two thirds of all points one block holds all eight voxels, and four loads of two words fetch them. A branch on this
+would be mispredicted for every third point. Therefore the other third of a row is listed without a branch, and looked
+up separately afterwards. The voxels of later points in the row are prefetched.
 """
 
 import numpy as np
@@ -11,17 +11,18 @@ from dudmap.core.backends.cpu.memory import load_pair, prefetch
 from dudmap.core.backends.threads import kernel, scalar
 
 AHEAD = 16
-"""Points between that whose voxels are loaded and that whose voxels are prefetched."""
+"""Distance between the point that is loaded and the point that is prefetched."""
 
 
 @kernel
 def load_corners(window, geometry, cell, voxel, size_y, size_z, corners, u):
-    """Words of the eight voxels around a point into ``corners[:, u]``, int32, corner 4 dx + 2 dy + dz; 0 = unknown.
+    """Load the words of the eight voxels around a point into ``corners[:, u]``, int32, corner 4 dx + 2 dy + dz; 0 =
+    unknown.
 
-    ``cell`` and ``voxel`` say which one lies at its lower corner. ``corners`` has two axes: eight words in a row would
-    be read back by one vector load, which waits for all stores.
+    ``cell`` and ``voxel`` identify the voxel at the lower corner. ``corners`` has two axes, because eight consecutive
+    words would be read by one vector load, which waits for all stores.
     """
-    # 1 along the axes where the next voxel lies in the next block
+    # 1 along the axes whose next voxel lies in the next block
     x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3
     for corner in range(8):
         dx, dy, dz = corner >> 2, (corner >> 1) & 1, corner & 1
@@ -38,13 +39,13 @@ def _voxel(geometry, slot, voxel):
 
 @scalar
 def last_corner(shape):
-    """Largest x, y, z of a lattice point of a window of ``shape`` blocks that has eight voxels around it, int32."""
+    """Largest x, y, z of a lattice point with eight voxels around it in a window of ``shape`` blocks, int32."""
     return np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
 
 
 @scalar
 def locate(x, y, z, last, size_y, size_z):
-    """Where ``load_row`` finds the eight voxels around a point of the window's lattice, voxels.
+    """Address, for ``load_row``, of the eight voxels around a point of the window's lattice, voxels.
 
     Args:
         x, y, z: The point, float32.
@@ -52,8 +53,8 @@ def locate(x, y, z, last, size_y, size_z):
         size_y, size_z: Blocks of the window.
 
     Returns:
-        Cell; voxel; 1 where the eight voxels lie in more than one block, else 0; whether the point lies inside, without
-        which the others are those of another point; fractions of its coordinates.
+        Cell; voxel; 1 if the eight voxels lie in several blocks, else 0; whether the point lies inside; fractions of
+        its coordinates. For a point outside, the other values belong to another point.
     """
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
     jx, jy, jz = np.int32(lx), np.int32(ly), np.int32(lz)
@@ -71,16 +72,13 @@ def locate(x, y, z, last, size_y, size_z):
 def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
-    Those of the points, a third, whose eight voxels lie in several blocks are looked up on their own.
+    The third of the points with voxels in several blocks is looked up separately.
 
     Args:
-        window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
-        shape: (3,) int64 blocks of the window.
-        geometry: (slots * 512,) int32 packed voxels.
-        cells: (w + AHEAD,) int32, cell of the window that holds the point; any cell behind the last one.
+        window, shape, geometry: See ``VoxelGrid``; ``geometry`` is flat.
+        cells: (w + AHEAD,) int32, cell of the window that holds the point; any cell after the last point.
         voxels: (w + AHEAD,) int32, number within the block of the voxel at its lower corner.
-        crossing: (w,) int32, 1 where the eight voxels of a point lie in more than one block, else 0, and 0 for points
-            whose words are not used.
+        crossing: (w,) int32, 1 if the eight voxels of a point lie in several blocks, else 0; 0 for unused points.
         outer: (w,) int32, work space.
         words: (8, >= w) int32 out, corner 4 dx + 2 dy + dz.
     """
@@ -109,6 +107,6 @@ def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
 
 @scalar
 def _first_word(window, cell, voxel):
-    """Place of a voxel's word, and all bits where there is one, else none."""
+    """Index of a voxel's word, and a mask: all bits if it exists, else none."""
     slot = np.int64(window[np.uintp(cell)])
     return slot * 512 + voxel, ~(slot >> 63)

@@ -1,4 +1,4 @@
-"""The distance field of a map with voxels of one or of several sizes, as views read it."""
+"""Distance field of a map with one or several voxel sizes, for rendering."""
 
 from typing import NamedTuple
 
@@ -12,12 +12,12 @@ from dudmap.core.formulas.voxel import sdf_steps
 
 
 class FinerLevels(NamedTuple):
-    """Finer levels of a map, those with the larger voxels first.
+    """Finer levels of a map, larger voxels first.
 
     Attributes:
-        children: Of each level (slots of the next coarser, 8) int32: slot of the block with half the voxel size in
-            each octant of a block, -1 = none. There may be fewer rows than slots: those have no children.
-        geometry, colors: Of each level (slots, 512) int32 packed voxels and colours.
+        children: Per level (slots of the next coarser, 8) int32: slot of the block with half the voxel size in each
+            octant of a block, -1 = none. Slots beyond the last row have no children.
+        geometry, colors: Per level (slots, 512) int32 packed voxels and colours.
     """
 
     children: tuple[NDArray[np.int32], ...] = (np.full((0, 8), -1, np.int32),)
@@ -42,8 +42,11 @@ def block_at(window, shape, children, level, i, j, k):
 
 @scalar
 def load(window, shape, children, voxels, level, x, y, z, corners):
-    """Words of the voxels of a level around a point of the window's lattice into ``corners[:, 0]``, number 4 dx + 2 dy
-    + dz, 0 = none; returns the place of the point between them, in [0, 1)."""
+    """Load the words of a level's voxels around a point of the window's lattice into ``corners[:, 0]``, number 4 dx + 2
+    dy + dz, 0 = none.
+
+    Returns the position of the point between them, in [0, 1).
+    """
     scale = np.float32(1 << level)
     x, y, z = x * scale, y * scale, z * scale
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
@@ -71,8 +74,10 @@ def blend(values, ax, ay, az):
 
 @scalar
 def sample(window, shape, children, voxels, x, y, z, least, corners, values):
-    """Signed distance in stored steps at lattice point (x, y, z) inside the window by the smallest voxels that are
-    known, and their level; NaN where none are."""
+    """Signed distance in stored steps at lattice point (x, y, z) inside the window, and its level; NaN if unknown.
+
+    The smallest known voxels are used.
+    """
     for above in range(len(voxels)):
         level = len(voxels) - 1 - above
         if level > 0:

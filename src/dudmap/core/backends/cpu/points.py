@@ -1,4 +1,4 @@
-"""Trilinear samples of the whole map at any points, through the hash table: for work that is not done every frame."""
+"""Trilinear samples of the whole map at any points, through the hash table; for tasks not done every frame."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from dudmap.core.backends.cpu.hashing import place_of
 from dudmap.core.backends.threads import kernel
 
 UNSEEN, OBSERVED, EMPTY = 0, 1, 2
-"""State of a point: a voxel around it was never observed; all were; all lie in blocks of free space without voxels."""
+"""State of a point: a voxel around it was never observed; all were observed; all lie in free blocks without voxels."""
 SDF, WEIGHT, INTENSITY, RED = 0, 4, 5, 9
-"""First columns of the distance (steps) and its gradient (per voxel), the weight, the intensity and its gradient, and
-the colour (quarters of a grey level) in the rows of ``sample_points``."""
+"""First columns in the rows of ``sample_points``: distance (steps) and its gradient (per voxel), weight, intensity
+and its gradient, colour (quarters of a grey level)."""
 COLUMNS = 12
 
 
@@ -17,11 +17,13 @@ COLUMNS = 12
 def sample_points(table, coords, slot_of, free_count, geometry, colors, points, motion, free_steps, free_weight):
     """Samples (n, COLUMNS) float32 and states (n,) uint8 of a map at points (n, 3), in voxels.
 
-    The points are first moved by a rigid motion (3, 4).
-    Distance and intensity are interpolated trilinearly and carry their gradients, the colour is interpolated among
-    the voxels that have one, the weight is the smallest of the eight voxels. A block without voxels that was seen to
-    be empty k times lies ``free_steps`` in front of any surface with the weight ``k free_weight``. The intensity is 0
-    where one of the voxels has none, and the colour where none has one.
+    - The points are first moved by a rigid motion (3, 4).
+    - Distance and intensity are interpolated trilinearly, with gradients.
+    - The intensity is 0 if one of the eight voxels has none.
+    - The colour is interpolated among the voxels that have one, and 0 without any.
+    - The weight is the smallest of the eight voxels.
+    - A block without voxels, observed as empty k times, has the distance ``free_steps`` and the weight ``k
+      free_weight``.
     """
     out = np.zeros((len(points), 12), np.float32)
     states = np.zeros(len(points), np.uint8)

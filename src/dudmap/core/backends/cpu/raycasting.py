@@ -1,7 +1,7 @@
-"""The map seen from a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
+"""Rendering of the map at a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
 
-Blocks are first splatted into an image of tiles with the nearest and farthest depth at which a surface can lie
-(Prisacariu et al. 2017), so that a ray starts just before the first block it can meet and ends behind the last one.
+Blocks are first splatted into an image of tiles with the depth range in which a surface can lie (Prisacariu et al.
+2017). A ray then starts just before the first block and ends behind the last one.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ FAR = np.float32(2)
 
 @kernel
 def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_max, near, far):
-    """Widen the depth ranges of all tiles that the blocks with voxels in planes ``start`` to ``stop`` may cover.
+    """Extend the depth ranges of all tiles that the blocks with voxels in planes ``start`` to ``stop`` may cover.
 
     Args:
         start, stop: First and last plane of the window.
@@ -32,7 +32,7 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
         T: (3, 4) float32, block indices of the window to metres in the camera frame; block centres at whole numbers.
         intrinsics: (4,) float32 fx, fy, cx, cy.
         size: (2,) int64 image height and width.
-        radius: Of the sphere around a block, metres.
+        radius: Radius of the sphere around a block, metres.
         depth_min, depth_max: Limits of the view, metres.
         near, far: (tiles down, tiles across) float32, in and out.
     """
@@ -77,8 +77,11 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
 
 @scalar
 def step_length(distance):
-    """Step along a ray, voxels, at a signed distance (voxels): a little less than the distance, since a projective
-    distance is an upper bound, but never so short that the tracing stalls."""
+    """Step along a ray, voxels, at a signed distance (voxels).
+
+    It is shorter than the distance, because a projective distance is an upper bound, but long enough that the tracing
+    does not stall.
+    """
     ahead, back = max(np.float32(0.8) * distance, np.float32(0.5)), max(np.float32(-0.8) * distance, np.float32(1))
     return ahead if distance > np.float32(0) else back
 
@@ -92,8 +95,10 @@ def to_block_boundary(p, d, inverse):
 
 @kernel
 def inside_window(shape, o, d, t, end, nudge):
-    """Part of the ray ``o + t d`` between ``t`` and ``end`` that lies in the window less its last voxels and
-    ``nudge``; its end is before its beginning if there is none."""
+    """Part of the ray ``o + t d`` between ``t`` and ``end`` inside the window, without its last voxels and ``nudge``.
+
+    An empty part ends before its beginning.
+    """
     zero = np.float32(0)
     for axis in range(3):
         last = np.float32(8 * shape[axis] - 1)
@@ -112,9 +117,9 @@ def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corne
     Far from the surface the nearest voxel gives the step; the field is interpolated only within FAR of it.
 
     Args:
-        window: (Wx * Wy * Wz,) int32; negative entries are skipped as a whole.
+        window: (Wx * Wy * Wz,) int32; blocks with negative entries are skipped.
         shape: (3,) int64 blocks of the window.
-        children, voxels: As of ``trace_rows``.
+        children, voxels: As for ``trace_rows``.
         o, d: (3,) float32, voxels, and voxels per metre of depth.
         t, end: Depths, metres.
         unit: Voxels per step of the stored distance.
@@ -154,7 +159,7 @@ def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corne
             continue
         value, level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
         value *= unit
-        scale = np.float32(1 << level)  # the least step is a share of the voxels that were read
+        scale = np.float32(1 << level)  # the smallest step is a share of the voxel size that was read
         if value > zero:
             t_before, before = t, value
             t += step_length(value * scale) / scale * per_voxel
@@ -171,8 +176,10 @@ def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corne
 
 @scalar
 def _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, values):
-    """Zero between two depths by false position (Illinois variant); ``ends`` are the one outside and the distance
-    there, and the same inside."""
+    """Zero between two depths by false position (Illinois variant).
+
+    ``ends`` are depth and distance outside, and depth and distance inside.
+    """
     a, at_a, b, at_b = ends
     side = 0
     t = a + (b - a) * at_a / (at_a - at_b)
@@ -198,7 +205,9 @@ def _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, v
 
 @scalar
 def _shade(window, shape, children, voxels, colors, x, y, z, least, corners, values, color, normal):
-    """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 where it has no slope."""
+    """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 if the gradient
+    vanishes.
+    """
     one, level = np.float32(1), 0
     if len(voxels) > 1:
         _, level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
@@ -224,11 +233,11 @@ def trace_rows(
     row_start, row_stop, window, shape, children, voxels, colors, intrinsics, T, near, far, depth_min, depth_max, unit,
     least, depth, color, normals,
 ):  # fmt: skip
-    """Fill pixel rows ``row_start`` to ``row_stop`` of a view of the map.
+    """Render pixel rows ``row_start`` to ``row_stop`` of a view of the map.
 
-    ``voxels`` and ``colors`` hold the words (slots * 512,) int32 of each level, the largest voxels first, ``children``
-    the links from one level to the next (``FinerLevels``). ``T`` (3, 4) float32 maps metres in the camera frame to the
-    lattice of the window.
+    ``voxels`` and ``colors`` hold the words (slots * 512,) int32 of each level, larger voxels first. ``children`` links
+    each level to the next (``FinerLevels``). ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the
+    window.
     """
     corners = np.empty((8, 1), np.int32)
     values = np.empty(8, np.float32)
@@ -265,11 +274,11 @@ def raycast(
     parameters: RaycastParameters,
     finer: FinerLevels,
 ) -> RaycastResult:
-    """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
+    """Depth, colour and normals of the first surface at each pixel of an image (H, W).
 
-    A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes from
-    unknown space straight to the inside, there is none. Where a map has voxels of several sizes, ``grid`` are the
-    largest, and the smallest that are known count.
+    A surface is a change of the signed distance from positive to negative between trusted voxels. A ray that enters the
+    inside directly from unknown space hits no surface. With several voxel sizes, ``grid`` holds the largest voxels, and
+    the smallest known ones are used.
     """
     grid = grid.on_host()
     shape = grid.shape
@@ -323,8 +332,8 @@ def tile_depths(
 def motions(
     grid: VoxelGrid, T_world_camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], np.float32]:
-    """Motions (3, 4) from blocks of the window to metres in the camera frame and from there to the window's lattice,
-    and the radius of the sphere around a block, metres."""
+    """Motions (3, 4) from blocks of the window to metres in the camera frame, and from there to the window's
+    lattice; radius of the sphere around a block, metres."""
     voxel_size = grid.voxel_size
     corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]

@@ -1,4 +1,4 @@
-"""Loop over the pixels of an image whose rows were taken one after the other: what a global shutter would have seen."""
+"""Rectification of rolling-shutter images: loop over the pixels of the global-shutter image."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
 
 SAME_SURFACE = np.float32(0.03)
-"""Depths that differ by less than this share belong to one surface and are interpolated."""
+"""Largest difference, as a share of the depth, of depths that belong to one surface and are interpolated."""
 
 
 @scalar
@@ -49,22 +49,21 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
 def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, words, out, colors, sources):
     """Depth, and colours, of each pixel at the time of the middle row, for a team of threads (``teams.py``).
 
-    A pixel of the rectified image shows the recorded pixel to which the camera's motion takes its point until the row
-    is read out. The point has the depth that was recorded at the pixel itself, not at the recorded one, which matters
-    where the camera moves along a depth edge.
+    A pixel of the rectified image shows the recorded pixel to which its point moves until that row is read out. The
+    point takes the depth recorded at the rectified pixel's own position. This matters if the camera moves along a depth
+    edge.
 
     Args:
-        leads, team: As for ``run_team``.
         rows: Rows of a band.
         depth: (H, W) float32, metres, 0 = none.
         intrinsics: (4,) float32.
-        projection: ColorProjection of the depth camera into itself, ``place`` the identity.
-        fallback: Float32, depth of rows without a reading, metres.
+        projection: ColorProjection of the depth camera into itself, with identity ``place``.
+        fallback: Float32, depth of rows without any depth, metres.
         size: H, H, W.
-        words: (H * W,) int32 of the colours recorded in the same pixels; of size 0 where they are not wanted.
-        out: (H, W) float32 out, metres; interpolated on a surface, else of the nearest pixel.
-        colors: (H, W, 3) uint8 out, interpolated; of size 0 where they are not wanted.
-        sources: (H, W) int32 out, number of the nearest recorded pixel.
+        words: (H * W,) int32 of the colours recorded at the same pixels; of size 0 if unused.
+        out: (H, W) float32 out, metres; interpolated on a surface, otherwise from the nearest pixel.
+        colors: (H, W, 3) uint8 out, interpolated; of size 0 if unused.
+        sources: (H, W) int32 out, index of the nearest recorded pixel.
     """
     wide_vectors()
     num_bands = -(-depth.shape[0] // rows)
@@ -81,10 +80,10 @@ def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, wo
 
 @kernel
 def recorded_mask(mask, sources, out):
-    """Mask (H, W) bool of a rectified image in the recorded one, into ``out``.
+    """Mask (H, W) bool of a rectified image in the geometry of the recorded one, into ``out``.
 
-    A recorded pixel lies as far from its place in the rectified image as the pixel recorded there, in the other
-    direction: the displacement changes by less than a pixel over its own length.
+    The displacement of a recorded pixel is approximated by the negative displacement at the same rectified pixel. The
+    displacement changes by less than a pixel over its own length.
     """
     h, w = np.int32(mask.shape[0]), np.int32(mask.shape[1])
     flat, by_width, places = mask.reshape(-1), 1 / np.float64(w), np.empty(w, np.int32)

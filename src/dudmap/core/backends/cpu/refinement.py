@@ -1,4 +1,4 @@
-"""Loops over blocks of one level of the map: where it is too coarse for the surface, and with what a finer one begins.
+"""Loops over blocks of one level of the map: detail of the surface, and initial values of finer blocks.
 
 A block is read with two voxels around it, from its 27 neighbours (``VoxelBlocks.neighbourhood``).
 """
@@ -13,22 +13,22 @@ from dudmap.core.formulas.voxel import intensity_of, pack_color, pack_voxel, sdf
 PAD = 2
 """Voxels around a block that are read."""
 SIZE = 8 + 2 * PAD
-"""Edge of a block with these."""
+"""Edge of a block including these voxels."""
 NEAR = np.float32(1)
-"""Distance from the surface, voxels, up to which the field is examined: beyond, it bends at edges far away."""
+"""Largest distance from the surface, voxels, at which the field is examined; farther away it bends at remote edges."""
 SATURATED = np.float32(0.85)
-"""Share of the truncation band beyond which a distance may be cut off, and says nothing of the shape."""
+"""Share of the truncation band beyond which a distance may be truncated and has no shape information."""
 PRIOR = 8
-"""Largest weight that a voxel inherits: two frontal readings at one metre. What is inherited is the coarse surface,
-which the next readings should replace."""
+"""Largest weight that a voxel inherits: two frontal measurements at one metre. The next measurements should replace
+the inherited coarse surface."""
 BAND = 64
 """Blocks of one band."""
 
 
 @scalar
 def distance_bend(word, a, b, by_voxel, saturated):
-    """Second derivative of the distance at a voxel, per voxel, by those two voxels before and behind it, and whether it
-    is known; arguments as of ``examine_range``."""
+    """Second derivative of the distance at a voxel, per voxel, from the voxels two steps before and behind it, and
+    whether it is known; see ``examine_range``."""
     f, fa, fb = sdf_steps(word) * by_voxel, sdf_steps(a) * by_voxel, sdf_steps(b) * by_voxel
     known = ((a & 0xFF00) != 0) & ((b & 0xFF00) != 0) & (fa < saturated) & (fb < saturated)
     return (fa - f - f + fb) * np.float32(0.25), known
@@ -36,21 +36,21 @@ def distance_bend(word, a, b, by_voxel, saturated):
 
 @scalar
 def intensity_bend(word, a, b):
-    """Second derivative of the intensity (0..1) at a voxel by its neighbours, and whether it is known."""
+    """Second derivative of the intensity (0..1) at a voxel from its neighbours, and whether it is known."""
     known = ((a & 0xFF) != 0) & ((b & 0xFF) != 0) & ((word & 0xFF) != 0)
     return (intensity_of(a) + intensity_of(b) - np.float32(2) * intensity_of(word)) / np.float32(255), known
 
 
 @scalar
 def root_mean(total, count):
-    """Root mean square of ``count`` numbers by the sum of their squares."""
+    """Root mean square of ``count`` numbers from the sum of their squares."""
     return np.sqrt(total / np.float32(max(count, 1)))
 
 
 @scalar
 def mean_voxel(steps, count, weight, shade, shades):
-    """Word of the mean of ``count`` voxels by the sums of their distances and of ``shades`` intensities; 0 = unknown,
-    where the least of their weights is 0."""
+    """Word of the mean of ``count`` voxels from the sums of their distances and of ``shades`` intensities; 0 =
+    unknown, if the smallest weight is 0."""
     by = np.float32(1) / np.float32(max(shades, 1))
     word = pack_voxel(steps / np.float32(count), np.float32(weight), shade * by)
     return np.int32(word) if weight > 0 else np.int32(0)
@@ -58,7 +58,7 @@ def mean_voxel(steps, count, weight, shade, shades):
 
 @scalar
 def mean_color(red, green, blue, count):
-    """Word of the mean of ``count`` colours by their sums; 0 = none."""
+    """Word of the mean of ``count`` colours from their sums; 0 = none."""
     by = np.float32(1) / np.float32(max(count, 1))
     word = pack_color(red * by, green * by, blue * by)
     return np.int32(word) if count > 0 else np.int32(0)
@@ -66,12 +66,12 @@ def mean_color(red, green, blue, count):
 
 @kernel
 def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
-    """Octants of blocks ``start`` to ``stop``; the other arguments and results as of ``examine``.
+    """Octants of blocks ``start`` to ``stop``; the other arguments and results as for ``examine``.
 
-    With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
-    a; on a surface of curvature k the sum over the axes is about k times the voxel size, and linear interpolation
-    between voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice. The bend is the root
-    mean square over the voxels near the surface of |D|, that of the intensity the same with steps of one voxel.
+    With the distance f in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
+    a. On a surface of curvature k the sum over the axes is about k times the voxel size. The error of linear
+    interpolation is an eighth of it. Steps of two voxels divide the noise by four. The bend is the root mean square of
+    |D| over the voxels near the surface. The texture is the same for the intensity, with steps of one voxel.
     """
     words = np.empty((SIZE, SIZE, SIZE), np.int32)
     flat = words.reshape(-1)
@@ -108,7 +108,7 @@ def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, textur
                             if known:
                                 shade += d * d
                                 seen = True
-                        if axes > 0:  # beside the end of a finer level not all axes are known
+                        if axes > 0:  # at the end of a finer level not all axes are known
                             total += square * np.float32(3) / np.float32(axes)
                             count += 1
                         if seen:
@@ -165,17 +165,17 @@ def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geom
 def examine(
     geometry: NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """How much the distance and the intensity bend near the surface in each octant of blocks.
+    """Bend of distance and intensity near the surface, for each octant of blocks.
 
     Args:
         geometry: (slots, 512) int32 voxels of one level.
         near: (n, 27) int32 slots of the blocks and their neighbours, -1 = none.
         by_voxel: Voxels per step of the stored distance.
-        saturated: Distance from which on it may be cut off, voxels.
+        saturated: Distance beyond which it may be truncated, voxels.
 
     Returns:
         (n, 8) each: bend of the distance, per voxel, and of the intensity (0..1), float32, and whether the surface
-        passes through the octant or touches it, uint8.
+            passes through the octant or touches it, uint8.
     """
     bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
     surface = np.empty((len(near), 8), dtype=np.uint8)
@@ -198,7 +198,7 @@ def prolong(
 ) -> None:
     """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
 
-    A voxel is known where all the coarse voxels around it are, and has the least of their weights, at most PRIOR.
+    A voxel is known if all coarse voxels around it are known. Its weight is their smallest weight, at most PRIOR.
 
     Args:
         geometry, colors: (coarse slots, 512) int32.

@@ -1,8 +1,8 @@
 """Direct SDF and intensity registration (thesis eq. 4.27-4.47): one linearisation, and the descent of a level.
 
-A row of pixels is worked through in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
-vector arithmetic for residuals and sums. No stage mixes loads with branches, so LLVM vectorises the first and the last
-on every CPU.
+A row of pixels is processed in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
+vector arithmetic for residuals and sums. No stage mixes loads and branches, so that LLVM vectorises the first and the
+last on every CPU.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ from dudmap.core.formulas.residual import normal_terms, trilinear, weigh, within
 from dudmap.core.formulas.voxel import intensity_of, sdf_steps
 
 NUM_SUMS = 32
-"""Sums of one linearisation: 21 of H, 6 of b, cost, readings on the map, weight of all readings, weight of those on
-the map, weighted squared distances."""
+"""Sums of one linearisation: 21 of H, 6 of b, cost, number of pixels on the map, weight of all pixels with depth,
+weight of the pixels on the map, weighted squared distances."""
 
 SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
 """Index of each element of H among the sums, which hold its upper triangle row by row."""
@@ -32,7 +32,9 @@ COST = 27
 
 @scalar
 def write_lattice(T, voxel_size, origin, out):
-    """Write ``to_lattice`` of a pose (4, 4), element by element: the assignment of an array compiles for a second."""
+    """Write ``to_lattice`` of a pose (4, 4), element by element, because an array assignment takes a second to
+    compile.
+    """
     for i in range(3):
         for j in range(4):
             shift = np.float64(origin[i] * BLOCK) if j == 3 else np.float64(0)
@@ -47,19 +49,12 @@ def linearize_rows(
     """Add the normal equations of pixel rows ``row_start`` to ``row_stop`` to ``sums`` and write their residuals.
 
     Args:
-        row_start, row_stop: Rows of the band.
-        depth: (h, w) float32, metres, 0 = none.
-        intensity: (h, w) float32 in [0, 1].
-        weights: (h, w) float32 static weights in [0, 1].
-        intrinsics: (4,) float32 fx, fy, cx, cy of this level.
-        T: (3, 4) float32, camera to the window's lattice: voxels, origin at the window's first voxel.
-        window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
-        shape: (3,) int64 blocks of the window.
-        geometry: (slots * 512,) int32 packed voxels.
-        voxel_size, sdf_unit: Metres, and metres per step of the stored distance.
+        depth, intensity, weights, intrinsics: See ``LevelImage``.
+        T: (3, 4) float32, camera to the window's lattice, see ``to_lattice``.
+        window, shape, geometry, voxel_size, sdf_unit: See ``VoxelGrid``; ``geometry`` is flat.
         parameters: RegistrationParameters.
-        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map, or without
-            a weight.
+        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN off the map or without
+            weight.
         sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
     wide_vectors()
@@ -214,8 +209,8 @@ def descend(
         depth, intensity, weights, intrinsics, window, shape, geometry, parameters: As for ``linearize_rows``.
         origin: (3,) int64 coordinates of the window's first block.
         voxel_size, sdf_unit: As for ``linearize_rows``, but float64.
-        T_first: (4, 4) pose, camera to world, at which the descent begins.
-        is_known: Whether ``first`` holds the sums at this pose; else they are calculated first.
+        T_first: (4, 4) first pose, camera to world.
+        is_known: Whether ``first`` holds the sums at this pose; otherwise they are computed first.
         first: (NUM_SUMS,) float64, changed here.
         rules: DescentRules.
         poses: (limit + 1, 3, 4) float32 out, pose of each linearisation in the window's lattice.
@@ -224,8 +219,8 @@ def descend(
         sums: (2, bands, NUM_SUMS) float64 out, two buffers of sums.
 
     Returns:
-        The last accepted pose (4, 4), its sums (NUM_SUMS,), the buffer of its residuals, -1 for those at the first
-        pose that were known, the number of linearisations, and whether a stop criterion was met.
+        The last accepted pose (4, 4), its sums (NUM_SUMS,), the buffer of its residuals (-1 for known sums at the first
+        pose), the number of linearisations, and whether a stop criterion was met.
     """
     wide_vectors()
     num_bands, height = sums.shape[1], depth.shape[0]
@@ -279,7 +274,7 @@ def descend(
             if count == 1 and not is_known:
                 accepted, kept = total, buffer
                 continue
-            change = np.float64(0)  # by the mean of the gradients before and after the step
+            change = np.float64(0)  # from the mean of the gradients before and after the step
             for i in range(6):
                 change += (accepted[21 + i] + total[21 + i]) / 2 * step[i]
             better, damping, settled = judged(change, accepted[COST], length, damping, rules)
@@ -294,7 +289,7 @@ def descend(
 
 
 def normal_equations(sums: NDArray[np.float64], residuals: ImageStack) -> NormalEquations:
-    """The normal equations of the sums (NUM_SUMS,) of all pixels."""
+    """The normal equations from the sums (NUM_SUMS,) of all pixels."""
     cost, num_inliers, readings, weight, chi_square = sums[COST:].tolist()
     return NormalEquations(
         sums[SYMMETRIC], sums[21:27], cost, int(num_inliers), readings, weight, chi_square, residuals

@@ -1,4 +1,4 @@
-"""Reprojection of an image into older ones of the same camera: what they have at its points, and how both agree."""
+"""Reprojection of an image into older images of the same camera, and their agreement."""
 
 from typing import NamedTuple
 
@@ -12,9 +12,9 @@ from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import exact, kernel, scalar
 
 NEAREST = np.float32(0.05)
-"""Points nearer to the camera plane than this, or behind it, are not projected, metres."""
+"""Smallest depth of a projected point, metres."""
 LEAST_WEIGHT = np.float32(0.25)
-"""Least sum of the bilinear weights of the pixels with a reading: a quarter, the weight of each at equal distance."""
+"""Smallest sum of the bilinear weights of the pixels with depth: a quarter, the weight of each at equal distance."""
 PARTS = 2
 """Bands of rows of each older frame."""
 
@@ -23,10 +23,10 @@ class Reprojection(NamedTuple):
     """Differences of an image to n older frames, at the pixels of the image.
 
     Attributes:
-        gap: (n, h, w) float32, metres: older reading minus depth of this image's point in the older camera, the
-            smallest in magnitude among the four readings around its projection; NaN where there is none.
-        difference: (n, h, w) float32, older minus this intensity, NaN likewise.
-        marks: (n, h, w) uint8, mark of that reading, 0 where the point projects outside of the older frame.
+        gap: (n, h, w) float32, metres: older depth minus depth of this image's point in the older camera. Of the four
+            pixels around the projection, the smallest magnitude counts; NaN = none.
+        difference: (n, h, w) float32, older minus this intensity, NaN = none.
+        marks: (n, h, w) uint8, mark of the selected older pixel, 0 if the point projects outside the older frame.
     """
 
     gap: NDArray[np.float32]
@@ -47,9 +47,9 @@ def reproject(
     Args:
         depth, intensity: (h, w) float32; depth in metres, 0 = none.
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        Ts_older_camera: (n, 4, 4), camera of the image to those of the older frames.
-        older: (n, 2, h, w) float32, their depth and intensity.
-        marks: (n, h, w) uint8, of their pixels.
+        Ts_older_camera: (n, 4, 4), camera of the image to the cameras of the older frames.
+        older: (n, 2, h, w) float32, depth and intensity of the older frames.
+        marks: (n, h, w) uint8, marks of their pixels.
     """
     shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
     gap, difference = np.empty((2, *shape), np.float32)
@@ -60,7 +60,7 @@ def reproject(
 
 @kernel
 def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_marks, gap, difference, marks):
-    """Loop of ``reproject`` for a team of threads (``teams.py``), each of which takes some rows at a time."""
+    """Loop of ``reproject`` for a team of threads (``teams.py``)."""
     num_bands = PARTS * len(older)
     band, _ = first_band(leads, team, 0, num_bands)
     while band != NO_BAND:
@@ -80,7 +80,7 @@ def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_mark
 def reproject_rows(
     start, stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):  # fmt: skip
-    """Differences of some rows to one older frame: ``T`` is (4, 4) float32, the last three arguments are written."""
+    """Differences of some rows to one older frame; ``T`` is (4, 4) float32, the last three arguments are output."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
@@ -137,26 +137,27 @@ def reproject_rows(
 
 
 AGREEING_SIGMAS = 3 * np.sqrt(2)
-"""Difference of two readings of one surface that noise explains, in standard deviations of one of them."""
+"""Largest difference of two depths of one surface that noise explains, in standard deviations of one of them."""
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
 @exact
 def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewest, ceilings):
-    """Distance by which two images lie beside each other, and how many of their readings agree.
+    """Displacement between two images, and number of pixels with equal depth.
 
     Args:
         depth, intensity: (h, w) float32; depth in metres, 0 = none.
         moving: (h, w) bool, pixels that move.
-        gap, difference, marks: Of the older image, whose moving pixels are marked, see ``Reprojection``.
+        gap, difference, marks: Differences to the older image, see ``Reprojection``; marks are its moving pixels.
         noise: NoiseParameters, all float32.
-        fewest: Pixels that must show the same static surface in both.
-        ceilings: Intensities from which on this and the older image are saturated.
+        fewest: Smallest number of pixels that show the same static surface in both.
+        ceilings: Saturation limits of this and the older image.
 
     Returns:
-        The distance, see ``ImageConsistency.compare``; pixels, NaN where it is not known, as where too few pixels are
-        left that neither image saturates. Readings whose depth agrees
-        within AGREEING_SIGMAS, all readings, and those at whose place the older image has one.
+        - Displacement, see ``ImageConsistency.compare``, pixels; NaN with too few common or unsaturated pixels.
+        - Number of depths that agree within AGREEING_SIGMAS.
+        - Number of all depths.
+        - Number of depths at whose position the older image has depth.
     """
     h, w = depth.shape
     agreeing, readings, seen, count = 0, 0, 0, 0

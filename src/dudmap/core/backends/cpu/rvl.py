@@ -1,8 +1,8 @@
 """Lossless compression of depth images by run lengths and variable-length differences (RVL; Wilson 2017).
 
-An image is a sequence of runs: number of zeros, number of other values, and these as differences to the value before.
-All are written as groups of three bits, lowest first, each with a fourth bit that says whether more follow; eight
-groups make a word of 32 bits, highest first. It takes a fifth of the time of PNG.
+An image is a sequence of runs: number of zeros, number of other values, and the values as differences to the previous
+value. All numbers are written as groups of three bits, lowest first, with a fourth bit for continuation. Eight groups
+make a word of 32 bits, highest first. RVL takes a fifth of the time of PNG.
 """
 
 import struct
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel, scalar
 
 HEADER = struct.Struct("<II")
-"""Columns and rows, before the words, as compressed_depth_image_transport of ROS writes them."""
+"""Columns and rows before the words, in the layout of ROS' compressed_depth_image_transport."""
 MOST_PIXELS = 1 << 26
-"""Of an image that is believed: a few bytes can claim to be a long run of zeros."""
+"""Largest accepted number of pixels, because a few bytes can encode a long run of zeros."""
 
 
 @scalar
 def _put(value, words, place):
-    """Write a number from group ``place`` on into words that are 0; returns the place after it."""
+    """Write a number from group ``place`` into words that are 0; returns the next place."""
     while True:
         group = value & 7
         value >>= 3
@@ -33,7 +33,7 @@ def _put(value, words, place):
 
 @scalar
 def _get(words, place, last):
-    """A number, and the place after it, which is beyond ``last`` where the words end before the number does."""
+    """A number, and the next place; beyond ``last`` if the words end within the number."""
     value, shift = np.int64(0), 0
     while place < last:
         group = np.int64((words[place >> 3] >> np.uint32(28 - 4 * (place & 7))) & np.uint32(15))
@@ -46,7 +46,7 @@ def _get(words, place, last):
 
 @kernel
 def encode(image, words):
-    """Compress an image (n,) uint16 into words (n + 1,) uint32 that are 0; returns how many are used."""
+    """Compress an image (n,) uint16 into words (n + 1,) uint32 that are 0; returns the number of used words."""
     n, place, before, number = image.size, 0, np.int64(0), 0
     while number < n:
         start = number
@@ -65,7 +65,7 @@ def encode(image, words):
 
 @kernel
 def decode(words, image):
-    """Restore an image (n,) uint16 from its words, uint32; returns whether they hold such an image."""
+    """Restore an image (n,) uint16 from words uint32; returns whether the words are valid."""
     n, place, last, before, number = image.size, 0, 8 * words.size, np.int64(0), 0
     while number < n:
         zeros, place = _get(words, place, last)
@@ -85,14 +85,14 @@ def decode(words, image):
 
 
 def compressed(image: NDArray[np.uint16]) -> bytes:
-    """An image (h, w) with its size."""
+    """Compressed image (h, w) with its size."""
     words = np.zeros(image.size + 1, np.uint32)
     count = encode(image.reshape(-1), words)
     return HEADER.pack(*image.shape[::-1]) + words[:count].astype("<u4").tobytes()
 
 
 def decompressed(data: bytes) -> NDArray[np.uint16] | None:
-    """The image (h, w) of such data; None where it holds none."""
+    """The image (h, w) of compressed data; None if invalid."""
     if len(data) < HEADER.size:
         return None
     columns, rows = HEADER.unpack_from(data)

@@ -1,4 +1,4 @@
-"""Loop over the points of a depth image: signed distance, intensity difference and occupancy of the map there."""
+"""Loop over the points of a depth image: signed distance, intensity difference and occupancy of the map."""
 
 import numpy as np
 
@@ -28,24 +28,15 @@ def sample_rows(
 ):  # fmt: skip
     """Sample the map at the points of pixel rows ``row_start`` to ``row_stop``.
 
-    Corners without an observation are left out of the interpolation; a point needs half of the weight. A row is worked
-    through in stages, see ``registration.py``.
+    Unobserved corners are omitted from the interpolation; a point needs half of the weight. A row is processed in
+    stages, see ``registration.py``.
 
     Args:
-        row_start, row_stop: Rows of the band.
-        depth: (h, w) float32, metres, 0 = none.
-        intensity: (h, w) float32 in [0, 1].
-        intrinsics: (4,) float32.
+        depth, intensity, intrinsics: See ``LevelImage``.
         T: (3, 4) float32, camera to the window's lattice, voxels.
-        window: (cells,) int32.
-        shape: (3,) int64 blocks of the window.
-        geometry: (slots * 512,) int32.
-        sdf_unit: Metres per step of the stored distance.
-        free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
+        window, shape, geometry, sdf_unit, free_count: See ``VoxelGrid``; ``geometry`` is flat.
         free_after: Observations that make free space.
-        distance: (h, w) float32 out, metres, NaN where the map has no distance.
-        difference: (h, w) float32 out, map minus image intensity, NaN where the map has none.
-        occupancy: (h, w) uint8 out: UNKNOWN (also without a reading), SURFACE or FREE.
+        distance, difference, occupancy: Out, see ``MapSample``.
     """
     wide_vectors()
     w = depth.shape[1]
@@ -95,8 +86,10 @@ def sample(
     leads, team, rows, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
     distance, difference, occupancy,
 ):  # fmt: skip
-    """Sample the map at the points of an image, ``rows`` rows to a band, for a team of threads (``teams.py``); other
-    arguments as of ``sample_rows``."""
+    """Sample the map at the points of an image, with ``rows`` rows per band, for a team of threads (``teams.py``).
+
+    Other arguments as for ``sample_rows``.
+    """
     wide_vectors()
     height = depth.shape[0]
     num_bands = -(-height // rows)

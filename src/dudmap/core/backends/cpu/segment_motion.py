@@ -1,4 +1,4 @@
-"""Motion decided by segment: whole segments that move, and those that have stood still since an older frame."""
+"""Motion of whole segments, and segments that are still at their place in an older frame."""
 
 from typing import NamedTuple
 
@@ -10,47 +10,53 @@ from dudmap.core.backends.parameters import SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar
 
 MAX_SHARE = 0.15
-"""Segments that cover more than this share of the readings belong to the room: they are dynamic only if nearly all of
-their pixels are."""
+"""Largest share of the image covered by a movable segment. Larger segments belong to the room; they are dynamic only
+if nearly all of their pixels are."""
 MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
-"""Shares of the pixels of a segment that must be dynamic by themselves for all of it to be: with evidence that the
-others have moved as well, and without."""
+"""Smallest share of dynamic pixels for a dynamic segment: with evidence that the other pixels moved as well, and
+without."""
 STARTED_SHARE = 0.1
-"""Share of a segment that must be seeds for its pixels in unknown space to move, and of a region grown from seeds."""
+"""Smallest share of seeds in a segment whose pixels in unknown space move, and in a region grown from seeds."""
 DISTANCE_SCALE = 1.0
-"""Mean distance to the map of a segment that has moved, standard deviations of a reading."""
+"""Mean distance to the map of a segment that has moved, standard deviations of the depth."""
 MISMATCH_SCALE = 1 / 3
 """Intensity mismatch of a segment that has moved, pixels of motion at REFERENCE_WIDTH."""
 COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
-"""Upper quartiles of both over the static segments of a well registered frame; where the quartiles of a frame are
+"""Upper quartiles of both over the static segments of a well registered frame. If the quartiles of a frame are
 larger, the scales grow in proportion."""
 GRADIENT_NOISE = 0.03
-"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH: smaller ones give no evidence."""
+"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH; smaller gradients give no evidence."""
 SETTLED_SIGMAS = 4
-"""Distance between two readings of a point from which on it has moved in between, standard deviations."""
+"""Distance between two measurements of a point beyond which it has moved, standard deviations."""
 LEAST_SHARE = np.float32(1e-3)
-"""Least share of the pixels of a window that are compared: keeps a quotient finite."""
+"""Smallest share of compared pixels in a window; keeps a quotient finite."""
 SIZE, COMPARED, DYNAMIC, DISTANCE, MISMATCH = range(5)
-"""Columns of the evidence of a segment: its pixels; the share of them that is compared, since the map (or an older
-frame) has a surface near, and the share that is dynamic by itself; of those that are compared and not dynamic, the mean
-of distance / sigma, and the intensity mismatch in pixels of motion: the mean absolute deviation D of their intensity
-difference from its mean, over their mean gradient G, damped where G is no larger than noise: D G / (G + noise)^2."""
+"""Columns of the evidence of a segment:
+- number of pixels;
+- share of compared pixels, which have a surface of the map (or of an older frame) near;
+- share of dynamic pixels;
+- mean of distance / sigma over the static compared pixels;
+- intensity mismatch over the same pixels, pixels of motion.
+
+The mismatch is D G / (G + noise)^2. D is the mean absolute deviation of the intensity difference from its mean, G the
+mean gradient. The denominator damps gradients that are not larger than noise.
+"""
 MEAN_DEVIATION = 1.183
-"""Mean absolute deviation of normally distributed values, over their median one."""
+"""Mean absolute deviation over median absolute deviation, for normally distributed values."""
 f64 = np.float64
 
 
 class SegmentImage(NamedTuple):
-    """The segments of an image, and what residuals within them are compared with.
+    """The segments of an image, and the scales of their residuals.
 
     Attributes:
         labels: (h, w) int32 numbers of the segments from 1, 0 = none.
         count: Number of segments.
-        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
         gradient: (h, w) float32, magnitude of the intensity gradient.
-        window: Side of the window over which differences of intensities are averaged, pixels, odd.
+        window: Side of the window over which intensity differences are averaged, pixels, odd.
         sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        least_sigma: Float32, its least value here.
+        least_sigma: Float32, lower bound of ``sigma`` here.
     """
 
     labels: NDArray[np.int32]
@@ -64,7 +70,7 @@ class SegmentImage(NamedTuple):
 
 @exact_scalar
 def mirrored(n, size):
-    """Index of the pixel that stands for one beyond the border of an image: 1 for -1."""
+    """Index of the mirror image of a pixel beyond the image border: 1 for -1."""
     n = -n if n < 0 else n
     n = 2 * size - 2 - n if n >= size else n
     return min(max(n, 0), size - 1)
@@ -72,7 +78,7 @@ def mirrored(n, size):
 
 @exact_scalar
 def window_means(compared, difference, window):
-    """Mean difference (h, w) over those pixels of a square window that are compared."""
+    """Mean difference (h, w) over the compared pixels of a square window."""
     h, w = compared.shape
     half, by_area = window // 2, 1.0 / (window * window)
     ones, sums, means = np.zeros((h, w)), np.zeros((h, w)), np.empty((h, w), np.float32)
@@ -106,10 +112,10 @@ def segment_evidence(segments, labels, count, compared, moving, distance, means)
 
     Args:
         segments: SegmentImage.
-        labels, count: Its, or other ones.
+        labels, count: Its labels, or others.
         compared, moving: (h, w) bool.
         distance: (h, w) float32, metres.
-        means: (h, w) float32, ``window_means`` of the differences of intensities.
+        means: (h, w) float32, ``window_means`` of the intensity differences.
     """
     h, w = labels.shape
     sums, deviations, out = np.zeros((count + 1, 7)), np.zeros(count + 1), np.empty((count + 1, 5))
@@ -142,7 +148,7 @@ def segment_evidence(segments, labels, count, compared, moving, distance, means)
 
 @exact_scalar
 def upper_quartile(values):
-    """75th percentile of a few values, which are sorted, linear between two of them; 0 of no values."""
+    """75th percentile of a few values, linearly interpolated; 0 without values. Sorts the values in place."""
     count = len(values)
     if count == 0:
         return 0.0
@@ -162,22 +168,22 @@ def upper_quartile(values):
 def classify_segments(evidence, before, min_pixels):
     """Segments that move as a whole, (count + 1,) bool.
 
-    A segment of at least ``min_pixels`` is dynamic if
+    A segment of at least ``min_pixels`` is dynamic in two cases:
+    - At least NEARLY_ALL of its pixels are dynamic.
+    - It covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and its static pixels
+      have moved as well.
 
-    - at least NEARLY_ALL of its pixels are dynamic by themselves, or
-    - it covers at most MAX_SHARE of the readings, at least MIN_DYNAMIC of its pixels are dynamic by themselves, and
-      the mean distance s and the intensity mismatch m of its static pixels say that these have moved as well:
+    With the mean distance s and the intensity mismatch m, static pixels have moved if
 
-          (s / S)^2 + (m / M)^2 >= 1,    or 1/2 where most of the segment was dynamic in the last frame,
+        (s / S)^2 + (m / M)^2 >= 1,    or 1/2 if most of the segment was dynamic in the last frame.
 
-    with S = DISTANCE_SCALE and M = MISMATCH_SCALE, larger in a badly registered frame: in proportion to the upper
-    quartiles of |s| and m over the static segments of the frame, where these exceed COMMON_DISTANCE and
-    COMMON_MISMATCH.
+    The scales are S = DISTANCE_SCALE and M = MISMATCH_SCALE. They grow in a badly registered frame, if the upper
+    quartile of |s| or m over its static segments exceeds COMMON_DISTANCE or COMMON_MISMATCH, in proportion to it.
 
     Args:
         evidence: (count + 1, 5) of each segment.
         before: (count + 1,) share of the pixels that belonged to a dynamic segment in the last frame.
-        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
     """
     count, readings = len(evidence) - 1, 0.0
     distances, mismatches, static = np.empty(count), np.empty(count), 0
@@ -200,7 +206,7 @@ def classify_segments(evidence, before, min_pixels):
 
 @exact_scalar
 def counts_in(labels, count, first, second):
-    """Pixels (count + 1,) of each segment, and those of them in two masks (h, w) bool."""
+    """Number (count + 1,) of pixels of each segment, in total and in two masks (h, w) bool."""
     total, ones, twos = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -213,15 +219,14 @@ def counts_in(labels, count, first, second):
 
 @exact_scalar
 def split_mixed_segments(labels, count, before, total, part, min_pixels):
-    """Labels and number of the segments where those that were separate in the last frame, a dynamic and a static one,
-    stay separate.
+    """Split segments that merge a dynamic and a static segment of the last frame; returns labels and number.
 
-    A segment is split where each part holds at least a fifth of its pixels; a smaller part has merely come into view.
+    A segment is split if each part holds at least a fifth of its pixels. A smaller part has merely come into view.
 
     Args:
-        labels, count, min_pixels: As of ``SegmentImage``.
+        labels, count, min_pixels: As for ``SegmentImage``.
         before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
-        total, part: (count + 1,) int64 pixels of each segment, and those that did.
+        total, part: (count + 1,) int64 pixels of each segment, and of these the pixels in ``before``.
     """
     number, first = np.zeros(count + 1, np.int32), count
     for n in range(1, len(total)):
@@ -239,10 +244,10 @@ def split_mixed_segments(labels, count, before, total, part, min_pixels):
 
 @exact
 def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dynamic):
-    """Make dynamic what moves as a whole, and static what is new, after ``split_mixed_segments``.
+    """Update the dynamic pixels by segments, after ``split_mixed_segments``.
 
-    1. Pixels in unknown space are dynamic only in a segment at least STARTED_SHARE of which are seeds.
-    2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
+    1. Pixels in unknown space are dynamic only in a segment with at least STARTED_SHARE seeds.
+    2. Moving segments (``classify_segments``) are dynamic as a whole.
 
     Args:
         segments: SegmentImage.
@@ -250,8 +255,8 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
         seeds: (h, w) bool.
         sample: MapSample at the points of the image.
         intensity: (h, w) float32.
-        gain, offset: Float32: (1 - gain) of the intensity is added to the differences, and ``offset`` taken off, so
-            that the image has the exposure of the map.
+        gain, offset: Float32, 1 minus the exposure gain, and the offset. ``gain * intensity - offset`` is added to
+            the differences, so that the image has the exposure of the map.
         dynamic: (h, w) bool in and out.
 
     Returns:
@@ -271,7 +276,7 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
             dynamic[v, u] = dynamic[v, u] and (occupancy != UNKNOWN or begins[labels[v, u]])
             compared[v, u] = occupancy == SURFACE
             lit = sample.difference[v, u] + (gain * intensity[v, u] - offset)
-            difference[v, u] = np.float32(0) if np.isnan(lit) else lit  # in the air
+            difference[v, u] = np.float32(0) if np.isnan(lit) else lit  # no surface
     means = window_means(compared, difference, segments.window)
     evidence = segment_evidence(segments, labels, count, compared, dynamic, sample.distance, means)
     moving = classify_segments(evidence, part / size, segments.min_pixels)
@@ -283,9 +288,11 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
 
 @exact_scalar
 def median_mismatches(segments, labels, count, compared, moving, means):
-    """Intensity mismatch (count + 1,) of segments by medians: pixels beside something near show its colours, so that
-    what stands differs along its outline, while what has moved differs nearly everywhere. Arguments as of
-    ``segment_evidence``."""
+    """Intensity mismatch (count + 1,) of segments by medians; arguments as for ``segment_evidence``.
+
+    Pixels next to a near object show its colours. A static segment therefore differs along its outline, a moved one
+    nearly everywhere.
+    """
     sizes, out = np.zeros(count + 1, np.int64), np.zeros(count + 1)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -309,11 +316,13 @@ def median_mismatches(segments, labels, count, compared, moving, means):
 
 @exact
 def stand_still(segments, dynamic, gap, difference, settled):
-    """Keep of the settled segments those whose dynamic part stands where it stood in an older frame.
+    """Clear ``settled`` for segments whose dynamic part has moved since an older frame.
 
-    That is where more than 0.7 of its pixels are visible, less than 0.1 of them lie off by more than SETTLED_SIGMAS,
-    the mean distance is below one sigma, and the intensity mismatch by medians below 1.2 times the frame's upper
-    quartile (or COMMON_MISMATCH).
+    A segment stays settled if all of these hold:
+    - More than 0.7 of its pixels are visible.
+    - Less than 0.1 of them are displaced by more than SETTLED_SIGMAS.
+    - The mean distance is below one sigma.
+    - The intensity mismatch by medians is below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
 
     Args:
         segments: SegmentImage.
@@ -330,7 +339,7 @@ def stand_still(segments, dynamic, gap, difference, settled):
             parts[v, u] = segments.labels[v, u] + (count if dynamic[v, u] else 0)
             compared[v, u] = not np.isnan(gap[v, u])
             sigma = max(segments.least_sigma, segments.sigma[v, u])
-            displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # not where it is NaN
+            displaced[v, u] = abs(gap[v, u]) > SETTLED_SIGMAS * sigma  # False for NaN
     means, found = window_means(compared, difference, segments.window), 0
     evidence = segment_evidence(segments, parts, 2 * count, compared, displaced, gap, means)
     mismatches = median_mismatches(segments, parts, 2 * count, compared, displaced, means)

@@ -1,6 +1,6 @@
-"""Surface segmentation of a depth image.
+"""Surface segmentation of a depth image, along depth edges and concave edges.
 
-The segments are cut along depth edges and along concave edges. The scalar formulas stand in functions of their own.
+The scalar formulas are separate functions.
 """
 
 import numpy as np
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel, scalar
 
 PLANE_STEP = np.float32(0.35)
-"""Largest distance of a pixel from the plane through its neighbour in the same segment, as a share of the largest
-depth step."""
+"""Largest distance of a pixel from the plane of its neighbour in the same segment, as a share of the largest depth
+step."""
 
 
 def segment_surface(
@@ -21,7 +21,7 @@ def segment_surface(
     normal_reach: int,
     sine: float,
 ) -> tuple[NDArray[np.int32], int]:
-    """Connected segments of surface, cut along depth edges and concave edges.
+    """Connected segments of surface, separated by depth edges and concave edges.
 
     Args:
         depth: (h, w) float32, metres, 0 = none.
@@ -32,7 +32,7 @@ def segment_surface(
         sine: Sine of half the smallest angle between the normals across a concave edge.
 
     Returns:
-        (h, w) int32 number of each pixel's segment from 1, 0 = no reading, and the number of segments.
+        (h, w) int32 number of each pixel's segment from 1, 0 = no depth, and the number of segments.
     """
     normals = np.empty((*depth.shape, 3), dtype=np.float32)
     edge = np.empty(depth.shape, dtype=np.bool_)
@@ -44,7 +44,7 @@ def segment_surface(
 
 @scalar
 def surface_end(depth, tolerance, v, u, dv, du, reach):
-    """Pixels (0 to ``reach``) that one can go in a direction without leaving the surface."""
+    """Number of pixels (0 to ``reach``) on the same surface in a direction."""
     z = depth[v, u]
     for step in range(1, reach + 1):
         vn, un = v + dv * step, u + du * step
@@ -58,8 +58,8 @@ def surface_end(depth, tolerance, v, u, dv, du, reach):
 
 @scalar
 def normal_of_gradient(x, y, z, zu, zv):
-    """Unit normal, towards the camera, of a surface at the normalised image point (x, y) and depth z, whose gradient
-    over normalised image coordinates is (zu, zv)."""
+    """Unit normal, towards the camera, of a surface at normalised image point (x, y) and depth z. (zu, zv) is the
+    depth gradient over normalised image coordinates."""
     nx, ny, nz = zu, zv, -(z + x * zu + y * zv)
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / length, ny / length, nz / length
@@ -80,13 +80,13 @@ def is_concave(turn, length, sine):
 
 @scalar
 def plane_distance(nx, ny, nz, ex, ey, ez):
-    """Distance of a point from the plane with unit normal n, when the point lies at e from a point of the plane."""
+    """Distance of a point from the plane with unit normal n; e is the point relative to a point of the plane."""
     return abs(nx * ex + ny * ey + nz * ez)
 
 
 @scalar
 def plane_step(depth, intrinsics, normals, v, u, vn, un):
-    """Smaller one of the distances of two neighbouring pixels' points from each other's plane, metres."""
+    """Smaller of the distances of two neighbouring points from each other's plane, metres."""
     z, zn = depth[v, u], depth[vn, un]
     ex = ((np.float32(un) - intrinsics[2]) * zn - (np.float32(u) - intrinsics[2]) * z) / intrinsics[0]
     ey = ((np.float32(vn) - intrinsics[3]) * zn - (np.float32(v) - intrinsics[3]) * z) / intrinsics[1]
@@ -98,7 +98,7 @@ def plane_step(depth, intrinsics, normals, v, u, vn, un):
 
 @kernel
 def concave_edges(depth, intrinsics, tolerance, reach, normal_reach, sine, normals, edge):
-    """Normals, and pixels on concave edges: an object on the floor is cut off at its foot, faces of a box are not.
+    """Normals, and pixels on concave edges: they separate an object from the floor, but not the faces of a box.
 
     Args:
         depth, intrinsics, tolerance, reach, normal_reach, sine: See ``segment_surface``.
@@ -156,7 +156,7 @@ def connected_segments(depth, intrinsics, tolerance, normals, edge, labels, pass
 
     Args:
         depth, intrinsics, tolerance, normals, edge: See ``concave_edges``.
-        labels: (h, w) int32 out: number from 1, 0 = no reading.
+        labels: (h, w) int32 out: number from 1, 0 = no depth.
         passes: Pixels by which a segment may grow over the pixels of an edge.
 
     Returns:
@@ -191,7 +191,7 @@ def connected_segments(depth, intrinsics, tolerance, normals, edge, labels, pass
                     stack[top] = vn * w + un
                     top += 1
     for _ in range(passes):
-        # pixels join all at once, so that the result does not depend on the order of the scan
+        # pixels join simultaneously, so that the result does not depend on the scan order
         for v in range(h):
             for u in range(w):
                 if labels[v, u] != 0 or depth[v, u] <= 0:

@@ -1,4 +1,4 @@
-"""Point splatting: points seen in earlier images, carried over into the image of a new pose."""
+"""Point splatting: points of earlier images projected into the image of a new pose."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel
 
 SAME_SURFACE = np.float32(0.05)
-"""Largest distance of two readings of a pixel on the same surface, as a share of the depth."""
+"""Largest distance of two measurements of a pixel on the same surface, as a share of the depth."""
 NEAREST = np.float32(0.05)
-"""Points nearer to the camera plane than this, or behind it, are not projected, metres."""
+"""Smallest depth of a projected point, metres."""
 
 
 class PointImage(NamedTuple):
@@ -18,8 +18,8 @@ class PointImage(NamedTuple):
 
     Attributes:
         points: (h, w, 3) float32, world frame, metres.
-        intensities: (h, w) float32, NaN = no point; the other two are then arbitrary.
-        times: (h, w, 2) float64, seconds: when the point's surface was first seen, and last.
+        intensities: (h, w) float32, NaN = no point; the other arrays are then arbitrary.
+        times: (h, w, 2) float64, seconds: first and last observation of the point's surface.
     """
 
     points: NDArray[np.float32]
@@ -35,13 +35,13 @@ class PointImage(NamedTuple):
 def splat(
     image: PointImage, T_camera_world: NDArray[np.float64], intrinsics: NDArray[np.float32], since: float
 ) -> PointImage:
-    """The points as a camera sees them: the nearest in each pixel.
+    """The nearest point in each pixel of a camera.
 
     Args:
         image: Points in the world.
         T_camera_world: (4, 4).
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        since: Points last seen before this time are left out, seconds.
+        since: Points last observed before this time are left out, seconds.
     """
     out = PointImage.empty(image.intensities.shape)
     points, intensities, times = image
@@ -61,9 +61,9 @@ def overwrite(
     T_world_camera: NDArray[np.float64],
     intrinsics: NDArray[np.float32],
 ) -> None:
-    """Replace the points of the pixels ``used`` by the readings of an image.
+    """Replace the points of the pixels ``used`` by the measurements of an image.
 
-    The time a point was first seen is kept where the reading lies on the same surface.
+    The time of the first observation is kept if the measurement lies on the same surface.
 
     Args:
         image: Points by pixel of the same camera pose; changed.
@@ -78,7 +78,7 @@ def overwrite(
 
 @kernel
 def splat_points(points, intensities, times, since, T, intrinsics, new_points, new_intensities, new_times):
-    """Loop of ``splat`` over n points; ``T`` is (3, 4) float32, the last three arguments are written."""
+    """Loop of ``splat`` over n points; ``T`` is (3, 4) float32, the last three arguments are output."""
     h, w = new_intensities.shape
     nearest = np.full((h, w), np.float32(1e9))
     new_intensities[:] = np.nan

@@ -1,4 +1,4 @@
-"""The voxels of a block together with those around it."""
+"""The voxels of a block and of its surroundings."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from dudmap.core.backends.threads import scalar
 
 @scalar
 def surrounded(voxels, near, words):
-    """Words of a block and of the voxels around it; 0 where there is no block.
+    """Words of a block and of the voxels around it; 0 without a block.
 
     Args:
         voxels: (slots, 512) int32.

@@ -1,12 +1,12 @@
-"""Marching-cubes tables (Lorensen & Cline 1987), derived instead of typed.
+"""Marching-cubes tables (Lorensen & Cline 1987), derived by code.
 
-Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz); bit k of a case is set where corner k is inside
-(sdf < 0). An edge is a pair (corner, axis) of its lower end and its direction.
+Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz). Bit k of a case is set if corner k is inside (sdf <
+0). An edge is a pair (corner, axis) of its lower end and its direction.
 
-On each face of the cell the surface consists of one or two segments between crossed edges. They depend on the four
-signs of that face alone (on an ambiguous face each inside corner is separated by its own segment), so that two cells
-agree on the face between them, and the mesh has no cracks. The segments form closed loops, which are triangulated
-without a diagonal that lies in a face: such a diagonal could coincide with a neighbour's and give an edge four
+On each face of the cell the surface consists of one or two segments between crossed edges. They depend only on the four
+signs of that face; on an ambiguous face each inside corner gets its own segment. Therefore neighbouring cells agree on
+their common face, and the mesh has no cracks. The segments form closed loops, which are triangulated without diagonals
+inside a face. Such a diagonal could coincide with a diagonal of the neighbour, so that an edge would have four
 triangles.
 """
 
@@ -22,7 +22,6 @@ EDGES = tuple((corner, axis) for axis in range(3) for corner in range(8) if CORN
 
 
 def _edge_between(a: int, b: int) -> int:
-    """Number of the edge between two corners."""
     axis = next(n for n in range(3) if CORNERS[a][n] != CORNERS[b][n])
     return EDGES.index((min(a, b), axis))
 
@@ -55,7 +54,7 @@ def _segments(case: int) -> dict[int, int]:
     """Segments of all faces, from crossed edge to crossed edge; the inside is on the right, seen from outside the cell.
 
     Along the border of a face, counter-clockwise, a segment starts at the edge that enters the inside and ends at the
-    edge that leaves it: it separates one run of inside corners.
+    edge that leaves it. It separates one run of inside corners.
     """
     out = {}
     for face in FACES:
@@ -86,8 +85,6 @@ def _loops(case: int) -> list[list[int]]:
 
 @cache
 def _triangulations(n: int) -> list[list[tuple[int, int, int]]]:
-    """All triangulations of a polygon of n corners."""
-
     def cut(i: int, j: int) -> list[list[tuple[int, int, int]]]:
         if j - i < 2:
             return [[]]

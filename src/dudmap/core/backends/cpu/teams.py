@@ -1,8 +1,8 @@
 """Threads that share the bands of consecutive steps inside one compiled call.
 
-One thread leads: it announces a step of some bands, works on them itself, and waits until all are done. The others
-take bands as long as there are any. A band is taken by adding 1 to a ticket that also holds the number of the step, so
-a thread that comes late finds nothing or the bands of a later step, and never holds up the others.
+One thread leads: it announces a step, works on its bands, and waits until all are done. The other threads take bands
+while any remain. Taking a band adds 1 to a ticket that also holds the step number. A late thread therefore finds no
+band or a band of a later step, and never delays the others.
 """
 
 import sys
@@ -15,12 +15,12 @@ from numba.extending import intrinsic
 from dudmap.core.backends.threads import also_in_other_threads, kernel, num_threads, scalar
 
 TICKET, DONE = 0, 8
-"""Places, on two cache lines, of the next ticket, step << 32 | band, and of the number of bands that are done."""
+"""Places, on two cache lines, of the next ticket (step << 32 | band) and of the number of finished bands."""
 FINISHED = -(1 << 62)
 """Ticket after the last step."""
 NO_BAND = -1
 PATIENCE = 4096
-"""Times that a thread without work yields its core before it leaves, about a millisecond."""
+"""Number of times that an idle thread yields its core before it leaves, about a millisecond."""
 
 if sys.platform == "win32":
     _yield_core = njit(lambda: None, cache=False)
@@ -34,7 +34,7 @@ else:
 
 @intrinsic
 def _add(typing_context, array, index, value):
-    """Add to an element of an int64 array at once; its value before."""
+    """Add atomically to an element of an int64 array; returns the previous value."""
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -45,7 +45,7 @@ def _add(typing_context, array, index, value):
 
 @intrinsic
 def _load(typing_context, array, index):
-    """An element of an int64 array that other threads write."""
+    """Load atomically an element of an int64 array."""
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -56,7 +56,7 @@ def _load(typing_context, array, index):
 
 @intrinsic
 def _store(typing_context, array, index, value):
-    """Write an element of an int64 array that other threads read."""
+    """Store atomically into an element of an int64 array."""
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -68,7 +68,7 @@ def _store(typing_context, array, index, value):
 
 @kernel
 def announce(team, step):
-    """Lead: offer the bands of the next step to all threads."""
+    """Leader: offer the bands of the next step to all threads."""
     _store(team, DONE, 0)
     _store(team, TICKET, step << 32)
 
@@ -90,20 +90,20 @@ def take(team, num_bands):
 
 @kernel
 def done(team):
-    """A band is done."""
+    """Count one finished band."""
     _add(team, DONE, 1)
 
 
 @kernel
 def wait_for_all(team, num_bands):
-    """Lead: wait until all bands of the step are done."""
+    """Leader: wait until all bands of the step are done."""
     while _load(team, DONE) < num_bands:
         _yield_core()
 
 
 @kernel
 def wait_for_work(team, num_bands):
-    """Other threads: the next band, and the number of its step; ``NO_BAND`` where there is nothing more to do."""
+    """Other threads: the next band and its step; ``NO_BAND`` if no work is left."""
     for _ in range(PATIENCE):
         band, step = take(team, num_bands)
         if band != NO_BAND or step == FINISHED:
@@ -114,7 +114,7 @@ def wait_for_work(team, num_bands):
 
 @scalar
 def first_band(leads, team, step, num_bands):
-    """A first band of the next step, which the leading thread offers to all, and the number of its step."""
+    """First band of the next step, which the leading thread announces, and the number of the step."""
     if leads:
         announce(team, step)
         return take(team, num_bands)
@@ -123,17 +123,17 @@ def first_band(leads, team, step, num_bands):
 
 @kernel
 def finish(team):
-    """Lead: there is no further step."""
+    """Leader: announce that no further step follows."""
     _store(team, TICKET, FINISHED)
 
 
 def run_team(function, num_bands, *arguments):
-    """Result of a compiled ``function(leads, team, *arguments)``, which other threads run too while it does.
+    """Result of a compiled ``function(leads, team, *arguments)``, which other threads execute concurrently.
 
     Args:
         function: Kernel; ``leads`` is True in the thread that returns the result.
         num_bands: Bands of each step; one band needs no other thread.
-        arguments: Of the function.
+        arguments: Arguments of the function.
     """
     team = np.zeros(16, dtype=np.int64)
     team[TICKET] = num_bands  # nothing to take before the first step

@@ -4,15 +4,15 @@ from numba.core import types
 from numba.extending import intrinsic
 
 WIDTH = 512
-"""Bits. Processors with shorter registers use those they have."""
+"""Bits. Processors with shorter registers use their own width."""
 
 
 @intrinsic
 def wide_vectors(typing_context):
-    """Have the loops of the enclosing kernel use registers of ``WIDTH`` bits where the processor has them.
+    """Compile the loops of the enclosing kernel for registers of ``WIDTH`` bits, if the processor has them.
 
-    LLVM uses half of an AVX-512 register unless a function asks for all of it, as its first generation slowed its clock
-    down for longer ones. Only loops that calculate much per load gain.
+    By default LLVM uses half of an AVX-512 register, because the first generation reduced its clock for longer ones.
+    Only loops with much arithmetic per load gain.
     """
 
     def generate(context, builder, signature, arguments):

@@ -1,4 +1,4 @@
-"""Loops over blocks: those that a depth image touches, can change, or sees to be empty (thesis section 4.5)."""
+"""Loops over blocks: blocks that a depth image touches, can change, or observes as empty (thesis section 4.5)."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from dudmap.core.formulas.pixel import band_behind, band_front, elements, projec
 TILE = 8
 """Edge of a tile of the depth image, pixels."""
 SETTLED = 8
-"""Frames that are fused into a far block before it is updated in every second frame only."""
+"""Fused frames after which a far block is updated in every second frame only."""
 REACH = np.float32(0.8661)
 """Radius of the sphere around a block over its edge: half of the space diagonal."""
 
@@ -21,28 +21,28 @@ def mark_blocks(
 ):  # fmt: skip
     """Window cells of blocks without voxels that the truncation bands of a depth image touch.
 
-    A block known to be free gets voxels only within the fixed part of the band: in the part that grows with the noise,
-    blocks would appear and vanish with every frame.
+    A known free block gets voxels only within the fixed part of the band. In the part that grows with the noise, blocks
+    would appear and vanish with every frame.
 
-    A row of pixels goes along its rays step by step: the addresses are computed for all of them before cells are read.
+    A row of pixels advances along its rays step by step: addresses are computed for the whole row before cells are
+    read.
 
     Args:
         row_start, row_stop, stride: Rows of the band, and the step between pixels.
         depth: (H, W) float32, metres, 0 = none.
         intrinsics: (4,) float32 fx, fy, cx, cy.
         T: (3, 4) float32, camera to window blocks: block units, origin at the window's first block.
-        shape: (3,) int64 blocks of the window.
-        window: (cells,) int32.
-        free_count: (entries,) uint8 observations of emptiness.
+        shape, window, free_count: See ``VoxelGrid``.
         free_after: Observations that make a block known free space.
         frame_number: Number of this frame.
-        stamps: (cells,) int32, number of the frame that last found a cell; changed here. Two bands may both find one.
+        stamps: (cells,) int32, number of the last frame that found each cell; changed here. Two bands may both find
+            one.
         band: TruncationBand.
         block_size: Edge of a block, metres.
         found: (n,) int32 out.
 
     Returns:
-        Number of cells found; never more than ``len(found)``.
+        Number of cells found, at most ``len(found)``.
     """
     wide_vectors()
     count, w = 0, -(-depth.shape[1] // stride)
@@ -87,12 +87,11 @@ def mark_blocks(
 
 @scalar
 def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
-    """Nearest and farthest reading and share of pixels with one, per tile of the depth image.
+    """Depth range and share of pixels with depth, per tile of the depth image.
 
     Args:
-        row_start, row_stop: Rows of tiles.
         depth: (H, W) float32.
-        nearest, farthest, valid: (ceil(H / TILE), ceil(W / TILE)) float32 out; no reading gives inf, 0, 0.
+        nearest, farthest, valid: Out, see ``DepthTiles``.
     """
     h, w = depth.shape
     zero, one, none = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -124,25 +123,24 @@ def visible_slots(
 ):  # fmt: skip
     """Slots of the blocks that a depth image can change and that are updated in this frame.
 
-    Where the sensor's noise is wider than the band, a block that has been fused into often enough to hold the mean of
-    that noise is updated in every second frame only, with double weight; one half of such blocks in the even frames,
-    the other in the odd ones.
+    A block alternates if the sensor noise is wider than the band and SETTLED frames, enough for a stable mean, have
+    been fused into it. It is updated in every second frame with double weight. Half of these blocks are updated in even
+    frames, the other half in odd ones.
 
     Args:
-        start, stop: Range of candidates.
         slots: (n,) int32 candidates.
-        coords: (num_slots, 3) int32 from the origin of T block coordinates by slot.
+        coords: (num_slots, 3) int32 block coordinates by slot, relative to the origin of T.
         fused: (num_slots,) uint8 frames that were fused into a slot.
         turn: Number of this frame; negative = all blocks are updated in every frame.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
         block_size: Edge of a block, metres.
-        farthest: Depth tiles, see ``tile_ranges``.
+        farthest: See ``DepthTiles``.
         band: TruncationBand.
-        depth_min, depth_max: Range of the readings, metres.
-        out: (n,) int32 out, written from ``start`` on.
-        repeats: (n,) float32 out, number of frames that this one stands for.
+        depth_min, depth_max: Depth range, metres.
+        out: (n,) int32 out, written from ``start``.
+        repeats: (n,) float32 out, number of frames that this frame stands for.
 
     Returns:
         Number of slots written.
@@ -191,29 +189,28 @@ def observe_free(
     x_start, x_stop, x_step, window, shape, origin, T, intrinsics, size, block_size, nearest, valid, band, depth_max,
     counts, repeats, free_after, found,
 ):  # fmt: skip
-    """Add observations of emptiness to window cells without voxels that lie wholly in front of all readings of a depth
-    image; those without an entry are listed instead.
+    """Add observations of emptiness to window cells without voxels that lie entirely in front of all surfaces of a
+    depth image. Cells without an entry are listed instead.
 
     Works on columns of the window, so that only the view frustum is visited.
 
     Args:
         x_start, x_stop, x_step: Window planes of this call.
-        window: (cells,) int32.
-        shape, origin: (3,) int64 blocks of the window and its first block.
+        window, shape, origin: See ``VoxelGrid``.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
         block_size: Edge of a block, metres.
-        nearest, valid: Depth tiles, see ``tile_ranges``.
+        nearest, valid: See ``DepthTiles``.
         band: TruncationBand.
-        depth_max: Farthest reading, metres.
+        depth_max: Largest depth, metres.
         counts: (entries,) uint8, observations of emptiness by entry; changed here.
-        repeats: Observations that are added.
-        free_after: Observations from which on a cell is not visited again.
+        repeats: Observations to add.
+        free_after: Observations after which a cell is not visited again.
         found: (n,) int32 out, cells without an entry.
 
     Returns:
-        Number of cells found; never more than ``len(found)``.
+        Number of cells found, at most ``len(found)``.
     """
     count = 0
     radius = REACH * block_size
@@ -268,7 +265,7 @@ def observe_free(
                 v = project(py, by_z, intrinsics[1], intrinsics[3])
                 tx0, ty0 = np.int64(u) // TILE, np.int64(v) // TILE
                 if 0 <= tx0 < nearest.shape[1] and 0 <= ty0 < nearest.shape[0] and z + radius >= nearest[ty0, tx0]:
-                    continue  # most of space is occluded: its centre shows that at less cost
+                    continue  # most of space is occluded; the centre shows this at less cost
                 reach = radius / (z - radius)
                 ru, rv = reach * intrinsics[0], reach * intrinsics[1]
                 tx0, tx1 = np.int64(np.floor(u - ru)) // TILE, np.int64(np.floor(u + ru)) // TILE

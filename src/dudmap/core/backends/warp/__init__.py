@@ -1,1 +1,1 @@
-"""The operations of ``core/backends/spec.py`` on NVIDIA GPUs, by Warp (extra ``gpu``)."""
+"""The operations of ``core/backends/spec.py`` on NVIDIA GPUs, with Warp (extra ``gpu``)."""

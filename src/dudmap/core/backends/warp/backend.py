@@ -1,11 +1,10 @@
-"""The back end for GPUs: Warp kernels for the loops over pixels and voxels of a frame.
+"""GPU back end: Warp kernels for the loops over pixels and voxels of a frame.
 
-The voxels stay on the device; which blocks there are, meshes, views, labels and maps with several voxel sizes
-are the CPU's.
+The voxels stay on the device. The CPU manages the blocks and computes meshes, views, labels and maps with several voxel
+sizes.
 """
 
-# Warp's annotations name float where any type of number is meant
-# pyright: reportArgumentType=false, reportReturnType=false
+# Warp's annotations say float for any type of number
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -39,14 +38,16 @@ from dudmap.core.backends.warp.kernels.structs import Lattice, camera_of, struct
 from dudmap.core.backends.warp.memory import down, in_warp, resident, up, wrote
 
 GROUPS = 64
-"""Partial sums that are left after the first level of a sum."""
+"""Partial sums after the first level of a sum."""
 PER_THREAD = 8
 """Pixels that one thread adds up in a linearisation."""
 
 
 class WarpBackend(CpuBackend):
-    """``Backend`` on a device of Warp, "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
-    Operations that are not defined here are the CPU's."""
+    """``Backend`` on a device of Warp: "cuda:0", or "warp-cpu", which runs the same kernels on the CPU for tests.
+
+    Other operations are inherited from the CPU.
+    """
 
     def __init__(self, device: str) -> None:
         super().__init__()
@@ -83,14 +84,14 @@ class WarpBackend(CpuBackend):
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """See ``Backend.register``; 32 sums come down per step."""
+        """See ``Backend.register``; 32 sums are downloaded per step."""
         at = self._linearization(grid, image, parameters)
         return descend(lambda T: at(to_lattice(T, grid.voxel_size, grid.origin)), T_world_camera, first, rules)
 
     def _linearization(
         self, grid: VoxelGrid, image: LevelImage, parameters: RegistrationParameters
     ) -> Callable[[NDArray[np.float32]], NormalEquations]:
-        """Normal equations of an image as a function of its pose in the lattice; the images go up once for all."""
+        """Normal equations of an image as a function of its pose in the lattice; the images are uploaded once."""
         shape, p, camera = image.depth.shape, struct(parameters), camera_of(image.intrinsics)
         threads = -(-image.depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
         with self._using():
@@ -131,7 +132,7 @@ class WarpBackend(CpuBackend):
         return faults.using(self.device)
 
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
-        """Run a kernel; without threads nothing happens."""
+        """Run a kernel, unless it has no threads."""
         if np.prod(dim) > 0:
             wp.launch(kernel, dim=dim, inputs=list(arguments), device=in_warp(self.device))
 
@@ -142,7 +143,7 @@ class WarpBackend(CpuBackend):
         return up(array, self.device)
 
     def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
-        """The window and its voxels as kernels take them."""
+        """The window and its voxels as kernel argument."""
         lattice = Lattice()
         lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
         lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
@@ -150,7 +151,7 @@ class WarpBackend(CpuBackend):
 
 
 class _Residuals:
-    """Images (2, h, w) on a device, of which each is downloaded when it is asked for."""
+    """Images (2, h, w) on a device, each downloaded when it is read."""
 
     def __init__(self, images: Any, using: Callable[[], AbstractContextManager[None]]) -> None:  # noqa: ANN401
         self._images, self._using = images, using

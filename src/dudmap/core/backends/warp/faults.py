@@ -1,7 +1,7 @@
-"""A device that fails: what Warp raises becomes one sentence, and the device is not used again in the process.
+"""Device failures: an exception of Warp becomes one sentence, and the process no longer uses the device.
 
-Warp raises RuntimeError, and Exception itself where a module cannot be loaded. After most failures of a GPU its context
-can do nothing more in the process.
+Warp raises RuntimeError, and Exception itself if a module cannot be loaded. After most GPU failures the context of the
+process is unusable.
 """
 
 import threading
@@ -20,7 +20,7 @@ def is_lost(device: str) -> bool:
 
 
 def forget() -> None:
-    """Use failed devices again: for tests, which let devices fail that are sound."""
+    """Use failed devices again; for tests that simulate failures."""
     _lost.clear()
 
 

@@ -1,7 +1,6 @@
-"""Arrays of a device: copies of the map that stay there, and the ways of images there and back."""
+"""Device arrays: persistent copies of the map, upload and download of images."""
 
-# Warp's annotations name float where any type of number is meant
-# pyright: reportArgumentType=false, reportReturnType=false
+# Warp's annotations say float for any type of number
 
 from typing import Any
 
@@ -14,7 +13,7 @@ from dudmap.core.backends.warp import faults
 from dudmap.core.backends.warp.kernels import rows as kernels
 
 GROWTH = 1.5
-"""Rows on the device in units of those in use, when its array is made anew."""
+"""Allocated rows on the device, as a multiple of the used ones."""
 WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.int32): wp.int32, np.dtype(np.uint8): wp.uint8,
 }  # fmt: skip
@@ -26,13 +25,13 @@ def in_warp(device: str) -> str:
 
 
 def up(array: NDArray, device: str) -> Any:  # noqa: ANN401 - an array of Warp
-    """A copy of an array on a device."""
+    """Upload an array."""
     words = np.ascontiguousarray(array)
     return wp.array(words, dtype=WARP_TYPES[words.dtype], device=in_warp(device))
 
 
 def down(array: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
-    """A copy of an array of a device, whose work is waited for."""
+    """Download an array after its pending work."""
     found = array.numpy()
     return found.copy() if array.device.is_cpu else found  # NumPy and Warp share the memory of the CPU
 
@@ -40,7 +39,7 @@ def down(array: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
 class RowCopy:
     """Copy of an int32 array (rows,) or (rows, width) on a device; see ``Mirror.copy``.
 
-    What a device that has failed wrote since the last ``pull`` is lost.
+    If the device fails, its writes since the last ``pull`` are lost.
     """
 
     def __init__(self, device: str) -> None:
@@ -50,7 +49,7 @@ class RowCopy:
         self._written: list[NDArray] = []  # rows that the device wrote
 
     def current(self, mirror: Mirror) -> Any:  # noqa: ANN401 - an array of Warp
-        """The device's array with everything that the host wrote."""
+        """The device's array, with all writes of the host."""
         if self._array is None or len(self._array) < mirror.used:
             rows = min(int(GROWTH * mirror.used) + 1, len(mirror.array))
             host, self._array = mirror.host[:rows], None
@@ -64,18 +63,18 @@ class RowCopy:
         return self._array
 
     def device_wrote(self, rows: NDArray[np.int32]) -> None:
-        """The device has written rows (n,)."""
+        """Mark rows (n,) as written by the device."""
         self._written.append(rows)
 
     def host_wrote(self, rows: NDArray[np.integer] | None) -> None:
-        """Rows (n,) of the host's array, None = all, have been written."""
+        """Mark rows (n,) of the host's array, None = all, as written."""
         if rows is None:
             self._array, self._stale, self._written = None, [], []
         elif len(rows):
             self._stale.append(np.asarray(rows))
 
     def pull(self, host: NDArray[np.int32]) -> None:
-        """Bring the host's array up to date with what the device wrote."""
+        """Update the host's array with the writes of the device."""
         written, self._written = self._written, []
         if not written or faults.is_lost(self.device):
             return
@@ -100,7 +99,7 @@ class RowCopy:
 
 
 def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: ANN401 - an array of Warp
-    """The array on a device: a mirror's copy there, which is made at its first use, or an array's for this once."""
+    """The array on a device: the persistent copy of a mirror, created at first use, or a temporary copy of an array."""
     if not isinstance(array, Mirror):
         return up(array, device)
     if not (isinstance(array.copy, RowCopy) and array.copy.device == device):
@@ -110,7 +109,7 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
 
 
 def wrote(array: Mirror | NDArray[np.int32], rows: NDArray[np.int32]) -> None:
-    """A kernel has written rows (n,) of the mirror that ``resident`` gave; a plain array would not see the change."""
+    """Mark rows (n,) of a mirror as written by a kernel; a plain array would not see the change."""
     if not (isinstance(array, Mirror) and isinstance(array.copy, RowCopy)):
         raise TypeError("the device writes to mirrors only; a plain array would not see the change")
     array.copy.device_wrote(rows)

@@ -1,1 +1,1 @@
-"""Warp kernels: loops over pixels, voxels and blocks around the formulas that the CPU has, too (``formulas.py``)."""
+"""Warp kernels: loops over pixels, voxels and blocks around the formulas shared with the CPU (``formulas.py``)."""

@@ -1,8 +1,8 @@
-"""The scalar formulas of the CPU kernels (``dudmap/core/backends/cpu``), compiled by Warp from the same text.
+"""The scalar formulas of the CPU kernels (``dudmap/core/backends/cpu``), compiled by Warp from the same source.
 
-A function that Numba compiles is plain Python on float32 and int32 numbers. ``warp_function`` gives its code object
-other globals, in which ``np`` and the functions it calls are those of Warp, and hands it to ``wp.func``. What Warp's
-language lacks is defined here: the conjunction of two booleans by ``&``, and the parts of a packed word.
+A function for Numba is plain Python on float32 and int32 numbers. ``warp_function`` replaces the globals of its code
+object by their Warp counterparts and passes it to ``wp.func``. This file defines the operations that Warp lacks: ``&``
+and ``|`` of two booleans, and parts of a packed word.
 """
 
 import inspect
@@ -32,25 +32,25 @@ def motion_of(T: np.ndarray) -> wp.types.vector:
 
 @wp.func
 def bit_and(a: wp.bool, b: wp.bool):
-    """The conjunction of two truth values."""
+    """Conjunction of two truth values."""
     return a and b
 
 
 @wp.func
 def bit_and(a: wp.int32, b: wp.int32):
-    """The conjunction of two words, bit by bit."""
+    """Bitwise conjunction of two words."""
     return wp.bit_and(a, b)
 
 
 @wp.func
 def bit_or(a: wp.bool, b: wp.bool):
-    """The disjunction of two truth values."""
+    """Disjunction of two truth values."""
     return a or b
 
 
 @wp.func
 def bit_or(a: wp.int32, b: wp.int32):
-    """The disjunction of two words, bit by bit."""
+    """Bitwise disjunction of two words."""
     return wp.bit_or(a, b)
 
 
@@ -71,7 +71,7 @@ _NUMPY = types.SimpleNamespace(
     floor=wp.floor, ceil=wp.ceil, sqrt=wp.sqrt, exp=wp.exp, sin=wp.sin, cos=wp.cos,
     minimum=wp.min, maximum=wp.max, where=wp.where,
 )  # fmt: skip
-"""What the formulas use of NumPy, and of ``math``. Indices of 64 bits fit into 32 there."""
+"""Functions of NumPy and ``math`` that the formulas use. Indices of 64 bits fit into 32 here."""
 _OF_NUMPY = {
     np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.int64: wp.int32, np.floor: wp.floor,
     np.sqrt: wp.sqrt, np.exp: wp.exp,
@@ -81,7 +81,8 @@ _compiled: dict[Formula, wp.Function] = {}
 
 
 def warp_function(formula: Formula) -> wp.Function:
-    """The function of Warp with the text of a formula that Numba compiles, or a plain one, and of all that it calls."""
+    """Warp function with the code of a formula for Numba, or of a plain function, including all functions that it
+    calls."""
     if formula not in _compiled:
         function = formula if isinstance(formula, types.FunctionType) else formula.py_func
         names = {**function.__globals__, "bit_and": bit_and, "bit_or": bit_or, **_OWN}
@@ -96,7 +97,7 @@ def warp_function(formula: Formula) -> wp.Function:
 
 
 def _counterpart(value: object) -> object:
-    """What Warp has for a global of a formula."""
+    """Warp counterpart of a global of a formula."""
     if isinstance(value, Formula):
         return warp_function(value)
     if value is np or value is math:

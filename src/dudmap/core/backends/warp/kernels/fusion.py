@@ -1,6 +1,6 @@
 """Fusion of a depth image into the blocks in view (thesis section 4.5, algorithm 1).
 
-The arithmetic before the shared formulas is that of ``core/backends/cpu/integration.py``.
+The arithmetic before the shared formulas equals ``core/backends/cpu/integration.py``.
 """
 
 import warp as wp
@@ -28,7 +28,8 @@ def integrate(
 ):  # fmt: skip
     """Fuse the image into one voxel per thread: see ``integration.integrate_blocks``.
 
-    ``coords`` (n, 3) are those of ``slots`` (n,). The count of occupied voxels is an integer, whose sum has no order.
+    ``coords`` (n, 3) are the coordinates of ``slots`` (n,). The count of occupied voxels is an integer, so that its sum
+    does not depend on the order.
     """
     block, n = wp.tid()
     slot = slots[block]

@@ -9,13 +9,13 @@ Rows = wp.array2d(dtype=wp.int32)
 
 @wp.kernel
 def scatter(rows: wp.array(dtype=wp.int32), source: Rows, target: Rows):
-    """Row n of ``source`` to row ``rows[n]`` of ``target``."""
+    """Copy row n of ``source`` to row ``rows[n]`` of ``target``."""
     n, k = wp.tid()
     target[rows[n], k] = source[n, k]
 
 
 @wp.kernel
 def gather(rows: wp.array(dtype=wp.int32), source: Rows, target: Rows):
-    """Row ``rows[n]`` of ``source`` to row n of ``target``."""
+    """Copy row ``rows[n]`` of ``source`` to row n of ``target``."""
     n, k = wp.tid()
     target[n, k] = source[rows[n], k]

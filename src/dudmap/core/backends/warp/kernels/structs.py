@@ -1,4 +1,4 @@
-"""Named tuples of ``core/backends/parameters.py`` as structures of Warp: the same names, every number float32."""
+"""Named tuples of ``core/backends/parameters.py`` as Warp structures: the same names, every number float32."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ _STRUCTS: dict[type, Any] = {}
 
 
 def _struct_of(kind: type) -> Any:
-    """Structure of Warp with the fields of a named tuple of numbers and of such tuples."""
+    """Warp structure with the fields of a named tuple of numbers and nested tuples."""
     fields = {name: _STRUCTS.get(one, wp.float32) for name, one in kind.__annotations__.items()}
     _STRUCTS[kind] = wp.struct(type(kind.__name__, (), {"__annotations__": fields, "__module__": __name__}))
     return _STRUCTS[kind]

@@ -1,7 +1,7 @@
 """Loops that read the map: normal equations, samples at points.
 
-Sums are those of ``cpu/registration.py``: each thread adds up a fixed set of pixels, and the partial sums are added in
-their order, so that two runs on one device give the same numbers bit for bit. Atomic additions would not.
+The sums equal ``cpu/registration.py``. Each thread adds a fixed set of pixels, and the partial sums are added in order.
+Therefore two runs on one device give bit for bit the same numbers, unlike atomic additions.
 """
 
 import warp as wp
@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 NUM_SUMS = wp.constant(registration.NUM_SUMS)
 UNKNOWN, SURFACE, FREE = (wp.constant(wp.uint8(state)) for state in (states.UNKNOWN, states.SURFACE, states.FREE))
 LANES = wp.constant(128)
-"""Pixels that go into one partial sum are this many apart, so that neighbouring threads read neighbouring pixels."""
+"""Distance between the pixels of one partial sum, so that neighbouring threads read neighbouring pixels."""
 Sums = wp.types.vector(registration.NUM_SUMS, wp.float32)
 Corners = wp.types.vector(8, wp.int32)
 
@@ -121,7 +121,9 @@ def linearize(
 
 @wp.kernel
 def add_up(partial: wp.array2d(dtype=wp.float32), groups: int, out: wp.array2d(dtype=wp.float64)):
-    """One level of the sum: each thread adds every ``groups``-th partial sum of one quantity, in order, in float64."""
+    """First level of the sum: each thread adds every ``groups``-th partial sum of one quantity, in order, in
+    float64.
+    """
     k, group = wp.tid()
     total = wp.float64(0.0)
     for n in range(group, partial.shape[1], groups):
@@ -131,7 +133,7 @@ def add_up(partial: wp.array2d(dtype=wp.float32), groups: int, out: wp.array2d(d
 
 @wp.kernel
 def finish(parts: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
-    """The last level of the sum."""
+    """Last level of the sum."""
     k = wp.tid()
     total = wp.float64(0.0)
     for n in range(parts.shape[1]):
