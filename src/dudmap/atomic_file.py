@@ -39,7 +39,6 @@ def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> It
     the old file, a power cut the old or the new one. A link at ``path`` is replaced.
 
     Args:
-        path: The file.
         sync: Wait until the file and its name are on the disk. Without it a power cut may lose the new and the old
             file.
         own: The folder of the file was made by dudmap and must be no link.

@@ -39,7 +39,7 @@ def need(name: str, purpose: str, modules: tuple[str, ...]) -> None:
 
 
 def install(name: str) -> str:
-    """The command that installs an extra: the package is installed from its sources, since no index has it."""
+    """The command that installs an extra from the sources of the package, because no index has it."""
     return f'pip install ".[{name}]" in the folder of the sources of dudmap'
 
 

@@ -20,7 +20,7 @@ class DefaultGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the help of the group, then the help of its first command, whose name may be left out."""
+        """Write the help of the group, then the help of its first command, whose name is optional."""
         super().format_help(ctx, formatter)
         name, command = next(iter(self.commands.items()))
         command.format_help(command.context_class(command, info_name=name, parent=ctx), formatter)

@@ -1,8 +1,8 @@
 """Surface that stayed in place and got other colours: a poster, a screen, a painted wall.
 
 Light changes brightness smoothly; paint changes it abruptly. The colours of both visits are averaged over small cells,
-which removes errors of a pose that is off by a pixel. A gain is fitted to the cells around each cell. The remaining
-difference marks other colours if it exceeds the spread of all cells.
+which removes pose errors of a pixel. A gain is fitted to the cells around each cell. The remaining difference marks
+other colours if it exceeds the spread of all cells.
 """
 
 import numpy as np

@@ -1,11 +1,11 @@
 """Compare the surface of one map with another map of the same place.
 
-Every vertex of one mesh is looked up in the other map. It is confirmed, denied, behind a surface, or not seen. A vertex
-is denied if the other map has free space there and no surface within the noise of both maps.
+Every vertex of one mesh is confirmed, denied, behind a surface, or not seen by the other map. A vertex is denied if the
+other map has free space there and no surface within the noise of both maps.
 
-This noise is one voxel plus three standard deviations of the local noise. The local noise is the larger of two: the
-sensor's at the camera's distance, and the spread of the distances between both surfaces nearby. The latter includes
-errors of the alignment and the bending of maps.
+This noise is one voxel plus three standard deviations of the local noise. The local noise is the larger of the sensor's
+at the camera's distance and the spread of the distances between both surfaces nearby. The latter includes errors of the
+alignment and the bending of maps.
 """
 
 from dataclasses import dataclass
@@ -164,7 +164,7 @@ def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArra
     """Number of views (n,) of a visit that look through points (n, 3) of the common frame at a surface behind them.
 
     The surface must lie farther than twice a margin (n,), metres, behind the point, in the pixel and its neighbours.
-    Views are rendered because the map stores free space per block and not where part of a block is hidden.
+    Views are rendered because the map stores free space per block only.
     """
     import cv2
 

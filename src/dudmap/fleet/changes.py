@@ -41,7 +41,6 @@ class Change:
         kind: appeared, disappeared, moved, recoloured, or unknown (surface that only one visit saw).
         before, after: Its surface in either visit, None if it is absent.
         confidence: 0..1, share of its surface that agrees with its kind.
-        motion: Its motion, if it moved.
     """
 
     kind: str

@@ -30,21 +30,16 @@ BEST_FRAMES = 3
 def diff_runs(
     before: str | Path, after: str | Path, out: str | Path | None = None, min_size: float = 0.1
 ) -> dict[str, Any]:
-    """Compare two run folders.
-
-    With ``out`` the folder receives changes.json, changes/<id>.ply and report.html.
+    """Compare two run folders; return the content of changes.json.
 
     Args:
         before, after: Run folders with map.npz and keyframes.npz.
-        out: New folder, or one of an earlier comparison.
+        out: New folder, or one of an earlier comparison, for changes.json, changes/<id>.ply and report.html.
         min_size: Edge of the smallest thing that is reported, metres.
-
-    Returns:
-        Content of changes.json.
 
     Raises:
         MapError: A folder is no complete run folder, a map has no free space, or the places cannot be joined.
-        ConfigError: ``min_size`` is impossible.
+        ConfigError: ``min_size`` is out of range.
         DudmapError: ``out`` cannot be used.
     """
     found = compared(before, after, min_size)

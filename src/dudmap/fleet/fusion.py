@@ -1,9 +1,9 @@
 """Fuse many maps on disk, one range of space at a time, and write the surface as 3D Tiles 1.1 (OGC 22-025r4).
 
-The world is cut into cells of 16x16x16 blocks. Cells are octree nodes and so have consecutive Morton codes. A range is
-a sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses one range: it adds the maps that
-reach it, writes the blocks as a map file, and the surface of every cell as a tile. Blocks of neighbouring ranges that
-touch the range are fused for the triangles at its border and not stored.
+The world is cut into cells of 16x16x16 blocks, nodes of an octree with consecutive Morton codes. A range is a sequence
+of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker adds the maps that reach a range, and writes its
+blocks as a map file and the surface of every cell as a tile. Touching blocks of neighbouring ranges are fused for the
+triangles at the border, and not stored.
 
 The tiles form a tree of GLB files with levels of detail. Leaves are cells with their full surface. An inner tile joins
 the vertices of its children in cubes of twice the size, so that all tiles have about as many triangles. A browser

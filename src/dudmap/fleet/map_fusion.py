@@ -1,10 +1,10 @@
 """Fuse maps with known relative poses, one range of blocks at a time, by exact integer sums.
 
-The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean. The weighted mean of several maps is the
-quotient of two sums, ``sdf = sum(w_i sdf_i) / sum(w_i)``, rounded once. The sums are integers, so that the order and
-grouping of the maps do not change the voxels.
+The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, so that of several maps is the quotient of two
+sums, ``sdf = sum(w_i sdf_i) / sum(w_i)``, rounded once. The sums are integers, so that the order and grouping of the
+maps do not change the voxels.
 
-A range is all blocks with Morton codes between two numbers. Neither all maps nor the whole result need to be in memory.
+A range is all blocks with Morton codes between two numbers. It bounds the memory for maps and result.
 """
 
 from collections.abc import Iterable, Sequence
@@ -198,9 +198,8 @@ def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) ->
     """Divide the sums.
 
     Emptiness seen by one map where another has voxels counts as an observation of free space. Its distance is
-    ``free_steps`` (truncation in steps), its weight ``carve_rate`` per observation. Objects that stood in one run and
-    left before the others so disappear. A block that is then empty everywhere, by ``free_after`` observations, loses
-    its voxels.
+    ``free_steps`` (truncation in steps), its weight ``carve_rate`` per observation. Objects that left before the other
+    runs so disappear. A block that is then empty everywhere, by ``free_after`` observations, loses its voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
     emptiness = (carve_rate * sums.free * held)[:, None]
@@ -268,8 +267,8 @@ def fused_blocks(
     """Fuse maps, in any order, into some blocks given by Morton codes.
 
     Voxels of at least one map reach the blocks ``near`` (n,); the blocks ``empty`` (m,) are empty in at least one map.
-    The result has the camera and parameters of ``like``. Each of the ``maps`` comes with its pose (4, 4). Maps on the
-    same grid are copied exactly; others are interpolated trilinearly.
+    The result has the camera and parameters of ``like``. The ``maps`` come with their poses (4, 4): maps on the same
+    grid are copied exactly, others interpolated trilinearly.
     """
     sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
     for volume, T, reached in maps:

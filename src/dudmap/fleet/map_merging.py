@@ -51,11 +51,11 @@ class Hypothesis:
 def relative_poses(
     a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
 ) -> list[Hypothesis]:
-    """Relative poses of two maps from their keyframes, best first; empty if no keyframe of b is recognised in a.
+    """Relative poses ``T_a_b`` of two maps from their keyframes, best first; empty if no keyframe of b is recognised in
+    a.
 
-    Each keyframe of b is matched to the keyframes of a (``KeyframeDatabase.match``) with the ``camera`` of a. Every
-    match votes for ``T_a_b``. Agreeing votes are averaged, weighted by their number of features. Poses with more
-    matching features come first.
+    Each keyframe of b is matched to the keyframes of a (``KeyframeDatabase.match``) with the ``camera`` of a. Agreeing
+    matches are averaged, weighted by their number of features. Poses with more matching features come first.
     """
     database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []

@@ -52,11 +52,10 @@ WRITTEN = {
 
 
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
-    """Merge the maps of two run folders into a new run folder, in the world frame of the first.
+    """Merge the maps of two run folders into a new run folder, in the world frame of the first; return merge.json.
 
-    The folder holds map, keyframes, mesh, metrics.json, and config.toml of the first run. It also holds the
-    trajectories of both runs (trajectory.txt, trajectory-2.txt, ...) and merge.json, whose content is returned. If the
-    maps do not match, nothing is written.
+    The folder holds map, keyframes, mesh, metrics.json, merge.json, config.toml of the first run, and the trajectories
+    of both (trajectory.txt, trajectory-2.txt). If the maps do not match, nothing is written.
 
     Raises:
         MapError: The maps do not match; the message says why.
@@ -136,16 +135,15 @@ def merge_fleet(
 ) -> FleetReport:
     """Merge the maps of two or more runs.
 
-    The folder receives:
+    The folder must be new, or hold a world, which is replaced. It receives:
 
     - world.json: runs with their poses, ranges, pairs.
     - map/<code>.npz: one map file per range, for ``TsdfVolume.load``.
     - tileset.json and tiles/: 3D Tiles 1.1.
     - trajectory.txt, trajectory-2.txt, ...: all runs in the world of the first.
 
-    It must be new, or hold a world, which is replaced. Groups of at least two runs that do not overlap the largest
-    group become worlds in part-2, part-3, ... ``workers`` is the number of processes; ``note`` receives progress
-    messages.
+    Groups of at least two runs that do not overlap the largest group become worlds in part-2, part-3, ... ``workers``
+    is the number of processes; ``note`` receives progress messages.
 
     Raises:
         ConfigError: A run is named twice, or the voxels differ in size.

@@ -2,10 +2,10 @@
 
 Candidate pairs come from place recognition or from the pose graph; features, surfaces and checks decide on each pair.
 
-Places are recognised by VLAD (Jegou et al. 2010). The differences of a keyframe's features to their nearest visual
+Places are recognised by VLAD (Jegou et al. 2010): the differences of a keyframe's features to their nearest visual
 words are summed per word. Each sum is normalised (Arandjelovic and Zisserman 2013), then the whole vector. The words
 are k-means centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components towards
-equal variance, because many places share doors and wallpaper. All keyframes are compared with all.
+equal variance, because many places share doors and wallpaper.
 """
 
 from collections.abc import Callable, Sequence
@@ -77,8 +77,8 @@ def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDAr
 def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """Similarity (n, n) of the places of runs from descriptors (k, d) of each; symmetric, 0 on the diagonal.
 
-    Every keyframe votes for the ``NEIGHBOURS`` runs with the most similar keyframes. A vote is the similarity above
-    that of the last of these runs.
+    Every keyframe votes for the ``NEIGHBOURS`` runs with the most similar keyframes. A vote is the excess over the
+    similarity of the last of these runs.
     """
     everything = _whitened(np.concatenate(runs))
     sizes = np.array([len(run) for run in runs], np.int64)
@@ -195,8 +195,7 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
     """Relative poses of pairs of runs, and the poses of all runs.
 
     The first round compares each run with its most similar runs. Each further round compares runs that overlap at the
-    current poses, starting from these poses. It also compares runs of smaller groups with the next similar runs of
-    other groups.
+    current poses, and runs of smaller groups with the next similar runs of other groups.
 
     Raises:
         MapError: A file is damaged.

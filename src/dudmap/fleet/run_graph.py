@@ -1,6 +1,6 @@
 """Poses of many runs from pairwise relative poses: rejection by cycles, then a robust pose graph.
 
-Relative poses around a cycle must compose to the identity. If a cycle does not close, its joins that no other cycle
+Relative poses around a cycle must compose to the identity. If they do not, the joins of the cycle that no other cycle
 confirms are rejected, because a false join costs more than a missed one. The remaining joins are optimised with a Huber
 kernel.
 """
@@ -36,8 +36,7 @@ def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
     """Cut of a graph that separates at least as many pairs ``apart`` as it has edges; empty if there is none.
 
     Of all minimum cuts between such pairs, the one with most separated pairs per edge is returned as edge indices.
-    Minimum cuts follow from maximum flow with unit capacities (Ford and Fulkerson 1956), on the side of either node.
-    ``edges`` must be unique.
+    Minimum cuts follow from maximum flow with unit capacities (Ford and Fulkerson 1956). ``edges`` must be unique.
     """
     if not edges or not apart:
         return set()
@@ -162,9 +161,8 @@ def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
 def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[Join]:
     """Remove joins that at least as many pairs of runs deny.
 
-    False joins bring groups of runs to a wrong place, and several may agree with each other in similar places. Runs of
-    both groups that then share a place disagree. The joins across a cut are therefore rejected if at least as many
-    pairs across it disagree.
+    False joins bring groups of runs to a wrong place, and several may agree in similar places. Runs of both groups that
+    then share a place disagree. So the joins across a cut are rejected if at least as many pairs across it disagree.
     """
     left = list(joins)
     while cut := best_cut([(join.a, join.b) for join in left], denied):

@@ -1,8 +1,8 @@
-"""Compiles the kernels that a wheel brings: ``python -m dudmap.lab.wheel_kernels FOLDER`` (``make package``).
+"""Compiles the kernels of a wheel: ``python -m dudmap.lab.wheel_kernels FOLDER`` (``make package``).
 
 The first process runs every part of the system on a few small images, for the lowest level, and notes the argument
-types of each kernel. The others compile the same kernels for the other levels, and run none of them: the machine at
-hand needs to have the lowest level only.
+types of each kernel. The others compile the same kernels for the other levels without running them, so that the machine
+needs the lowest level only.
 """
 
 import hashlib

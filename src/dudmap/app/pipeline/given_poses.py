@@ -137,7 +137,7 @@ def _natural(path: Path) -> tuple[int, str]:
 def _matrices(path: Path) -> NDArray[np.float64] | None:
     """Poses (N, 4, 4) of a file of four numbers a line, four lines a pose; None for any other file.
 
-    Lines of three numbers between the poses are left out (Open3D's .log).
+    Lines of three numbers between the poses are skipped (Open3D's .log).
     """
     with damaged(DatasetError, path):
         lines = [line.split() for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]

@@ -62,11 +62,8 @@ class Inspection:
     """Content of a recording.
 
     Attributes:
-        name, format: Of the recording.
-        frames: Number of frames.
         duration: From the first to the last depth image, seconds.
         rate: Depth images per second (from the median interval).
-        has_color: Whether there are colour images.
         color_rate: Colour images per second; None if their times are unknown.
         gaps: (time of the frame before the gap, length) of every gap, seconds.
         camera, color_camera: Intrinsics of the depth and the colour camera; equal for registered images.
@@ -75,8 +72,7 @@ class Inspection:
         depth_scale: Units of a 16-bit depth image per metre.
         median_depth: Of all measurements of the sampled frames, metres; None without any.
         valid_depth: Share of pixels with depth.
-        depth_range: Used depths, metres.
-        voxel_size: Edge of a voxel, metres. Range and voxel size are given, or chosen from the depth.
+        depth_range, voxel_size: Given, or chosen from the depth, metres.
         too_near, too_far: Shares of the measurements below and above ``depth_range``.
         unreadable: Errors of the sampled frames that cannot be read.
         ground_truth: Number of ground truth poses, 0 without.

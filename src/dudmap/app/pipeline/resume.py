@@ -30,9 +30,8 @@ def resume(
 ) -> RunReport:
     """Continue a killed or interrupted run from its last checkpoint to the end.
 
-    Recording, configuration and options are taken from the interrupted run, and a report is written if it was wanted.
-    Poses, masks, map and mesh are bit-identical to those without interruption. A run that ended during the calibration
-    of the colour camera starts again.
+    Recording, configuration and options are those of the interrupted run. Poses, masks, map and mesh are bit-identical
+    to a run without interruption. A run that ended during the calibration of the colour camera starts again.
 
     Args:
         out: The run folder.
@@ -42,8 +41,8 @@ def resume(
         observers: As for ``run``.
 
     Raises:
-        StateError: There is no state in the folder, the run is finished, its recording has changed, another version of
-            dudmap wrote it, or it is damaged.
+        StateError: The folder has no state, the run is finished, its recording has changed, or the state is damaged or
+            of another version.
         DudmapError: As for ``run``; or another process writes into the folder.
     """
     from dudmap.app.viewing.report import ReportObserver

@@ -70,10 +70,9 @@ def run(
 ) -> RunReport:
     """Run the system over a recording, or on a camera until its stream ends or Ctrl-C, and write a run folder.
 
-    ``docs/files.md`` describes the files of the folder: trajectory.txt, mesh.ply, map.npz, metrics.json and others.
-    Results of an earlier run in the folder are removed first. If the run is interrupted or fails, the results so
-    far are written. With ``storing`` the folder also holds state.db until the run is finished;
-    ``dudmap.app.pipeline.resume.resume`` continues from it.
+    ``docs/files.md`` describes the files: trajectory.txt, mesh.ply, map.npz, metrics.json and others. Results of an
+    earlier run are removed first. An interrupted or failed run writes the results so far. With ``storing`` the folder
+    also holds state.db until the run is finished; ``dudmap.app.pipeline.resume.resume`` continues from it.
 
     Args:
         sequence: The recording, whose ground truth and masks are used for evaluation only; or a camera, which is closed
@@ -83,24 +82,24 @@ def run(
         max_frames: Process only this many frames.
         save_masks: Write the dynamic mask of every frame.
         save_map: Write map.npz and keyframes.npz.
-        masks: Folder of external dynamic masks, which are added to the estimated ones. They are named like the images
-            or <timestamp>.png, with 255 = dynamic. Frames with a mask are counted.
+        masks: Folder of external dynamic masks (255 = dynamic), added to the estimated ones. They are named like the
+            images or <timestamp>.png.
         ignore: Image, white at pixels of the depth or colour image that are never used; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
-        ahead: Number of frames read ahead of the processed one, without effect on the result. Use 0 for rendered
-            frames, because rendering uses all cores and would distort the times.
+        ahead: Number of frames read ahead, without effect on the result. Use 0 for rendered frames, because rendering
+            uses all cores and would distort the times.
         live: Replay the recording as if it were a camera.
         record: MCAP file for all frames of a camera that arrive, processed or not.
-        passes: 2 processes the recording twice. The second pass compares every frame with the final map of the first
-            one, so that objects in view from the start also leave the map. The last complete pass is written.
+        passes: 2 processes the recording twice. The second pass compares every frame with the final map of the first,
+            so that objects in view from the start also leave the map. The last complete pass is written.
         poses: Poses of the frames: the result, or the start of registration; given_poses.txt is their copy. If they are
-            the result, frames without a pose are left out.
+            the result, frames without a pose are skipped.
         calibration: Of the colour camera; None takes the calibration of the recording or the camera.
         calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to continue; it is modified. All poses are in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
-        max_memory: Largest resident memory of the process, bytes. Distant parts of the map wait on disk. None keeps the
-            whole map in memory. It changes no result.
+        max_memory: Largest resident memory of the process, bytes. Distant parts of the map wait on disk, without effect
+            on the result. None keeps the whole map in memory.
         observers: Observers of every pass, every processed frame, and the written run folder.
         storing: Store the state of the run at checkpoints; None does not. A live replay cannot be stored.
         warnings: Sentences on suspected faults of the recording (``pipeline.inspection``), for metrics.json.
@@ -108,7 +107,7 @@ def run(
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or it is 2 with a camera or ``saved_map``. ``localize`` lacks a
             ``saved_map``. ``storing`` is used with a camera. The configured system lacks an option.
-        CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
+        CameraError: The camera stopped delivering frames, after writing; or the recording cannot be written.
         DudmapError: The folder cannot be written, lies in the recording, or is in use by another process. The recording
             cannot be used, or no frame could be tracked.
         KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names the saved

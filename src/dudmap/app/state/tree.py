@@ -1,7 +1,7 @@
 """Convert state to a tree of plain values and arrays, and back, by the annotations of its classes.
 
-The tree names no classes: the annotation of an attribute determines the class of its value, and a value that does not
-fit is refused.
+The tree names no classes: the annotation of an attribute determines the class of its value. A value that does not fit
+raises an error.
 
 - A ``Stateful`` object is restored in place, after its owner created it.
 - Dataclasses and named tuples are created from their fields; an object that occurs twice is created once.

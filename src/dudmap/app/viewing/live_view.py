@@ -45,11 +45,8 @@ class _News:
 class LiveView(RunObserver):
     """Shows a running run in a window.
 
-    The thread of the run copies data into a slot, and another thread shows it. Later images replace images that were
-    not taken in time, so that the run never waits for the page.
-
-    Args:
-        window: The page.
+    The thread of the run copies data into a slot, and another thread shows it. A later image replaces an earlier one
+    that is still in the slot, so that the run never waits for the page.
 
     Attributes:
         costs: Milliseconds per frame in the thread of the run.

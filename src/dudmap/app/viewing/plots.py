@@ -23,7 +23,7 @@ POINTS = 400
 
 
 def plots(run: RunFiles) -> dict[str, str]:
-    """SVG text by title: trajectory, its error, dynamic share, residuals, for which there are data."""
+    """SVG text by title of the plots with data: trajectory, its error, dynamic share, residuals."""
     out: dict[str, str] = {}
     if len(run.trajectory) > 1:
         out["Trajectory seen from above"] = _from_above(run)

@@ -167,8 +167,8 @@ def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     """Write the report of a run folder, by default report.html in it, and return its path.
 
-    The page shows the mesh (at most ``TRIANGLES`` triangles) with trajectory, camera and moving objects in 3D. It also
-    shows thumbnails, plots, metrics, the configuration, and lost frames with reasons.
+    The page shows the mesh (at most ``TRIANGLES`` triangles) with trajectory and moving objects in 3D, thumbnails,
+    plots, metrics, configuration, and lost frames with reasons.
 
     Raises:
         DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.

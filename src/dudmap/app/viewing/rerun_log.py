@@ -26,13 +26,9 @@ BUDGET_MS = 10.0
 class RerunLog(RunObserver):
     """Writes camera, images, map, moving objects and metrics of every frame into an .rrd file.
 
-    Timelines: ``frame`` (number) and ``time`` (seconds since the first frame). Entities: ``world/camera`` with
-        colour and depth, ``world/map``, ``world/movers``, ``world/trajectory``; ``images/mask`` and
-        ``images/residuals``; the plots ``plots/ms``, ``plots/residual_mm``, ``plots/moving_percent``; ``lost`` with
-        the reasons.
-
-    Args:
-        path: The file.
+    Timelines: ``frame`` (number) and ``time`` (seconds since the first frame). Entities: ``world/camera`` with colour
+    and depth, ``world/map``, ``world/movers``, ``world/trajectory``; ``images/mask`` and ``images/residuals``; the
+    plots ``plots/ms``, ``plots/residual_mm``, ``plots/moving_percent``; ``lost`` with the reasons.
 
     Raises:
         DudmapError: rerun-sdk is not installed, or the file cannot be written.

@@ -35,12 +35,7 @@ class Window:
 
     Args:
         host: Address to serve at; 127.0.0.1 for this machine only.
-        port: Port to serve at.
-        title: Title of the page.
         token: Secret part of the address; None generates one unless ``host`` is this machine only.
-
-    Attributes:
-        access: Access control.
 
     Raises:
         MissingExtraError: viser is not installed.

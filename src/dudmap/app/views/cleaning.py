@@ -78,11 +78,7 @@ class CleanReport:
 
 
 class Cleaner:
-    """Replaces dynamic objects in the frames of a recording, given a run over it.
-
-    Args:
-        run: The run, with map and masks.
-        sequence: The recording.
+    """Replaces dynamic objects in the frames of a recording, given a run over it with map and masks.
 
     Attributes:
         indices: Numbers of the frames that have a pose and a mask.

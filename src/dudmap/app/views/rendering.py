@@ -163,14 +163,11 @@ def render_run(
 ) -> int:
     """Render the map along a trajectory; return the number of frames.
 
-    The suffix of ``out`` selects the output: .png a picture from the first pose, another known suffix a video. No
-    suffix is a folder, which receives a recording in TUM layout: rgb/, depth/ and their lists, intrinsics.txt and
+    The suffix of ``out`` selects the output: .png a picture from the first pose, another known suffix a video. Without
+    a suffix it is a folder for a recording in TUM layout: rgb/, depth/ and their lists, intrinsics.txt and
     groundtruth.txt.
 
     Args:
-        run: The run.
-        trajectory: Poses of the views.
-        out: File or folder.
         size: Width and height in pixels; None takes the size of the recording.
         fps: Frames per second of a video.
         progress: Receives the numbers of finished and of all frames.

@@ -33,7 +33,7 @@ COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_f
 class Recorder:
     """Writes frames without loss to an MCAP file that ``dudmap run`` and ROS 2 read.
 
-    ``put`` never waits: if the disk is too slow for the camera, frames are left out and counted. The file is written
+    ``put`` never waits: if the disk is too slow for the camera, frames are dropped and counted. The file is written
     into ``<name>.recording`` and moved to its final place when it is complete. If the process is killed or the power
     fails, all but the last ``UNSAVED`` seconds can be read there.
 

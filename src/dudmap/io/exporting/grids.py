@@ -62,8 +62,7 @@ class SpaceGrid:
         front of a surface or in known free space, else unknown.
 
         Args:
-            volume: The map.
-            mesh: Its surface; vertices closer together than a cell.
+            mesh: Surface of the map; vertices closer together than a cell.
             T_grid_map: (4, 4) axes of the grid.
             resolution: Edge of a cell, metres.
 
@@ -134,8 +133,6 @@ def look_up(volume: TsdfVolume, points: NDArray[np.float64]) -> tuple[NDArray[np
 
 def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write occupancy and Euclidean signed distances as NumPy archive.
-
-    Arrays:
 
     - ``format``: ``FORMAT``.
     - ``occupancy``: (X, Y, Z) int8, 100 = occupied, 0 = free, -1 = unknown.

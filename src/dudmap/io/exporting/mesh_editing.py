@@ -1,6 +1,6 @@
 """Parts of a mesh, closed holes and fewer triangles, for exports.
 
-An option with an impossible value is a ``ConfigError``, and a mesh of which nothing is left a ``MapError``.
+An option out of range raises a ``ConfigError``, an empty result a ``MapError``.
 """
 
 from dataclasses import replace
@@ -65,7 +65,7 @@ def with_filled_holes(mesh: Mesh, longest: float) -> Mesh:
 def border_loops(faces: NDArray[np.int32]) -> list[NDArray[np.int32]]:
     """Closed borders of the surface, each as its vertices in the direction of the triangles' edges.
 
-    Borders that touch themselves in a vertex are left out: their holes are not determined.
+    Borders that touch themselves in a vertex are omitted, because their holes are not determined.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     size = int(edges.max(initial=0)) + 1

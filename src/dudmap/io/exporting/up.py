@@ -24,7 +24,7 @@ LEVEL = np.cos(np.radians(15))
 """A surface faces a direction if its normal is within 15 degrees (cosine)."""
 UPSIDE_DOWN = 2.0
 """Ratio of surface facing down to surface facing up from which the map may be upside down. Rooms have much more surface
-facing up, since cameras look down on furniture."""
+facing up, because cameras look down on furniture."""
 TURNED, STEADY = 0.64, 0.9
 """Singular values of the mean rotation matrix. The second one is below ``TURNED`` (sin(x) / x at a quarter turn) if the
 cameras turn by half a turn or more. The first one is above ``STEADY`` if they nod by less than about 25 degrees."""

@@ -250,8 +250,8 @@ def open_sequence(
         options: Of one format, e.g. ``topics`` of bags; None means not given.
 
     Raises:
-        DatasetError: There is nothing at the path, no known format, several recordings, a defect, or an option that the
-            format lacks.
+        DatasetError: The path does not exist, has no known format or several recordings, is damaged, or the format
+            lacks an option.
     """
     path = Path(path)
     with damaged(DatasetError, f"the recording {path}"):

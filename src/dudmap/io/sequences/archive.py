@@ -1,4 +1,4 @@
-"""Unpack recordings in archives once into a cache; members that no image sequence needs are refused."""
+"""Unpack recordings in archives once into a cache; members that no image sequence needs raise an error."""
 
 import bz2
 import errno

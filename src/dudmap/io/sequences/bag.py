@@ -1,7 +1,7 @@
 """ROS 1 bags, ROS 2 bags (folders, SQLite and MCAP files), and RealSense recordings, through the package rosbags.
 
 RealSense recordings are ROS bags with special topics: ``.db3`` files of librealsense since March 2026, ``.bag`` files
-before. rosbags reads them without the driver and with random access, which the driver does not offer.
+before. rosbags reads them without the driver and with random access.
 """
 
 import re
@@ -46,8 +46,8 @@ class RosBag(Recording):
 
     The time of a frame is the stamp in the header of its depth message. In compressed bags it is the time of recording
     minus the median delay of the first messages. If the stamps do not increase, it is the time of recording. Colour is
-    associated one to one, nearest first, at most 20 ms apart. A bag without colour topics is a recording of depth
-    alone. If two messages of a topic have the same time of recording, one is left out.
+    associated one to one, nearest first, at most 20 ms apart. If two messages of a topic have the same time of
+    recording, one is skipped.
 
     Intrinsics come from the camera_info topics of the images. Depth and colour are registered if their frame of
     reference and intrinsics are equal. Otherwise ``calibration`` holds the colour camera and its motion to depth from

@@ -1,8 +1,8 @@
 """Read a bag with the package rosbags: topics, message times from the index, and single messages.
 
 rosbags trusts its input. This module limits decompression and accepts SQLite files with plain tables only. It decodes
-messages by the published ROS definitions of their types, because rosbags would turn definitions in a bag into Python
-code. Topics of all other types are listed and not read.
+messages by the published ROS definitions, because rosbags would turn definitions in a bag into Python code. Topics of
+other types are listed and not read.
 """
 
 import os

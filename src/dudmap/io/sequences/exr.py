@@ -60,7 +60,7 @@ def _header(data: bytes) -> tuple[dict[str, bytes], int]:
 
 
 def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
-    """Names and types of the channels in file order; channels with fewer pixels than the image are refused."""
+    """Names and types of the channels in file order; channels with fewer pixels than the image raise an error."""
     at = 0
     while listed[at]:
         end = listed.index(b"\0", at)

@@ -22,7 +22,7 @@ _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}
 def check_size(data: bytes, name: str) -> None:
     """Check the format and size of an image; ``name`` is used in messages.
 
-    The decoder's other formats are refused, since each adds code that reads untrusted files.
+    Other formats of the decoder are rejected, because each adds code that reads untrusted files.
 
     Raises:
         FrameError: It is in another format, too large, or its header is damaged.

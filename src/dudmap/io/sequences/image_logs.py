@@ -148,7 +148,7 @@ class SensRecording(_FrameLog):
 class KlgRecording(_FrameLog):
     """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
-    Depth is in millimetres (raw or zlib), colour raw or JPEG. The file gives no intrinsics, so they must be given. The
+    Depth is in millimetres (raw or zlib), colour raw or JPEG. Intrinsics must be given, because the file has none. The
     image size comes from them, else from the first JPEG image, else it is the logger's 640x480.
     """
 

@@ -1,7 +1,7 @@
 """Decoding of colour, depth and mask images, with one clear error for every defect of a file.
 
-A file that is missing, cut off, damaged, too large or no such image is a ``FrameError``. The size that a file declares
-is read before a decoder takes memory for it.
+A file that is missing, cut off, damaged, too large or no such image raises a ``FrameError``. The size that a file
+declares is read before a decoder takes memory for it.
 """
 
 import struct
@@ -84,7 +84,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def read_ignored(path: str | Path, camera: Camera, calibration: "Calibration | None" = None) -> NDArray[np.bool_]:
-    """Mask (H, W) of the pixels that never count, from an image in which they are white (above 127).
+    """Mask (H, W) of ignored pixels, from an image in which they are white (above 127).
 
     Raises:
         DatasetError: There is no such image, or it has the size of neither the depth nor the colour image.

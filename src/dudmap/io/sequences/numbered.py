@@ -114,8 +114,8 @@ LARGEST_CHANGE = 0.5
 class BopSequence(NumberedSequence):
     """Scene of BOP (Hodan et al. 2018), the benchmark for poses of objects: rgb/, depth/ and scene_camera.json.
 
-    The file holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. ``cam_R_w2c`` (row by row) and
-    ``cam_t_w2c`` (mm), if they are there, take points of the world to the camera and are the truth (bop_toolkit,
+    The file holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. The optional ``cam_R_w2c`` (row
+    by row) and ``cam_t_w2c`` (mm) map points of the world to the camera and are the ground truth (bop_toolkit,
     docs/bop_datasets_format.md).
     """
 

@@ -1,6 +1,6 @@
 """Files of camera poses as 4x4 matrices.
 
-A file that cannot be read or holds something else is a ``DatasetError``.
+A file that cannot be read or holds something else raises a ``DatasetError``.
 """
 
 from collections.abc import Iterable
@@ -68,7 +68,7 @@ def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
 
 
 def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Trajectory | None:
-    """Trajectory of (timestamp, T_world_camera) pairs; frames whose pose is not a rigid motion are left out.
+    """Trajectory of (timestamp, T_world_camera) pairs; frames whose pose is not a rigid motion are omitted.
 
     Data sets mark frames without a pose by infinite numbers or zeros. Rotations are projected onto the nearest one,
     as they were written with few digits. None if there is no pose.

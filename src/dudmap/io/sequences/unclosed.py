@@ -1,7 +1,7 @@
 """Bags that were not closed: the recorder was killed, the power failed, or a copy was cut off.
 
 The index of an MCAP file or ROS 1 bag lies at its end. A new index is made from the complete chunks and read as if it
-followed them. The file itself is not changed. Content that violates the format is a ``ValueError``.
+followed them. The file itself is not changed. Content that violates the format raises a ``ValueError``.
 """
 
 import io
@@ -255,7 +255,7 @@ class _BagChunk:
 
 
 def _completed_bag(path: Path, file: IO[bytes]) -> CompletedFile:
-    """A ROS 1 bag with a new index. The last chunk is rewritten, since its size and its indexes may be missing."""
+    """A ROS 1 bag with a new index. The last chunk is rewritten, because its size and indexes may be missing."""
     records = _bag_records(file, len(BAG))
     _, header, _, _ = next(records, (0, Fields(), 0, 0))
     chunks: list[_BagChunk] = []

@@ -23,12 +23,9 @@ FAR = 60
 class Video:
     """Frames of an MP4 file by number.
 
-    Frames in increasing order are decoded one after the other. In videos of a constant rate, the time of a frame gives
-    its number, and other frames are found by seeking. If the rate varies, or if seeking ends at another frame, all
-    frames are decoded from the beginning.
-
-    Args:
-        path: The file.
+    Frames in increasing order are decoded one after the other. At a constant rate, the time of a frame gives its
+    number, and other frames are found by seeking. If the rate varies, or if seeking ends at another frame, all frames
+    are decoded from the beginning.
 
     Raises:
         DatasetError: The file is no MP4 video that can be decoded, or its frames are too large.

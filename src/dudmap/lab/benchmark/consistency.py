@@ -1,9 +1,8 @@
-"""Score trajectories by how well they explain the images of a recording, without ground truth.
+"""Score trajectories without ground truth, by how well they explain the images of a recording.
 
-A frame rendered from the pose of another frame must show the depth and intensities measured there. Trajectories are
-compared on the same pixels of the same pairs of frames. Noise, movers and occlusion, which no pose explains, therefore
-affect all alike. Each trajectory has a calibration of the cameras. The images stay as recorded; points are projected
-with the pose, the velocity and the row times.
+A frame rendered from the pose of another frame must show the depth and intensities measured there. All trajectories are
+compared on the same pixels of the same pairs of frames, so that noise, movers and occlusion affect them alike. Points
+are projected with the pose, the velocity and the row times; every trajectory has a calibration of the cameras.
 
 Trajectories with too few common frames raise a ``DatasetError``.
 """

@@ -88,13 +88,11 @@ def measure_sequence(
     """Run a system on a recording: metrics of its metrics.json and errors of trajectory and mesh.
 
     Args:
-        sequence, config: Recording and parameters.
         surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
-        max_frames: Use only the first frames.
         samples: Number of points sampled on each surface.
         passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
-        calibrate: Estimate the calibration of the colour camera first, as in ``dudmap run``; else use the recording's.
+        calibrate: Estimate the calibration of the colour camera first; else use the recording's.
     """
     from dudmap.app.pipeline.frame_source import AHEAD
     from dudmap.app.pipeline.run import run
@@ -184,10 +182,9 @@ def measure_each(
         function: Makes a row of an argument; if it fails, the row has ``error``.
         jobs: Distinct labels for JSON, and arguments.
         workers: Number of processes at a time. Times per frame are reliable with one only.
-        done: Called with every row as soon as it is measured.
-        kept: File (.jsonl) to which every new row is added; rows in it are not measured again.
-        shared: Share ``workers`` processes between many short jobs, to save process starts. If one of them dies, the
-            remaining jobs have separate processes.
+        done: Receives every row as soon as it is measured.
+        kept: File (.jsonl) that collects the rows; rows in it are not measured again.
+        shared: Reuse the processes for several jobs. If one dies, the remaining jobs have separate processes.
     """
     jobs = list(jobs)
     rows: dict[str, Row] = {}

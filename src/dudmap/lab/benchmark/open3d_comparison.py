@@ -43,8 +43,8 @@ class Comparison(NamedTuple):
 def compare_with_open3d(python: Path, sequence: Sequence, frames: int, rounds: int = ROUNDS) -> Comparison:
     """Run both systems alternately on the first frames of a recording; ``python`` is an interpreter that has open3d.
 
-    Both receive decoded images and are timed until the pose is estimated and the frame is fused. dudmap has its default
-    configuration with dynamic labels, Open3D the same voxel size and largest depth.
+    Times include pose estimation and fusion, not image decoding. Both systems have the same voxel size and largest
+    depth; dudmap has its default configuration with dynamic labels.
     """
     count = min(frames, len(sequence))
     if count < 2:

@@ -83,11 +83,10 @@ class Tenths(RunObserver):
 def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[Row], None]) -> list[Row]:
     """Process a room with people at 15 Hz; the camera swings on an arc once in 20 s, and the noise never repeats.
 
-    ``done`` is called with every row as soon as its tenth of the run ends.
-
     Returns:
-        One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map, size
-            of the run folder, frames lost so far, and the largest error of a pose.
+        One row per tenth of the run: processor time and time per frame (medians), memory of the process, blocks of the
+            map, size of the run folder, frames lost so far, and the largest error of a pose. ``done`` receives each row
+            as soon as it is complete.
     """
     world = {"movers": ("people",), "camera_path": "orbit", "frames": frames, "fps": FPS, "seed": seed, "camera": size}
     recording = Rendered(Entry("room-people", parameters=world).open())

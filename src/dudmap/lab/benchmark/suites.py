@@ -33,10 +33,10 @@ class Entry:
         path: Folder, file or archive of a recording on disk; None for a synthetic one.
         parameters: Arguments of ``lab.synthetic.sequence``. ``camera`` is (width, height) in pixels, ``faults`` maps
             fields of ``SensorFaults`` that differ from the sensor's.
-        address: Public page of its download, empty if there is none.
+        address: Public page of its download, or empty.
         max_frames: Use only this many frames from the start.
-        parts: Boxes (x0, y0, z0, x1, y1, z1) in the world frame of the ground truth, metres, by name; the completeness
-            of the true surface in each is measured as well.
+        parts: Boxes (x0, y0, z0, x1, y1, z1) by name, metres, world frame of the ground truth. Completeness is also
+            measured in each.
     """
 
     name: str

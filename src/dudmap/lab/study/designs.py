@@ -24,13 +24,12 @@ Table = Any
 
 @dataclass(frozen=True)
 class Factor:
-    """One factor: a configuration key with its levels, or with a range.
-
-    A coded value is -1 at the low end of the range and +1 at the high end.
+    """A configuration key with its levels or its range.
 
     Attributes:
         levels: The levels in the order given; empty for a range.
-        low, high: Ends of the range, or the smallest and the largest level; NaN if the levels are no numbers.
+        low, high: Coded values -1 and +1: ends of the range, or smallest and largest level; NaN if levels are no
+            numbers.
         scale: Whether the coded value is linear in the value or in its logarithm.
         whole: Whether the key takes whole numbers only.
     """

@@ -102,8 +102,7 @@ class Run:
         point: Number of the point in the design; -1 for a confirmation run.
         values: Values of the factors by key.
         entry, sequence, replicate: The recording, its name without the replicate, and the replicate's number.
-        config: All parameters.
-        calibrate: Whether the colour camera is calibrated first, as in ``dudmap run``.
+        calibrate: Whether the colour camera is calibrated first.
         surfaces: Whether the mesh is scored.
         code: Hash of the code that runs it.
     """
@@ -135,9 +134,8 @@ class Plan:
     Attributes:
         base: Configuration of the keys that are no factors.
         entries: Recordings: name without the replicate, number of the replicate, and recording.
-        responses: Names of the responses; the first is optimised, the others are reported.
-        file: The design file.
-        tune: Its table of that name.
+        responses: Names of the responses; the first is optimised.
+        tune: Table ``tune`` of the design file.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
         code: Hash of the code.
     """

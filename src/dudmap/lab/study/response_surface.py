@@ -228,7 +228,7 @@ class Confirmation:
 
     Attributes:
         scale: The response; all values are as analysed.
-        predicted, low, high: Prediction of the model, and the interval that should contain the mean of ``count`` runs.
+        predicted, low, high: Predicted mean of ``count`` runs and its interval.
         design_mean: Mean of all runs of the design: the prediction without a model.
         measured, best_point: Means of the runs at the optimum and at the best point of the design.
     """

@@ -46,8 +46,8 @@ def conduct(
 ) -> list[Row]:
     """Do all runs that have no metrics yet, ``jobs`` at a time; see ``Conduct``.
 
-    ``runs.jsonl`` in the folder ``root`` holds the metrics of all runs so far by their keys. A run that fails has the
-    sentence ``error`` instead. With ``keep`` the run folders stay in ``runs/``. ``measure`` replaces the system.
+    ``runs.jsonl`` in ``root`` collects the metrics by key; a failed run has ``error`` instead. With ``keep`` the run
+    folders stay in ``runs/``. ``measure`` replaces the system.
     """
     unique = {run.key: run for run in runs}
     if measure is None and kernel_cache.is_cold():  # once, not in every worker

@@ -1,6 +1,6 @@
 """Screening of many keys: all numeric keys as factors, and the effect of each on each recording.
 
-A malformed table, or too few runs for all factors, is a ``ConfigError``.
+A malformed table, or too few runs for all factors, raises a ``ConfigError``.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,10 +26,12 @@ MOST_SHOWN = 16
 def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:
     """Every numeric key as a factor between its value divided by a ratio and its value times the ratio.
 
-    Both ends are kept inside the bounds of the key; for an exclusive bound, the end lies halfway between value and
-    bound. A whole number changes by 1 at least. All elements of a list change together, with two levels. Keys with the
-    value 0 are skipped, because they have no ratio. Keys ``chosen`` by the design file and keys that its table
-    (``ratio``, ``without``) names are skipped too.
+    - Both ends are kept inside the bounds of the key; for an exclusive bound, the end lies halfway between value and
+      bound.
+    - A whole number changes by 1 at least.
+    - All elements of a list change together, with two levels.
+    - Keys with the value 0, keys ``chosen`` by the design file, and keys in its table (``ratio``, ``without``) are
+      skipped.
     """
     if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
         raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
@@ -85,13 +87,13 @@ def bounds_of(key: str) -> dict[str, float]:
 def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
     """Effect of every two-level factor on every recording: mean at its high end minus mean at its low end.
 
-    Least squares with all factors together (statsmodels) per recording, so that a key that matters on one recording is
-    found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
-    and Hochberg 1995). In a design that is folded over, interactions of two factors are in the residual.
+    Least squares with all factors together (statsmodels) per recording. The probabilities are adjusted for the number
+    of keys and recordings together (Benjamini and Hochberg 1995). In a design that is folded over, interactions of two
+    factors are in the residual.
 
     Returns:
-        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in
-            standard deviations of the residual.
+        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in standard
+            deviations of the residual.
     """
     import pandas as pd
     import statsmodels.api as sm

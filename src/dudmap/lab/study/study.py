@@ -1,6 +1,6 @@
 """A whole study: its runs, its confirmation, its tables and its report; and chapter 6 of the thesis as studies.
 
-A study that cannot be run is refused with a ``DudmapError`` before anything is run.
+A study that cannot be run raises a ``DudmapError`` before the first run.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,8 @@
 """Search for a configuration on training recordings, and judge it on other recordings.
 
-Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). All metrics are ratios to the base
-configuration on the same recording, so that recordings count equally. The proposals depend on the seed and on earlier
-results only, and results are kept, so that a stopped search continues.
+Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). Metrics are ratios to the base configuration on
+the same recording, so that recordings count equally. Results are kept and proposals depend only on them and the seed,
+so that a stopped search continues.
 
 A search that cannot be judged raises a ``DudmapError`` before the first run.
 """
@@ -111,9 +111,9 @@ def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
     """Search, and judge the training front on the second set.
 
     Returns:
-        Values of the factors, and a row of the table. The row holds these values and, per response and set, the
-        geometric mean ratio to the base configuration (NaN if a run failed or lost more frames). It also holds the
-        probability p of the first response's ratios without an improvement, and whether the improvement holds.
+        Values of the factors, and a row of the table with these values. Per response and set, the row has the geometric
+        mean ratio to the base configuration (NaN if a run failed or lost more frames). It also has the probability p of
+        the first response's ratios without an improvement, and whether the improvement holds.
     """
     from statsmodels.stats.multitest import multipletests
 

@@ -1,6 +1,6 @@
 """Stream of walking people that covers a given share of the image.
 
-A share that no crowd covers is a ``ConfigError``.
+A share that no crowd covers raises a ``ConfigError``.
 """
 
 import numpy as np

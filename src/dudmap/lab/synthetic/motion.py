@@ -85,7 +85,7 @@ def crossing(
 ) -> FloorPath:
     """Path from one end of ``line`` to the other and, after a second out of view, back again, until ``duration``.
 
-    The middle 40 % of the line are passed at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
+    The speed is ``speed`` on the middle 40 % of the line and ``max(speed, entry_speed)`` elsewhere, so that slow movers
     also come into view. The first 25 % are passed at the time ``enter`` in seconds. With ``start_inside`` the path
     begins in the middle of the view.
     """

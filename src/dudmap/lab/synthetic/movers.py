@@ -25,9 +25,9 @@ class SyntheticMover:
     Attributes:
         name: Kind of object.
         primitives: Its solids, each in the frame of its part.
-        parts: Function of time that returns T_world_part (P, 4, 4) of every solid.
-        reference: Function of time that returns T_world_mover (4, 4), whose origin defines the velocity of the mover.
-        present: Function of time that returns whether the mover exists.
+        parts: T_world_part (P, 4, 4) of every solid as a function of time.
+        reference: T_world_mover (4, 4) as a function of time; its origin defines the velocity of the mover.
+        present: Whether the mover exists, as a function of time.
         settles: Whether it counts as static while it is at rest; people never do.
     """
 

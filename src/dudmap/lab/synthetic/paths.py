@@ -1,6 +1,6 @@
 """Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion.
 
-A path that is unknown, or does not fit the scene, is a ``ConfigError``.
+A path that is unknown, or does not fit the scene, raises a ``ConfigError``.
 """
 
 from collections.abc import Callable
@@ -163,8 +163,8 @@ def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers
 def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Array:
     """Recorded trajectory, resampled at ``times`` and placed in the scene by a rigid motion.
 
-    The mean orientation becomes the home pose's. The centre of the positions is placed as close to the home
-    position as possible, such that all positions are in the free space of the scene and clear of its solids.
+    The mean orientation becomes the home pose's. The centre of the positions is placed as close to the home position as
+    the free space of the scene permits.
     """
     start, end = trajectory.timestamps[0], trajectory.timestamps[-1]
     if times[-1] > end - start + 1e-6:

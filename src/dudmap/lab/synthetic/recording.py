@@ -158,13 +158,14 @@ class SyntheticSequence:
         return self._by_pixel(numbers, self._render(self._number(index), with_color=False))
 
     def surface(self, observed: bool = False) -> Mesh:
-        """True static surface in the world frame at the end of the sequence.
+        """True static surface in the world frame at the end of the sequence, with movers at rest during the last
+        second.
 
-        It includes movers at rest during the last second. Triangles inside or between solids are omitted.
+        Triangles inside or between solids are omitted.
 
         Args:
-            observed: Only the part that the camera saw in at least three of up to 120 evenly spread frames: not
-                occluded by movers, within the sensor's range, not at a grazing angle.
+            observed: Only the part seen in at least three of up to 120 evenly spread frames: not occluded by movers,
+                within the sensor's range, not at a grazing angle.
         """
         mesh = self._surface
         if not observed:

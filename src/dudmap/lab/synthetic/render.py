@@ -67,8 +67,6 @@ class Renderer:
         """Render an image of a camera, whose distortion is ignored, at T_world_camera (4, 4).
 
         Args:
-            camera: The camera.
-            T_world_camera: (4, 4).
             Ts_world_mover: (M, 4, 4) poses of the movers' primitives.
             present: (M,) which of them exist in this image.
             with_color: Also compute the colour.

@@ -1,8 +1,7 @@
 """Furniture and built-in static scenes (``scenes.toml``); z is up, lengths in metres.
 
-A row of ``solids`` names a solid or furniture with its position (the start of a capsule or cylinder), its other
-measures, and a material of the scene or the furniture. A row with ``repeat`` (first, end, step) stands for
-several, each with one of these numbers in place of every "*".
+A row of ``solids`` names a solid or furniture, its position (the start of a capsule or cylinder), its other measures,
+and a material. A row with ``repeat`` (first, end, step) is repeated with each of these numbers in place of every "*".
 """
 
 from collections.abc import Iterable, Iterator

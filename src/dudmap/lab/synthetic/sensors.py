@@ -74,7 +74,7 @@ class SensorModel(NoiseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeOfFlightModel(NoiseModel):
-    """Sensor that measures the range itself, so that its noise does not follow z^2.
+    """Sensor that measures the range, so that its noise does not follow z^2.
 
     The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 + slant z^1.5 (theta / (pi/2 - theta))^2
     in metres. theta is the angle of incidence (form of Fankhauser et al. 2015).
@@ -82,7 +82,7 @@ class TimeOfFlightModel(NoiseModel):
     Attributes:
         noise: Coefficients of 1, z and z^2, metres.
         slant: Coefficient of the term that grows with the angle of incidence, metres.
-        native_width: Width in pixels of the measurement; wider images are interpolated from it. 0: any.
+        native_width: Width in pixels of the measurement, from which wider images are interpolated. 0: any.
     """
 
     noise: tuple[float, float, float]

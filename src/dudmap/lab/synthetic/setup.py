@@ -112,17 +112,15 @@ def sequence(
         movers: Names of the movers, () for none; None for one person, or the movers of the situation.
         camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or the path of the
             situation.
-        frames: Number of frames.
-        fps: Frames per second.
         noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or the sensor's.
         speed: Speed of the movers in m/s; None for the natural speed of each.
-        coverage: Mean share of the image, 0 to 0.95, covered by a stream of people, which replaces the movers; 0 means
-            no movers.
+        coverage: Mean share of the image, 0 to 0.95, covered by a stream of people, which replaces the movers; 0 for
+            none.
         start_dynamic: Whether the movers are in view in the first frame.
         situation: Name of a difficult situation (``names()["situations"]``).
         seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics, or width and height in pixels. The view is the sensor's, else of 525 px focal length at
-            640x480. None for 640x480.
+        camera: Intrinsics, or width and height in pixels; None for 640x480. The view is the sensor's, else of 525 px
+            focal length at 640x480.
         motion_blur: Exposure time as a share of the frame interval; None for 0, or the sensor's.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
         sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.

@@ -129,7 +129,7 @@ def tessellate(
 ) -> Mesh:
     """Mesh of all surfaces that border free space.
 
-    Triangles whose front is inside another solid, or outside ``extent`` (two corners, m), are left out. Vertices are
+    Triangles whose front is inside another solid, or outside ``extent`` (two corners, m), are omitted. Vertices are
     exact; flat surfaces are exact everywhere, curved ones to about ``detail``^2 / (8 radius).
     """
     pieces: list[tuple[Points, Points, Points, Faces]] = []

@@ -261,13 +261,11 @@ def visits(
 
     Args:
         changes: Things and their changes, from ``parsed_changes``.
-        scene: Name of the scene.
-        seed: Seed of all random numbers.
         size: Longest edge of boxes, balls and bins, metres; drawn by default.
         people: Whether people walk through the second visit.
         other_light: Whether the lamps of the second visit are elsewhere.
         paths: Camera paths of the visits.
-        options: Of both recordings, see ``sequence``.
+        options: Arguments of ``sequence`` for both recordings.
 
     Raises:
         ConfigError: A name is unknown, or a thing finds no free place in view.

@@ -1,10 +1,10 @@
 """Rendering of analytic scenes: exact depth, the visible primitive, anti-aliased colour.
 
-A primitive is a kind, half sizes and a rigid pose. With the ray ``(x/z, y/z, 1) * t`` the ray parameter *is* the depth,
-so every formula below returns metres along the optical axis, in float64. Rays meet boxes, ellipsoids, capsules and
-cylinders in closed form (no step limit, wires thinner than a pixel are still exact); the torus, whose quartic is badly
-conditioned, is sphere traced (Hart 1996). Primitives are binned into screen tiles beforehand, and a tile visits them
-front to back until the nearest remaining one lies behind everything already hit.
+A primitive is a kind, half sizes and a rigid pose. With the ray ``(x/z, y/z, 1) * t`` the parameter t is the depth
+along the optical axis in metres, float64. Rays meet boxes, ellipsoids, capsules and cylinders in closed form, so that
+wires thinner than a pixel are exact. The torus is sphere traced (Hart 1996), because its quartic is badly conditioned.
+Primitives are binned into screen tiles. A tile visits them front to back until the nearest remaining one lies behind
+everything hit.
 """
 
 import numpy as np
