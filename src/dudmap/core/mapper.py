@@ -103,7 +103,7 @@ class Bootstrap(Stateful):
         """Reason why a frame cannot start a map, empty if it can."""
         depth = view.observation.depth
         enough = np.count_nonzero(depth[~dynamic_mask]) >= MIN_READINGS * depth.size
-        return "" if enough else "the depth image holds hardly any readings"
+        return "" if enough else "the depth image has hardly any measurements"
 
     def start(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Record the frame that starts a map."""

@@ -99,17 +99,17 @@ class Check:
 
 
 REGISTRATION = (
-    Check("readings", lambda _: MIN_READINGS, "only {figure:.0f} static readings fall on the map", at_least=True),
+    Check("readings", lambda _: MIN_READINGS, "only {figure:.0f} static measurements fall on the map", at_least=True),
     Check(
         "overlap",
         lambda limits: limits.config.min_inliers,
-        "only {figure:.0%} of the static readings fall on the map",
+        "only {figure:.0%} of the static measurements fall on the map",
         at_least=True,
     ),
     Check(
         "residual_mm",
         lambda limits: limits.config.max_residual * limits.sigma_mm,
-        "readings lie {figure:.1f} mm off the map",
+        "measurements lie {figure:.1f} mm off the map",
     ),
     Check(
         "condition",
@@ -124,13 +124,13 @@ RELATIVE = (
     Check(
         "residual_mm",
         lambda limits: max(STRICTNESS[limits.mode][0] * limits.residual_mm, limits.sigma_mm),
-        "readings lie {figure:.1f} mm off the map, at most {limit:.1f} mm were to be expected",
+        "measurements lie {figure:.1f} mm off the map, at most {limit:.1f} mm were to be expected",
         overruled_by="last frame",
     ),
     Check(
         "overlap",
         lambda limits: USUAL_OVERLAP * limits.overlap if limits.mode == "recovering" else 0.0,
-        "only {figure:.0%} of the static readings fall on the map, at least {limit:.0%} were to be expected",
+        "only {figure:.0%} of the static measurements fall on the map, at least {limit:.0%} were to be expected",
         at_least=True,
         overruled_by="last frame",
     ),
@@ -157,24 +157,24 @@ CHECKS = (
     Check(
         "dynamic_share",
         lambda limits: limits.max_dynamic_share,
-        "{figure:.0%} of the readings seem to move: the static world cannot be told",
+        "{figure:.0%} of the measurements seem to move: the static world is ambiguous",
     ),
     Check(
         "verified_share",
         lambda limits: MIN_VERIFIED_SHARE if limits.mostly_dynamic else 0.0,
-        "most of the readings seem to move, and only {figure:.0%} rest where the map has a surface",
+        "most of the measurements seem to move, and only {figure:.0%} are static on the map",
         at_least=True,
     ),
     Check(
         "confirmed_share",
         lambda limits: CONFIRMED_SHARE if limits.blind else 0.0,
-        "the image says nothing, and only {figure:.0%} of the depths agree with the last frame's",
+        "the image carries no information, and only {figure:.0%} of the depths agree with the last frame",
         at_least=True,
     ),
     Check(
         "image_shift_px",
         lambda _: MAX_IMAGE_SHIFT,
-        "the last image lies {figure:.1f} coarse pixels beside this one, and its corners do not support that",
+        "the last image is misregistered by {figure:.1f} coarse pixels, and its corners do not confirm the pose",
         overruled_by="corners",
     ),
 )

@@ -103,7 +103,7 @@ class PosePredictor(Stateful):
         verified = prediction.unverified_mask is not None and not self.mostly_slow
         if verified or not exceeds_noise_share(moving, view.labelled):
             return ""
-        return "something moves in view, and the map is too young to show what else does"
+        return "something moves, and the map is too young to show other moving objects"
 
     def predict(
         self, volume: TsdfVolume, view: FrameView, previously_dynamic: NDArray[np.bool_] | None
