@@ -15,7 +15,7 @@ def extra(name: str, purpose: str) -> Iterator[None]:
     """Around the imports of an extra's libraries; ``purpose`` begins the sentence that says that one is missing.
 
     Raises:
-        MissingExtraError: A library is not installed, or cannot be loaded since a system library is missing.
+        MissingExtraError: A library is not installed, or cannot be loaded because a system library is missing.
     """
     try:
         yield

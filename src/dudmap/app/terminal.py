@@ -25,7 +25,7 @@ def lines(text: str) -> str:
 
 def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Console
     """Console that prints texts as ``printable`` and without markup; only ``rich.text.Text`` has styles."""
-    from rich.console import Console  # here, as its import takes a third of the time of the program's start
+    from rich.console import Console  # imported here, because it takes a third of the start time
 
     class PlainConsole(Console):
         def render_str(self, text: str, **options: Any) -> "Text":  # noqa: ANN401

@@ -43,8 +43,8 @@ class AzureKinectRecording(Recording):
     """Recording in a ``.mkv`` file with the tracks COLOR and DEPTH and the attachment calibration.json.
 
     Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
-    and seen from its own camera. Both lenses are removed when a frame is read. Opening reads the file once, as times
-    stand between the images.
+    and seen from its own camera. Both lenses are removed when a frame is read. Opening reads the file once, because
+    times stand between the images.
     """
 
     format = "Azure Kinect .mkv"

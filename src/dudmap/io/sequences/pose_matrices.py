@@ -71,7 +71,7 @@ def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Traj
     """Trajectory of (timestamp, T_world_camera) pairs; frames whose pose is not a rigid motion are omitted.
 
     Data sets mark frames without a pose by infinite numbers or zeros. Rotations are projected onto the nearest one,
-    as they were written with few digits. None if there is no pose.
+    because they were written with few digits. None if there is no pose.
     """
     kept = []
     for stamp, T in poses:
