@@ -1,13 +1,16 @@
 """The configuration: strict, complete, readable again."""
 
+import re
+
 import pytest
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
+from dudmap.gone_keys import GONE
 
 
 def test_toml_round_trip(tmp_path):
-    config = Config().override(["volume.voxel_size=0.02", "tracker.iterations=[4, 3, 2]", "dynamics.method=threshold"])
+    config = Config().override(["volume.voxel_size=0.02", "tracker.iterations=[4, 3, 2]", "dynamics.enabled=false"])
     config.save(tmp_path / "config.toml")
     assert Config.load(tmp_path / "config.toml") == config
 
@@ -39,11 +42,14 @@ def test_parameters_of_another_system_are_refused_by_name(assignments, says):
         Config().override(assignments).check_used()
 
 
-def test_presets_of_earlier_versions(tmp_path):
-    (tmp_path / "old.toml").write_text('preset = "default"\n')
+def test_keys_of_earlier_versions_are_read_where_they_change_nothing(tmp_path):
+    (tmp_path / "old.toml").write_text('preset = "default"\n[tracker]\nrobust = "huber"\n')
     assert Config.load(tmp_path / "old.toml") == Config()
-    with pytest.raises(ConfigError, match='system = "thesis"'):
-        Config().override(["preset=thesis"])
+    for key, (left, instead) in GONE.items():
+        assert key not in keys()
+        assert Config().override([f"{key}={str(left).lower()}"]) == Config()
+        with pytest.raises(ConfigError, match=re.escape(f"{key} = 'other' is gone; {instead}")):
+            Config().override([f"{key}=other"])
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,7 @@ def test_presets_of_earlier_versions(tmp_path):
         ("volume.voxel_size=-0.01", "greater than 0"),
         ("volume.voxel_size=big", "volume.voxel_size"),
         ("volume.voxel_size=nan", "finite"),
-        ("dynamics.method=magic", "'em'"),
+        ("dynamics.enabled=magic", "boolean"),
         ("preprocess.depth_min=9", "depth_min"),
         ("volume.max_readings=2", "no voxel would ever be trusted"),
         ("tracker.iterations=[1]", "one entry per level"),

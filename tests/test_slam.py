@@ -85,16 +85,12 @@ def test_a_map_is_exposed_as_usual_though_the_camera_begins_in_the_dark(recordin
 @pytest.mark.parametrize(
     "assignments",
     [
-        ["tracker.robust=tukey"],
-        ["tracker.second_pass=false"],
-        ["tracker.constant_velocity=false"],
-        ["tracker.noise_weighting=false", "tracker.exposure=false"],
+        ["sensor.sigma_scale=0", "tracker.exposure=false"],
         ["volume.weighting=constant", "volume.carving=false"],
         ["volume.truncation_voxels=6", "volume.truncation_behind_voxels=3"],
         ["preprocess.filter=none", "preprocess.fill_holes=false"],
         ["volume.voxel_size=0.03"],
-        ["dynamics.method=threshold"],
-        ["dynamics.method=none"],
+        ["dynamics.enabled=false"],
         ["similarity.enabled=false"],
     ],
 )

@@ -1,7 +1,7 @@
 """All parameters with their defaults, bounds, units and meanings.
 
 The configuration is immutable, rejects unknown keys, and reads and writes TOML. Dotted keys name section and
-parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.method``. A default without a stated source was tuned on
+parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.enabled``. A default without a stated source was tuned on
 the recordings of docs/benchmarks.md.
 """
 
@@ -17,6 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 from dudmap.atomic_file import write_text
 from dudmap.config_section import ConfigSection
 from dudmap.errors import ConfigError
+from dudmap.gone_keys import without_gone
 from dudmap.input_files import parse_toml, read_toml
 from dudmap.ranges import RANGES, scaled
 from dudmap.thesis_config import ThesisConfig
@@ -94,17 +95,8 @@ class SimilarityConfig(ConfigSection):
 
     enabled: bool = True
     """Do not fuse frames whose view the map already contains; they are still tracked."""
-    measure: Literal["information", "features"] = "information"
-    """Redundancy test: weights of the map in the view (information), or matched SIFT features of the last fused frame
-    (features; thesis section 4.3)."""
     threshold: float = Field(default=0.84, gt=0, le=1)
-    """Share of the view that is known, by either measure, above which it is redundant (thesis section 4.3)."""
-    ratio: float = Field(default=0.7, gt=0, lt=1)
-    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance (features only)."""
-    image_width: int = Field(default=320, ge=80)
-    """Width of the image in which features are detected, pixels (features only)."""
-    max_features: int = Field(default=500, ge=50)
-    """Largest number of features per frame (features only)."""
+    """Share of the view that the map knows by its weights above which it is redundant (thesis section 4.3)."""
     max_translation: float = Field(default=0.005, ge=0)
     """Translation since the last fused frame above which a view counts as new without the test, metres; 0 tests all."""
     max_rotation_deg: float = Field(default=0.3, ge=0)
@@ -162,12 +154,8 @@ class VolumeConfig(ConfigSection):
 class TrackerConfig(ConfigSection):
     """Direct registration to the TSDF by distance and intensity residuals (thesis section 4.4)."""
 
-    robust: Literal["huber", "tukey"] = "huber"
-    """Robust weight function (thesis eq. 4.44, 4.45)."""
     huber: float = Field(default=0.01, gt=0)
-    """Huber threshold of the distance residual, metres at the reference depth (thesis table 6.1)."""
-    tukey: float = Field(default=0.05, gt=0)
-    """Tukey threshold of the distance residual, metres at the reference depth."""
+    """Huber threshold of the distance residual, metres at the reference depth (thesis eq. 4.44, table 6.1)."""
     damping: float = Field(default=0.02, gt=0)
     """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1); at most 1e-4
     on the finest level."""
@@ -178,8 +166,6 @@ class TrackerConfig(ConfigSection):
     """Huber threshold of the intensity residual, intensity in [0, 1]."""
     exposure: bool = True
     """Fit gain and offset between image and map intensities on the coarsest pyramid level."""
-    noise_weighting: bool = True
-    """Weight each distance residual by the sensor noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 6)
     """Largest number of iterations per pyramid level, coarse to fine; 0 skips the level."""
     widths: tuple[int, ...] = (80, 160, 320)
@@ -190,15 +176,11 @@ class TrackerConfig(ConfigSection):
     """The same for the coarser levels, which only lead to the next."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
     """Relative change of the cost below which a short step also ends a coarse level; 0 disables this criterion."""
-    second_pass: bool = True
-    """Register a second time with the dynamic labels (thesis algorithm 4)."""
-    constant_velocity: bool = True
-    """Predict the pose with a constant-velocity model; otherwise start from the last pose."""
     min_inliers: float = Field(default=0.15, ge=0, le=1)
     """Smallest share of the measurements that lie on the map in a tracked frame."""
     max_residual: float = Field(default=4.0, gt=0)
     """Largest robust root mean square of the distance residuals of a tracked frame, in standard deviations sigma(z) of
-    a measurement, with or without ``noise_weighting``."""
+    a measurement."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
     min_information: float = Field(default=2.3, ge=0)
@@ -225,23 +207,14 @@ class TrackerConfig(ConfigSection):
 class DynamicsConfig(ConfigSection):
     """Detection of dynamic pixels (thesis section 4.6)."""
 
-    method: Literal["em", "threshold", "none"] = "em"
-    """EM on the residuals (em), threshold and flood fill as in ReFusion (threshold), or no detection (none)."""
-    free_space: bool = True
-    """Label points inside known free space as dynamic (em only)."""
-    regions: bool = True
-    """Classify depth-connected regions instead of pixels (em only)."""
+    enabled: bool = True
+    """Detect dynamic pixels; otherwise every pixel is static."""
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; rounded to a halving of the camera image."""
-    threshold: float = Field(default=0.07, gt=0)
-    """Distance to the map above which method ``threshold`` labels a pixel as dynamic, metres, limited to the truncation
-    distance. ReFusion's published code uses 10 cm / sqrt 2."""
     noise_threshold: float = Field(default=0.03, gt=0)
     """Smallest distance to the static map of a dynamic measurement, metres (theta in thesis eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
     """The same distance in standard deviations of the measurement; the larger of the two applies."""
-    pieces: bool = True
-    """Classify whole surface segments, and remember dynamic ones until they have settled (with regions only)."""
     settle_time: float = Field(default=1.5, gt=0, le=60)
     """Time for which an object must be at rest before it counts as static again and is fused, seconds."""
     max_share: float = Field(default=0.9, gt=0, le=1)
@@ -249,7 +222,7 @@ class DynamicsConfig(ConfigSection):
     start_seconds: float = Field(default=1.0, ge=0)
     """Time after the first frame in which motion between images, with compensated ego-motion, also detects objects,
     seconds; the map has no free space yet. It is extended while this finds objects that the map does not reveal; 0
-    disables it (em only)."""
+    disables it."""
     margin_px: int = Field(default=5, ge=0, le=50)
     """Margin around dynamic regions that is not fused, pixels of an image 640 wide."""
 
@@ -395,7 +368,7 @@ class Config(ConfigSection):
         Raises:
             ConfigError: A key is unknown or a value invalid.
         """
-        tree = _without_preset(tree)
+        tree = without_gone(tree)
         _check_keys(tree)
         try:
             return cls.model_validate(_merged(scaled(cls().model_dump(), size), tree))
@@ -424,7 +397,7 @@ class Config(ConfigSection):
                 if not isinstance(branch, dict):
                     raise ConfigError(f"{key.strip()} is not a key: {part} holds a value")
             branch[parts[-1]] = _value(text.strip())
-        known = _without_preset(tree)
+        known = without_gone(tree)
         _check_keys(known)
         return self.from_tree(_merged(self.model_dump(), known))
 
@@ -472,16 +445,6 @@ def keys() -> list[str]:
         if isinstance(field.default, ConfigSection):
             out += [f"{part}.{key}" for key in type(field.default).model_fields]
     return out
-
-
-def _without_preset(tree: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The tree without the key ``preset`` of earlier versions, whose only use was the default."""
-    if tree.get("preset", "default") != "default":
-        raise ConfigError(
-            f'the key preset = {tree["preset"]!r} is gone; system = "thesis" (--system thesis) runs the system of the '
-            "thesis as written, with the parameters of the section thesis"
-        )
-    return {key: value for key, value in tree.items() if key != "preset"}
 
 
 def _check_keys(tree: Mapping[str, Any]) -> None:

@@ -19,7 +19,6 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
-from dudmap.lab.benchmark.suites import systems
 from oracle import half_normal_mixture_em
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
@@ -124,18 +123,8 @@ def test_a_walking_person_is_labelled_as_a_whole(recording):
     assert overlap(recording) > 0.7
 
 
-def test_the_threshold_rule_leaves_an_empty_room_alone():
-    sequence = synthetic.sequence("room", movers=(), frames=20, camera=SMALL)
-    slam = Slam(sequence.camera, systems("threshold")["threshold"])
-    results = [slam.process(sequence[index]) for index in range(20)]
-    assert all(result.state == "tracked" for result in results)
-    assert max(result.dynamic_share for result in results) < 0.05
-
-
-def test_every_method_runs_and_none_labels_nothing(recording):
-    assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028", step=2) > 0.1
-    assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false", step=2) > 0.05
-    assert overlap(recording, "dynamics.method=none", step=2) == 0.0
+def test_without_detection_nothing_is_labelled(recording):
+    assert overlap(recording, "dynamics.enabled=false", step=2) == 0.0
 
 
 @pytest.mark.parametrize(("rows", "stands"), [(6, False), (45, True)])

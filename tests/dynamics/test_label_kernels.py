@@ -64,7 +64,7 @@ def test_regions_of_moving_pixels(scene, free):
     rng, depth, _, sample = scene
     sigma, tolerance, *_ = label_oracle.weighed(depth, sample, NOISE)
     seen_free = (smooth(rng, 4) > 1.5) & (depth > 0)
-    rules = RegionRules(6, 4, 4, 1, 15, 0.25, True, True)
+    rules = RegionRules(6, 4, 4, 1, 15, 0.25)
     dynamic, seeds, probability = np.empty(SHAPE, bool), np.empty(SHAPE, bool), np.empty(SHAPE, np.float32)
     given = seen_free if free else np.empty((0, 0), bool)
     fit = np.float64(3.5), np.float32(-0.4)

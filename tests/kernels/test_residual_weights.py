@@ -13,19 +13,17 @@ from dudmap.core.formulas.residual import residual_weights
 BAND = TruncationBand(0.05, 0.05, 3.0, 0.3, SensorNoise(0.001, 0.0019))
 
 
-@pytest.mark.parametrize("tukey", [0.0, 0.03])
-@pytest.mark.parametrize("noisy", [0.0, 1.0])
-def test_weights_are_those_of_the_thesis(tukey, noisy):
-    """Equations 4.44 to 4.46, with the noise of the sensor (3.91)."""
-    rng, p = np.random.default_rng(1), RegistrationParameters(BAND, 0.01, tukey, 0.13, 0.1, 0.0029, noisy)
+def test_weights_are_those_of_the_thesis():
+    """Equations 4.44 and 4.46, with the noise of the sensor (3.91)."""
+    rng, p = np.random.default_rng(1), RegistrationParameters(BAND, 0.01, 0.13, 0.1, 0.0029)
     z = rng.uniform(0.5, 4, (20, 30)).astype(np.float32)
     r, rc = rng.normal(0, 0.02, z.shape).clip(-0.04, 0.04), rng.normal(0, 0.2, z.shape)
     rc[3] = np.nan
     static = rng.uniform(0, 1, z.shape)
     of_distance, of_intensity, square = residual_weights(z, np.stack([r, rc]).astype(np.float32), static, p)
-    scale = np.minimum(0.0029 / (0.001 + 0.0019 * z**2), 1) if noisy else np.ones_like(z)
+    scale = np.minimum(0.0029 / (0.001 + 0.0019 * z**2), 1)
     a, known = np.abs(r * scale), np.isfinite(rc)
-    robust = np.where(a < tukey, (1 - (a / tukey) ** 2) ** 2, 0) if tukey else np.minimum(0.01 / a, 1)
+    robust = np.minimum(0.01 / a, 1)
     np.testing.assert_allclose(of_distance, np.where(known, static * robust * scale**2, 0), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(square, np.where(known, static * robust * a**2, 0), rtol=1e-4, atol=1e-9)
     expected = np.where(known, static * 0.13 * np.minimum(0.1 / np.abs(rc), 1), 0)
@@ -33,16 +31,14 @@ def test_weights_are_those_of_the_thesis(tukey, noisy):
 
 
 OWNERS = {
-    ("huber", "tukey", "color_huber", "noise_weighting", "sigma_at_reference"): {
+    ("huber", "color_huber", "sigma_at_reference"): {
         "core/formulas/residual.py",
         "core/tracking/tracker.py:parameters",  # hands them on
-        "core/tracking/tracker.py:_judge",  # asks whether the weights have the noise
         "fleet/sdf_alignment.py:align_maps",  # differences of two maps, without a reading or its noise
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
         "core/map/volume.py:fusion_parameters",  # hands them on, as do all that follow
-        "core/tracking/tracker.py:_chi_square",
         "core/dynamics/detector.py:noise_parameters",
         "core/calibration/adjustment.py:__init__",
     },

@@ -73,10 +73,10 @@ def test_masked_pixels_are_neither_tracked_nor_fused():
     assert (slam.volume.raycast(np.eye(4)).depth[:, 420:] == 0).mean() > 0.98
 
 
-@pytest.mark.parametrize("method", ["em", "none"])
-def test_the_reported_mask_is_the_union(method):
+@pytest.mark.parametrize("enabled", ["true", "false"])
+def test_the_reported_mask_is_the_union(enabled):
     sequence = open_sequence(EXCERPT)
-    slam = Slam(sequence.camera, Config().override([f"dynamics.method={method}"]))
+    slam = Slam(sequence.camera, Config().override([f"dynamics.enabled={enabled}"]))
     mask = np.zeros(sequence.camera.shape, dtype=bool)
     mask[100:140, 200:260] = True
     slam.process(sequence[0])

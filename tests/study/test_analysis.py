@@ -40,7 +40,7 @@ def test_designs_stay_in_their_bounds_and_are_counted(kind):
 
 def test_a_full_factorial_design_has_every_combination_once():
     factors = factors_of(
-        {"tracker.huber": [0.005, 0.01], "dynamics.method": ["em", "none"], "volume.max_weight": [5, 9]}
+        {"tracker.huber": [0.005, 0.01], "dynamics.enabled": [True, False], "volume.max_weight": [5, 9]}
     )
     points = points_of(factors, DesignOptions())
     assert len(points) == 8 == len({tuple(point.values()) for point in points})

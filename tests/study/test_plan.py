@@ -18,7 +18,7 @@ def test_runs_are_points_times_sequences_times_replicates():
     plan = make_plan(
         {
             "base": ["device=cpu"],
-            "factors": {"tracker": {"huber": [0.005, 0.01]}, "dynamics.method": ["em", "none"]},
+            "factors": {"tracker": {"huber": [0.005, 0.01]}, "dynamics.enabled": [True, False]},
             "sequences": [{**ROOM, "replicates": 3, "seed": 5}, {"name": "other", "scene": "box", "frames": 6}],
             "responses": ["ate", "ms"],
         }
@@ -27,8 +27,8 @@ def test_runs_are_points_times_sequences_times_replicates():
     assert len(runs) == 4 * 4 == len({run.key for run in runs})
     assert {run.entry.parameters["seed"] for run in runs if run.sequence == "room"} == {5, 6, 7}
     assert {run.config.device for run in runs} == {"cpu"}
-    assert {(run.config.tracker.huber, run.config.dynamics.method) for run in runs} == {
-        (huber, method) for huber in (0.005, 0.01) for method in ("em", "none")
+    assert {(run.config.tracker.huber, run.config.dynamics.enabled) for run in runs} == {
+        (huber, enabled) for huber in (0.005, 0.01) for enabled in (True, False)
     }
 
 

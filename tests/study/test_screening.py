@@ -40,7 +40,7 @@ def test_the_ends_differ_from_the_value_by_the_ratio_unless_a_bound_or_a_whole_n
     ends = {factor.key: (factor.low, factor.high) for factor in factors_of(ratio=2.0)}
     assert ends["tracker.huber"] == (0.005, 0.02)
     assert ends["volume.max_weight"] == (128, 255)  # at most 255
-    assert ends["similarity.ratio"] == pytest.approx((0.35, 0.85))  # below 1: halfway from 0.7
+    assert ends["relocalization.ratio"] == pytest.approx((0.425, 0.925))  # below 1: halfway from 0.85
     assert ends["dynamics.max_share"][1] == 1.0
     small = {factor.key: (factor.low, factor.high) for factor in factors_of(ratio=1.01)}
     assert small["volume.min_weight"] == (2, 4)

@@ -13,7 +13,7 @@ SMALL = {"scene": "room", "movers": [], "frames": 30, "camera": [160, 120]}
 def plan_of(**more):
     return make_plan(
         {
-            "factors": {"tracker.huber": {"range": [0.005, 0.05]}, "tracker.robust": ["huber", "tukey"]},
+            "factors": {"tracker.huber": {"range": [0.005, 0.05]}, "tracker.exposure": [True, False]},
             "sequences": [{**SMALL, "name": "training", "replicates": 2}],
             "judge": [{**SMALL, "name": "judge", "replicates": 4, "seed": 50}],
             "responses": ["ate", "ms"],

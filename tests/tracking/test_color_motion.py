@@ -113,7 +113,7 @@ def test_registered_colour_is_taken_as_it_is_bit_for_bit():
     assert np.array_equal(poses(exact, None), poses(exact, same))
 
 
-@pytest.mark.parametrize("setting", ["dynamics.method=em", "dynamics.method=none", "tracker.second_pass=false"])
+@pytest.mark.parametrize("setting", ["dynamics.enabled=true", "dynamics.enabled=false"])
 def test_the_frame_that_is_fused_is_the_one_that_was_registered(setting):
     faulty = recording(color_delay=0.03)
     slam, made, given = Slam(SMALL, Config().override([setting]), calibration=truth_of(faulty)), [], []

@@ -281,7 +281,7 @@ class Slam(SlamResults, Stateful):
         self.mapper.extend(view, estimate, mask, fuse=True)
         self.bootstrap.start(view, estimate, mask)
         self.color_motion.start(view)
-        if self.config.dynamics.method == "em":
+        if self.config.dynamics.enabled:
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)

@@ -72,10 +72,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         return slam
 
     def variants() -> None:
-        for variant in ("dynamics.method=threshold", "tracker.robust=tukey", "preprocess.drop_mixed=true"):
-            slam = Slam(CAMERA, Config().override([variant, *SMALL]))
-            for frame in frames:
-                slam.process(frame)
+        slam = process("preprocess.drop_mixed=true")
         band = TruncationBand(1.0, 1.0, 1.0, 1.0, SensorNoise(1.0, 1.0, 1.0))
         image, parameters = frames[0].depth, slam.tracker.parameters(band)
         residual_weights(image, np.stack([image, image]), image, parameters)

@@ -108,7 +108,7 @@ def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float6
     """Matched points (N, 3) of two frames that fit one affine motion, each in its camera."""
     sift, points = SiftExtractor(POINTS), []
     seen = [sift.extract(reduced_grey(frame.rgb, frame.rgb.shape[1] // 2)) for frame in frames]
-    pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0, mutual=True)
+    pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0)
     for frame, features, rows in zip(frames, seen, pairs.T, strict=True):
         u, v = 2 * features.pixels[rows].T + 0.5
         row, column = (

@@ -1,4 +1,4 @@
-"""Artificial views (thesis section 4.5.3): render the map along a trajectory, as picture, video or recording."""
+"""Artificial views (thesis section 4.5): render the map along a trajectory, as picture, video or recording."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -88,19 +88,17 @@ class RegistrationParameters(NamedTuple):
 
     Attributes:
         band: Truncation band; pixels farther from the surface are outliers.
-        huber, tukey: Constants of the distance residual, metres at the reference depth; tukey = 0 selects Huber.
+        huber: Huber constant of the distance residual, metres at the reference depth.
         color_weight, color_huber: Weight and Huber constant of the intensity residual (0..1), used in the range from
             ``darkest`` to ``brightest``.
-        sigma_at_reference, noise_weighting: 1 scales each distance residual by this sigma (m) / sigma(z), 0 does not.
+        sigma_at_reference: Each distance residual is scaled by this sigma, metres, over sigma(z).
     """
 
     band: TruncationBand
     huber: float
-    tukey: float
     color_weight: float
     color_huber: float
     sigma_at_reference: float
-    noise_weighting: float
     darkest: float = -np.inf
     brightest: float = np.inf
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig, SensorConfig
-from dudmap.core.backends.cpu import labeling
 from dudmap.core.backends.cpu.evidence import (
     BINS,
     CENTERS,
@@ -23,7 +22,7 @@ from dudmap.core.backends.cpu.evidence import (
 from dudmap.core.backends.cpu.segment_motion import STARTED_SHARE, moving_segments, stand_still
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
-from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, elliptical_kernel
+from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
 from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
 from dudmap.core.frames.observation import Level, Pyramid, saturated, unsaturated
@@ -48,10 +47,6 @@ MAPPED_SHARE = 0.3
 """Share of what moves in a segment that must lie on the map for the map to decide about the rest, too."""
 MIN_REGION = 0.0008
 """Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
-EROSION, DILATION, FLOOD_STEP = 15 / 640, 10 / 640, 0.007
-"""Radii of the threshold rule's structuring elements, as shares of the image width, and the largest depth step to a
-neighbouring pixel in its flood, as a share of the depth, in an image 640 pixels wide (Palazzolo et al. 2019, code)."""
-
 NONE = np.empty((0, 0), dtype=np.bool_)
 """No pixels."""
 
@@ -88,7 +83,7 @@ class DynamicDetector(Stateful):
     """Labels the pixels of registered frames as static or dynamic.
 
     Args:
-        config: Method and thresholds.
+        config: Thresholds and times.
         sensor: Noise of the depth readings.
 
     Attributes:
@@ -121,9 +116,7 @@ class DynamicDetector(Stateful):
             level = levels().labelled
             return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
 
-        config = self.config
-        needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
-        return cache(submit(compute) if now and needed else compute)
+        return cache(submit(compute) if now and self.config.enabled else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
         """Begin with the first frame of a map, of which no pixel is known to move.
@@ -163,8 +156,8 @@ class DynamicDetector(Stateful):
             exposure: Gain and offset that make the image's intensities those of the map.
             slow: (h, w) bool, those of them that an older image shows to move; None for none.
         """
-        config, depth = self.config, level.depth
-        noise = noise_parameters(config, self.sensor, level, volume.voxel_size)
+        depth = level.depth
+        noise = noise_parameters(self.config, self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
         if (dark := saturated(level, exposure, sample.difference)) is not None:
             sample.difference[dark] = np.nan
@@ -174,32 +167,23 @@ class DynamicDetector(Stateful):
             depth, sample.distance, sample.occupancy, noise, RULES, CENTERS, sigma, tolerance, histogram
         )
         frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise)
-        if config.method == "threshold":
-            dynamic = self._threshold_and_flood(frame, volume.truncation)
-            return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = Mixture((1 - prior, prior), (static, moves))
         offset, slope = mixture.coefficients
         dynamic, seeds = (np.empty(depth.shape, np.bool_) for _ in range(2))
         rules = RegionRules(
-            MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, STARTED_SHARE,
-            config.free_space, config.regions,
+            MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, STARTED_SHARE
         )  # fmt: skip
         moving_pixels(
             depth, sample.distance, sample.occupancy, sigma, tolerance, self._seen_free(frame, unknown), offset,
             np.float32(slope), noise, rules, dynamic, seeds, probability,
         )  # fmt: skip
-        segments = None
-        if config.regions:
-            if config.pieces:
-                dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
-            if moving is not None and moving.any():
-                fast = moving if slow is None else moving & ~slow
-                dynamic = dynamic | (moving & ~self._stands_on_map(frame, fast, segmentation()))
-            # what belongs to no moving region fits badly for another reason, which the robust weights deal with
-            probability = np.where(dynamic, np.float32(0), np.float32(1))
-        hidden = None
-        if config.free_space:
-            hidden = self.background.hidden(timestamp, unsaturated(level, exposure), T_world_camera)
+        dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
+        if moving is not None and moving.any():
+            fast = moving if slow is None else moving & ~slow
+            dynamic = dynamic | (moving & ~self._stands_on_map(frame, fast, segmentation()))
+        # pixels outside moving regions fit badly for another reason, which the robust weights handle
+        probability = np.where(dynamic, np.float32(0), np.float32(1))
+        hidden = self.background.hidden(timestamp, unsaturated(level, exposure), T_world_camera)
         return Labels(probability, dynamic, mixture, histogram, sample, segments, hidden)
 
     def update(
@@ -220,8 +204,7 @@ class DynamicDetector(Stateful):
             labels: Labels of the frame.
         """
         self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.segmentation)
-        if self.config.free_space:
-            self.background.update(timestamp, unsaturated(level, exposure), T_world_camera, labels.dynamic)
+        self.background.update(timestamp, unsaturated(level, exposure), T_world_camera, labels.dynamic)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
         """Move what is remembered with a correction (4, 4) of the world."""
@@ -234,9 +217,9 @@ class DynamicDetector(Stateful):
         self.background.reset()
 
     def _seen_free(self, frame: _Comparison, unknown: float) -> NDArray[np.bool_]:
-        """Pixels (h, w) in space that single frames have seen to be free, of size 0 where they are not asked;
-        ``unknown`` is the share of the readings in space unknown to the map."""
-        if not (self.config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown))):
+        """Pixels (h, w) in space that single frames have seen to be free, of size 0 without such frames; ``unknown``
+        is the share of the readings in space unknown to the map."""
+        if not (older := self.memory.free_space_frames(frame.timestamp, unknown)):
             return NONE
         gap = np.float32(MAX_GAP) * noise_threshold(self.config, frame.sigma)
         return self.memory.seen_free(frame.level, frame.T_world_camera, gap, older)
@@ -281,25 +264,6 @@ class DynamicDetector(Stateful):
         still = (np.arange(segments.count + 1) > 0) & (known > MAPPED_SHARE * asked)
         stand_still(segments, mapped, distance, difference, still)
         return moving & still[segments.labels]
-
-    def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
-        """Pixels (h, w) far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019).
-
-        The flood stops at what fits the map: over depth alone it runs from a foot over the floor through the room.
-        """
-        import cv2
-
-        level = frame.level
-        distance = np.abs(np.nan_to_num(frame.sample.distance))
-        noise = noise_threshold(self.config, frame.sigma)
-        rim = 0.95 * truncation  # a stored distance never exceeds the truncation
-        marked = (distance > min(self.config.threshold, rim)) | frame.free
-        width = level.camera.width
-        core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(EROSION * width)) > 0
-        tolerance = np.float32(FLOOD_STEP * 640 / width) * level.depth
-        open_pixels = (distance > noise) | frame.free
-        labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
-        return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0
 
 
 def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:

@@ -84,16 +84,16 @@ class Labels:
     Attributes:
         static_probability: (h, w) float32 in [0, 1]; the weights of the second registration.
         dynamic: (h, w) bool.
-        mixture: The fitted densities; None for methods without a fit.
+        mixture: The fitted densities.
         histogram: (BINS,) counts of the normalised residuals.
         sample: Distance, intensity difference and occupancy of the map at the points of the frame.
-        segmentation: Surface segments of the frame; None if motion is not decided by segment.
+        segmentation: Surface segments of the frame.
         hidden: (h, w) bool, pixels without depth in front of known background; None if not examined.
     """
 
     static_probability: NDArray[np.float32]
     dynamic: NDArray[np.bool_]
-    mixture: Mixture | None
+    mixture: Mixture
     histogram: NDArray[np.int64]
     sample: MapSample
     segmentation: Segmentation | None = None

@@ -57,24 +57,10 @@ def huber_cost(a, k):
     return min(a, k) * (a - f32(0.5) * min(a, k))
 
 
-@scalar
-def tukey_inlier(a, by_k):
-    """1 - (a / k)^2 of Tukey's biweight, 0 beyond k (thesis eq. 4.45); the weight is its square."""
-    capped = min(a * by_k, f32(1))
-    return f32(1) - capped * capped
-
-
-@scalar
-def tukey_cost(inlier, limit):
-    """Tukey cost of ``tukey_inlier``; ``limit`` = k^2 / 6 is the cost of an outlier."""
-    return limit * (f32(1) - inlier * inlier * inlier)
-
-
 @written_out
 def noise_scale(z, p):
-    """sigma(reference depth) / sigma(z), at most 1, if residuals are weighted by sensor noise, else 1."""
-    scaled = min(p.sigma_at_reference / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
-    return p.noise_weighting * scaled + (f32(1) - p.noise_weighting)
+    """sigma(reference depth) / sigma(z), at most 1."""
+    return min(p.sigma_at_reference / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
 
 
 @written_out
@@ -96,19 +82,16 @@ def weigh(r, rc, z, static, known, p):
         - Its weighted squared distance at one metre.
         - The weight of the distance and the weight of the intensity.
     """
-    zero, one = f32(0), f32(1)
-    use_tukey = p.tukey > zero
-    by_tukey = one / p.tukey if use_tukey else one
-    limit = p.tukey * p.tukey / f32(6)
+    zero = f32(0)
     gate = band_front(z, p.band) * GATE
     scale = noise_scale(z, p)
     valid = known & (abs(r) < gate)
     rn = r * scale
     a = abs(rn)
-    inlier = tukey_inlier(a, by_tukey)
-    robust = inlier * inlier if use_tukey else huber_weight(a, p.huber)
-    cost = tukey_cost(inlier, limit) if use_tukey else huber_cost(a, p.huber)
-    worst = limit if use_tukey else huber_cost(gate * scale, p.huber)
+    outlier = a > p.huber  # selected and not limited: the compiler then orders the products as in earlier versions
+    robust = p.huber / a if outlier else f32(1)
+    cost = p.huber * (a - f32(0.5) * p.huber) if outlier else f32(0.5) * a * a
+    worst = huber_cost(gate * scale, p.huber)
     ac = abs(rc)
     color_robust, color_cost = huber_weight(ac, p.color_huber), huber_cost(ac, p.color_huber)
     used = static if valid else zero

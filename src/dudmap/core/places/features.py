@@ -62,13 +62,11 @@ class SiftExtractor:
         )
 
 
-def match_descriptors(
-    a: NDArray[np.float32], b: NDArray[np.float32], ratio: float, *, mutual: bool
-) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows: each row of ``a`` with its nearest neighbour in ``b``, if it passes the ratio test.
+def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
+    """Pairs (m, 2) of rows that are each other's nearest neighbours and pass the ratio test from ``a`` to ``b``.
 
     All distances are computed: for some hundred features this is exact and faster than a search tree. Nothing matches
-    if ``b`` has fewer than two rows. ``mutual`` keeps only pairs that are also nearest neighbours from ``b`` to ``a``.
+    if ``b`` has fewer than two rows.
     """
     if len(a) == 0 or len(b) < 2:
         return np.empty((0, 2), dtype=np.int64)
@@ -76,7 +74,7 @@ def match_descriptors(
     nearest = np.argmin(squared, axis=1)
     rows = np.arange(len(a))
     first = squared[rows, nearest]
-    passed = np.argmin(squared, axis=0)[nearest] == rows if mutual else np.ones(len(a), dtype=bool)
+    passed = np.argmin(squared, axis=0)[nearest] == rows
     squared[rows, nearest] = np.inf
     passed &= first < ratio**2 * squared.min(axis=1)
     return np.stack([rows[passed], nearest[passed]], axis=1)

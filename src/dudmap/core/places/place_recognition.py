@@ -243,9 +243,7 @@ class KeyframeDatabase(Stateful):
             return []
         found: list[PlaceMatch] = []
         for keyframe in _most_similar(features, among):
-            pairs = match_descriptors(
-                features.descriptors, keyframe.features.descriptors, self.config.ratio, mutual=True
-            )
+            pairs = match_descriptors(features.descriptors, keyframe.features.descriptors, self.config.ratio)
             if len(pairs) < fewest:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]

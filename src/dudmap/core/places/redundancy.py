@@ -1,8 +1,7 @@
 """Redundant views: frames without new information for the map, which are not fused (thesis section 4.3).
 
-The thesis calls a view redundant if more than 84 % of the SIFT features of the last fused frame are found in it again.
-On real sensors noise alone keeps this share below 84 %, even on a tripod. The map's weights measure the same directly:
-the information that the map has already.
+The thesis compares SIFT features of two images. The map's weights measure the same directly: the information that the
+map has already.
 """
 
 from dataclasses import dataclass
@@ -10,68 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import Config, SimilarityConfig
+from dudmap.config import Config
 from dudmap.core.dynamics.detector import MIN_REGION, depth_tolerance, distance_sigma, noise_threshold
 from dudmap.core.dynamics.masks import opened_mask
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
-
-MIN_FEATURES = 20
-"""Smallest number of features in both frames; with fewer, the frame counts as new."""
-SCALES, EXPONENTS = (0.25, 0.5, 1.0), (2.6, 1.6, 1.4)
-"""Share on the full image = share on an image reduced by a scale, with 500 features, to the power of the exponent.
-
-Fitted on 115 pairs of 640x480 frames (hand-held, tripod, and one view with added noise and sub-pixel shifts). The rms
-error of the fit is 0.05, at a quarter of the width 0.10.
-"""
-
-
-class SimilarityTest(Stateful):
-    """Compares the appearance of a frame with a reference frame.
-
-    The share of the reference's SIFT features that are found again is measured on a reduced image. It is converted to
-    the share on the full image, so that the threshold keeps its meaning of the thesis. Features are extracted on
-    demand, once per image. Not thread-safe.
-    """
-
-    _reference: Remembered[NDArray[np.uint8] | None] = None
-    _cache: Remembered[list[tuple[NDArray[np.uint8], NDArray[np.float32]]]]
-
-    def __init__(self, config: SimilarityConfig | None = None) -> None:
-        self.config = config or SimilarityConfig()
-        self._sift = SiftExtractor(self.config.max_features)
-        # reduced images and their descriptors: at most the reference and the latest frame
-        self._cache = []
-
-    def set_reference(self, rgb: NDArray[np.uint8]) -> None:
-        """Set the reference (H, W, 3) for later frames."""
-        self._reference = reduced_grey(rgb, self.config.image_width)
-
-    def is_redundant(self, rgb: NDArray[np.uint8]) -> bool:
-        """Whether a frame (H, W, 3) shows the view of the reference; False without a reference."""
-        return self.similarity(rgb) > self.config.threshold
-
-    def similarity(self, rgb: NDArray[np.uint8]) -> float:
-        """Share in [0, 1] of the reference's features that are found again in a frame; 0 without enough features."""
-        if self._reference is None:
-            return 0.0
-        images = self._reference, reduced_grey(rgb, self.config.image_width)
-        reference, latest = (self._descriptors(image) for image in images)
-        self._cache = [(images[0], reference), (images[1], latest)]
-        if min(len(reference), len(latest)) < MIN_FEATURES:
-            return 0.0
-        share = len(match_descriptors(reference, latest, self.config.ratio, mutual=False)) / len(reference)
-        return float(share ** np.interp(self._reference.shape[1] / rgb.shape[1], SCALES, EXPONENTS))
-
-    def _descriptors(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Descriptors (n, 128) of a reduced image, cached for the last two images."""
-        known = (descriptors for other, descriptors in self._cache if np.array_equal(other, image))
-        found = next(known, None)
-        return self._sift.extract(image).descriptors if found is None else found
 
 
 @dataclass(eq=False)
@@ -96,19 +41,17 @@ class RedundantViews(Stateful):
     angle, with other systematic errors, which the average should contain as well.
     """
 
-    features: Remembered[SimilarityTest]
     _place: Remembered[_Place | None] = None
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.features = SimilarityTest(config.similarity)
         self._learnt = 2 * config.volume.free_after
 
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:
         """Whether to leave a registered frame out of the fusion into a map.
 
-        ``similarity.measure`` "features" applies the rule of the thesis. With "information" a frame is redundant if the
-        map has on average more than ``similarity.threshold`` of the information on the visible static surface.
+        A frame is redundant if the map has on average more than ``similarity.threshold`` of the information on the
+        visible static surface.
         Exceptions are regions with news:
 
         * a surface with fewer than 2 ``volume.free_after`` observations, because the space before it is not yet known
@@ -120,8 +63,6 @@ class RedundantViews(Stateful):
         place, config, level = self._place, self.config.similarity, view.labelled
         if place is None or not config.enabled or not self._is_near(place, estimate.T_world_camera):
             return False
-        if config.measure == "features":
-            return self.features.is_redundant(view.colored().rgb)
         static = _static(view, estimate)
         known = self._known_share(volume, level, estimate.T_world_camera)
         if not static.any() or known[static].mean() <= config.threshold:
@@ -136,10 +77,8 @@ class RedundantViews(Stateful):
         if not config.enabled:
             return
         place = self._place
-        if config.measure == "features":
-            self.features.set_reference(view.colored().rgb)
         static = _static(view, estimate)
-        if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
+        if place is None or not self._is_near(place, T_world_camera):
             depth, to_carve = np.where(static, level.depth, np.float32(0)), np.zeros(level.depth.shape, np.int64)
             self._place = _Place(T_world_camera, depth, to_carve)
             return

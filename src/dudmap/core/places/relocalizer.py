@@ -149,7 +149,7 @@ class Relocalizer(Stateful):
 
     @property
     def _compares_images(self) -> bool:
-        return self.config.dynamics.method == "em" and self.config.dynamics.start_seconds > 0
+        return self.config.dynamics.enabled and self.config.dynamics.start_seconds > 0
 
     def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
         """Whether the motion between an earlier lost image and this one is certainly the camera's.

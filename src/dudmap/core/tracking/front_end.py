@@ -133,7 +133,7 @@ class FrontEnd(Stateful):
         tracker = self.blind_tracker if view.without_image else self.tracker
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
         split, relit = max(1, len(levels) - 1), self._is_relit(view)
-        if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
+        if not self.config.dynamics.enabled:
             with view.timer("track"):
                 coarse, weights = levels[:split], initial_weights(levels[:split], None, excluded)
                 found = tracker.minimize(volume, coarse, T_init, weights, relit=relit)
@@ -142,9 +142,7 @@ class FrontEnd(Stateful):
                 fine, exposure = view.pyramid.tracked[split - 1 :], found.exposure
                 weights = initial_weights(fine, None, excluded)
                 tracking = tracker.align(volume, fine, found.T_world_camera, weights, split - 1, exposure)
-            labelled = self.config.dynamics.method != "none"
-            labels = self._label(volume, view, prediction, tracking) if labelled else None
-            return PoseEstimate(tracking, labels, unverified, view)
+            return PoseEstimate(tracking, None, unverified, view)
         with view.timer("track"):
             coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
             found = tracker.minimize(volume, coarse, T_init, weights, relit=relit)
@@ -175,7 +173,7 @@ class FrontEnd(Stateful):
         with view.timer("track"):
             [weights] = initial_weights([coarse], self.last_dynamic, excluded) or [np.ones_like(coarse.depth)]
             found = tracker.judge(volume, coarse, T_world_camera, weights)
-        labels = None if self.config.dynamics.method == "none" else self._label(volume, view, prediction, found)
+        labels = self._label(volume, view, prediction, found) if self.config.dynamics.enabled else None
         with view.timer("track_again"):
             if labels is None:
                 [weights] = initial_weights([fine], None, excluded) or [np.ones_like(fine.depth)]

@@ -94,8 +94,6 @@ class MotionModel(Stateful):
         """Predicted pose (4, 4) at a time in seconds."""
         if self._T_given is not None:
             return self._T_world_given @ self._T_given
-        if not self.config.constant_velocity:
-            return self.T_world_camera
         return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
     def repeated(self, timestamp: float, T_last: NDArray[np.float64], *, depth_only: bool) -> NDArray[np.float64]:

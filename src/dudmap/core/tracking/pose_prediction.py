@@ -73,7 +73,7 @@ class PosePredictor(Stateful):
     ) -> None:
         self.motion = motion
         self.tracker = tracker
-        self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
+        self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.enabled else 0.0)
         self._known_poses = known_poses
 
     def start(self, view: FrameView) -> None:

@@ -14,10 +14,8 @@ from dudmap.core.backends.parameters import (
     LevelImage,
     NormalEquations,
     RegistrationParameters,
-    SensorNoise,
     TruncationBand,
 )
-from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
@@ -320,24 +318,19 @@ class Tracker:
         return RegistrationParameters(
             band=band,
             huber=config.huber,
-            tukey=config.tukey if config.robust == "tukey" else 0.0,
             color_weight=config.color_weight if color_weight is None else color_weight,
             color_huber=config.color_huber,
             sigma_at_reference=self._sigma,
-            noise_weighting=float(config.noise_weighting),
         )
 
     def _judge(self, found: Minimum, T_world_camera: NDArray[np.float64]) -> TrackingResult:
         """Result of a registration that ended at a pose (4, 4), with the first failed check.
 
-        The metrics are comparable between configurations. Distances are in units of the sensor noise even if the
-        registration does not weigh by it. Intensities are compared after the best gain and offset even if the
-        registration does not apply them.
+        Intensities are judged after the best gain and offset, even if the registration does not apply them.
         """
         config, system, level, weights = self.config, found.equations, found.level, found.weights
         share = system.weight / max(system.readings, 1.0)
-        chi_square = system.chi_square if config.noise_weighting else self._chi_square(system, level, weights)
-        residual = math.sqrt(chi_square / max(system.weight, 1e-9))
+        residual = math.sqrt(system.chi_square / max(system.weight, 1e-9))
         scale = 1 / np.sqrt(np.maximum(system.H.diagonal(), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * (scale[:, None] * scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
@@ -356,12 +349,3 @@ class Tracker:
         )  # fmt: skip
         reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor))
         return replace(result, converged=False, reason=reason) if reason else result
-
-    def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
-        """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2, as linearised with
-        ``noise_weighting``."""
-        noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale, self.sensor.reference_depth)
-        everywhere = TruncationBand(np.inf, np.inf, 0.0, np.inf, noise)  # other residuals are NaN
-        parameters = self.parameters(everywhere)._replace(noise_weighting=1.0)
-        squares = residual_weights(level.depth, system.residuals, weights, parameters)[2]
-        return float(np.sum(squares, dtype=np.float64))

@@ -123,7 +123,7 @@ UNCALIBRATED = ("colour-as-given",)
 USUAL = {
     "ablation": ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))]),
     "sensors": "colour-as-given,no-colour,dudmap",
-    "limits": "dudmap,none,threshold,em",
+    "limits": "dudmap,none",
     "fence": "voxel-5mm,voxel-1cm,voxel-2cm,voxel-2cm-16m",
 }
 """Default systems of a suite; other suites have only the default system."""

@@ -66,8 +66,6 @@ class RegionRules(NamedTuple):
         half_seam: Half width of seams that are not seeds, pixels.
         min_area: Smallest number of pixels of a region.
         seeded_share: Smallest share of seeds in a region.
-        free_space: Whether pixels in known free space certainly move.
-        regions: Whether regions grow from seeds; otherwise every pixel is decided alone.
     """
 
     limit: float
@@ -76,8 +74,6 @@ class RegionRules(NamedTuple):
     half_seam: int
     min_area: float
     seeded_share: float
-    free_space: bool
-    regions: bool
 
 
 exact_sigma = written_out(reading_sigma)
@@ -176,7 +172,7 @@ def moving_pixels(
         offset, slope: Float64 and float32, as in ``Mixture.coefficients``.
         noise: NoiseParameters, all float32.
         rules: RegionRules.
-        dynamic, seeds: (h, w) bool out; ``seeds`` only if regions grow.
+        dynamic, seeds: (h, w) bool out.
         probability: (h, w) float32 out, static probability of the mean field.
     """
     h, w = depth.shape
@@ -188,15 +184,13 @@ def moving_pixels(
                 s = sigma[v, u]
                 least = noise_limit(s, noise.floor, noise.sigmas)
                 odds[v, u] = surface_log_odds(distance[v, u], s, least, offset, slope, limit)
-            if rules.free_space and (occupancy[v, u] == FREE or (seen and seen_free[v, u])):
+            if occupancy[v, u] == FREE or (seen and seen_free[v, u]):
                 odds[v, u] = -limit
     smoothed = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
     for v in range(h):
         for u in range(w):
             probability[v, u] = smoothed[v, u]
             dynamic[v, u] = probability[v, u] < np.float32(0.5) and depth[v, u] > ZERO
-    if not rules.regions:
-        return
     wide = opened(dynamic, rules.half_seam)
     open_pixels = np.empty((h, w), np.bool_)
     for v in range(h):
