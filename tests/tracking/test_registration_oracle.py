@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dudmap.config import Config, SensorConfig, TrackerConfig, VolumeConfig
+from dudmap.config import Config, TrackerConfig, VolumeConfig
 from dudmap.core.backends.cpu.exposure import fit_exposure
 from dudmap.core.backends.descent import DescentRules, descend
 from dudmap.core.backends.parameters import NormalEquations
@@ -56,7 +56,7 @@ def test_the_gradient_is_that_of_the_cost(volume):
 def test_normal_equations_equal_a_plain_sum_over_pixels(volume):
     """H and b rebuilt from numerically differentiated residuals of every pixel, with quadratic cost."""
     config = TrackerConfig(huber=10.0, color_huber=10.0, color_weight=0.3)
-    tracker, level = Tracker(config, SensorConfig(sigma_scale=0)), level_of(corner())
+    tracker, level = Tracker(config, SENSOR), level_of(corner())
     T = retract(np.eye(4), np.array([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]))
     step = 1e-4
     weights = interior(tracker, volume, level, T, 2 * step)
@@ -67,9 +67,10 @@ def test_normal_equations_equal_a_plain_sum_over_pixels(volume):
         ahead = tracker.linearize(volume, level, retract(T, step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
         back = tracker.linearize(volume, level, retract(T, -step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
         J[..., axis] = (ahead.astype(np.float64) - back) / (2 * step)
-    scale = np.array([1.0, 0.3])[:, None]
-    H = np.einsum("cn,cni,cnj->ij", np.broadcast_to(scale, r.shape), J, J)
-    b = np.einsum("cn,cni,cn->i", np.broadcast_to(scale, r.shape), J, r)
+    noise = np.minimum(SENSOR.sigma(1.0) / SENSOR.sigma(level.depth[weights > 0]), 1)
+    scale = np.stack([noise**2, np.full_like(noise, 0.3)])
+    H = np.einsum("cn,cni,cnj->ij", scale, J, J)
+    b = np.einsum("cn,cni,cn->i", scale, J, r)
     assert np.abs(system.H - H).max() < 0.05 * np.abs(H).max()
     assert np.abs(system.b - b).max() < 0.05 * np.abs(b).max()
     assert np.allclose(system.H, system.H.T)
