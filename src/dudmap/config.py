@@ -1,8 +1,8 @@
 """All parameters with their defaults, bounds, units and meanings.
 
 The configuration is immutable, rejects unknown keys, and reads and writes TOML. Dotted keys name section and
-parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.enabled``. A default without a stated source was tuned on
-the recordings of docs/benchmarks.md.
+parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.enabled``. A default without a stated source was tuned
+on the recordings of docs/benchmarks.md.
 """
 
 import difflib
