@@ -13,6 +13,7 @@ FOUNDATION = {
     "config",
     "errors",
     "extras",
+    "gone_keys",
     "input_files",
     "ranges",
     "interruption",
