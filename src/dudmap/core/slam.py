@@ -12,6 +12,7 @@ from dudmap.core.arrays import copied
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.ego_motion import Restart
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
@@ -203,8 +204,8 @@ class Slam(SlamResults, Stateful):
                 self.motion.apply_correction(correction)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_first_frame(view, prediction)
-        if prediction.crowd_in_map is not None and self.relocalizer.may_start_submaps:
-            return self._start_submap(view.with_dynamic(prediction.crowd_in_map))
+        if prediction.restart is not None:
+            return self._restart_map(view, prediction.restart)
         last = self.predictor.ego_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
         registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
@@ -268,9 +269,10 @@ class Slam(SlamResults, Stateful):
             self.front_end.lose(view.timestamp)
         return view
 
-    def _start_map(self, view: FrameView) -> FrameResult:
-        """Start a map with a single frame, whose camera frame becomes the world frame."""
-        estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, self.motion.start)
+    def _start_map(self, view: FrameView, T_world_camera: NDArray[np.float64] | None = None) -> FrameResult:
+        """Start a map with a single frame at a pose (4, 4); None: its camera frame becomes the world frame."""
+        T_start = self.motion.start if T_world_camera is None else T_world_camera
+        estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
         if reason := self.bootstrap.rejection_reason(view, mask):
@@ -285,7 +287,8 @@ class Slam(SlamResults, Stateful):
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
+        restarted = T_world_camera is not None
+        return self._result(view, None, mask, T_world_camera=T_start, fused=True, corrected=restarted)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
@@ -313,12 +316,25 @@ class Slam(SlamResults, Stateful):
         return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 
     def _start_submap(self, view: FrameView) -> FrameResult:
-        self.color_calibration.interrupt()
         self.atlas.start_submap()
+        self._forget_map()
+        return self._start_map(view)
+
+    def _restart_map(self, view: FrameView, restart: Restart) -> FrameResult:
+        """Restart the young map with this frame, and correct the poses of its earlier frames."""
+        self.atlas.clear_map()
+        self.atlas.move(restart.stamps, restart.corrections)
+        self._forget_map()
+        result = self._start_map(view.with_dynamic(restart.moving), restart.T_world_camera)
+        self.predictor.ego_motion.start_verified = True
+        return result
+
+    def _forget_map(self) -> None:
+        """Reset the state learnt from the frames of a map that ends."""
+        self.color_calibration.interrupt()
         for remembered in (self.monitor, self.detector, self.predictor.ego_motion, self.redundancy):
             remembered.reset()
         self.relocalizer.found()
-        return self._start_map(view)
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         self.front_end.update(view, estimate)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.dynamics.dominant_motion import (
+    AGREED,
     DominantMotion,
     dominant_motion,
     exceeds_noise_share,
@@ -66,6 +67,23 @@ class TrackedImage:
 
 
 @dataclass(frozen=True, eq=False)
+class Restart:
+    """New start of a young map whose camera has followed a crowd.
+
+    Attributes:
+        T_world_camera: (4, 4) pose of the frame that starts the map again.
+        moving: (h, w) bool, its moving pixels, label resolution.
+        stamps: (n,) times of earlier images, seconds.
+        corrections: (n, 4, 4) corrections of their poses.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    moving: NDArray[np.bool_]
+    stamps: NDArray[np.float64]
+    corrections: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class SlowMotion:
     """Motion between an older image and a new one that is too slow between consecutive images.
 
@@ -92,6 +110,7 @@ class EgoMotionSegmenter(Stateful):
     Attributes:
         active: Whether to compare the next frame with the last one.
         last: The last tracked frame.
+        start_verified: Whether the poses since the start are known not to follow a crowd.
     """
 
     active: Remembered[bool] = False
@@ -100,18 +119,22 @@ class EgoMotionSegmenter(Stateful):
     _started: Remembered[float]
     last: Remembered[TrackedImage | None] = None
     _older: Remembered[deque[TrackedImage]]
+    _since_start: Remembered[list[TrackedImage]]
+    start_verified: Remembered[bool] = False
     _compared: Remembered[tuple[float, DominantMotion | None] | None] = None  # time and result of the last comparison
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._young_until = self._latest_end = self._started = -np.inf
-        self._older = deque()
+        self._older, self._since_start = deque(), []
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._young_until, self._latest_end = timestamp + self.seconds, timestamp + 2 * self.seconds
         self._started = timestamp
         self._older.clear()
+        self._since_start.clear()
+        self.start_verified = False
 
     @property
     def started(self) -> bool:
@@ -134,10 +157,14 @@ class EgoMotionSegmenter(Stateful):
         young = self.map_is_young(frame.timestamp)
         hidden = frame.moving is not None and is_majority_dynamic(frame.moving, frame.pyramid.labelled)
         self.active = young or (hidden and self.seconds > 0 and self.started)
+        if not young:
+            self._since_start.clear()
         if not young and not (self.active and self._older):  # a crowd since the first second may be a slow one
             self._older.clear()
         elif not self._older or frame.timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
             self._older.append(replace(frame))
+            if young:
+                self._since_start.append(replace(frame))
 
     def reset(self) -> None:
         """Drop the last frame, so that nothing is compared before the next ``update``."""
@@ -163,6 +190,36 @@ class EgoMotionSegmenter(Stateful):
             ):
                 self._young_until = min(now.timestamp + self.seconds, self._latest_end)
         return self._compared[1]
+
+    def restart(self, now: TrackedImage, crowd: NDArray[np.bool_], same_pose: tuple[float, float]) -> Restart | None:
+        """New start of the young map, now that most of the view is known to move.
+
+        Backwards in time, each earlier image is registered by its corners to the next one, without the moving pixels.
+        None if every pose stays within ``same_pose``, or if a motion is not found.
+
+        Args:
+            now: The image, at its pose relative to the last one.
+            crowd: (h, w) bool, its moving pixels.
+            same_pose: Largest distance (m) and angle (deg) of equal poses.
+        """
+        if self.start_verified:
+            return None
+        images, corrections, later = self._since_start[::-1], [np.eye(4)], replace(now, moving=crowd)
+        for image in images:
+            image = replace(image, T_world_camera=corrections[-1] @ image.T_world_camera)
+            motion = later.motion_to(image, np.inf)
+            if motion is None or motion.share < AGREED:
+                return None
+            T = later.T_world_camera @ se3.inverse(motion.T_after_before)
+            corrections.append(T @ se3.inverse(image.T_world_camera) @ corrections[-1])
+            later = replace(image, T_world_camera=T, moving=~motion.static_after)
+        self.start_verified = True
+        moved = zip(images, corrections[1:], strict=True)
+        if all(se3.agree(T @ image.T_world_camera, image.T_world_camera, *same_pose) for image, T in moved):
+            return None
+        T_world = se3.inverse(corrections[-1])  # the first camera keeps its pose
+        stamps = np.array([image.timestamp for image in self._since_start])
+        return Restart(T_world @ now.T_world_camera, crowd, stamps, T_world @ np.stack(corrections[:0:-1]))
 
     def slow_motion(self, now: TrackedImage) -> SlowMotion | None:
         """Comparison with the oldest suitable image; None without one or without a common motion.

@@ -19,7 +19,7 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, SAME_POSE, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor, Verdict
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 
@@ -28,8 +28,6 @@ NO_CHANCE = 3
 UNCHANGED_SHARE = 0.02
 """Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
 on at the finest level alone."""
-SAME_POSE = 0.01, 0.25
-"""Initial poses nearer to each other than this (reference depths, deg) lead to the same registration."""
 
 
 class FrontEnd(Stateful):

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, DominantMotion, exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, SlowMotion
+from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, ImagePose, Restart, SlowMotion
 from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
-from dudmap.core.map.volume import FREE, SURFACE, UNKNOWN, TsdfVolume
+from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.motion_model import MotionModel
@@ -19,6 +19,8 @@ from dudmap.core.tracking.tracker import Tracker
 
 CLEARLY_BETTER = 0.95
 """A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
+SAME_POSE = 0.01, 0.25
+"""Poses nearer to each other than this (reference depths, deg) count as equal: registrations from them agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,7 @@ class PosePrediction:
         slow: (h, w) bool, the part of ``moving`` found with an older image; None without comparison.
         moving_before: (h, w) bool, moving pixels of the map's first image if that is compared; else None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
-        crowd_in_map: (h, w) bool, ``moving`` if it is most of the view and part of the map, so that the camera has
-            followed it; else None.
+        restart: New start of a young map whose camera has followed a crowd; else None.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -44,7 +45,7 @@ class PosePrediction:
     slow: NDArray[np.bool_] | None = None
     moving_before: NDArray[np.bool_] | None = None
     unverified_mask: NDArray[np.bool_] | None = None
-    crowd_in_map: NDArray[np.bool_] | None = None
+    restart: Restart | None = None
 
 
 class PosePredictor(Stateful):
@@ -75,6 +76,7 @@ class PosePredictor(Stateful):
         self.tracker = tracker
         self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.enabled else 0.0)
         self._known_poses = known_poses
+        self.same_pose = SAME_POSE[0] * config.sensor.reference_depth, SAME_POSE[1]
 
     def start(self, view: FrameView) -> None:
         """Begin with the first frame of a map."""
@@ -147,17 +149,17 @@ class PosePredictor(Stateful):
             if slow is not None:
                 moving, moving_before = moving | slow.moving, slow.moving_first
             young = self.ego_motion.map_is_young(timestamp)
-            unverified, lasts = self._watch_crowd(view, motion, slow, moving, was_moving=was_moving)
-            occupancy = None if unverified is None and young else _occupancy(volume, view.labelled, T_image)
-            mapped = lasts and unverified is not None and moving_before is None and not known
-            mapped = mapped and is_majority_dynamic(moving & (occupancy == SURFACE), view.labelled)
-            crowd_in_map = moving if mapped else None
+            unverified = self._watch_crowd(view, motion, slow, moving, was_moving=was_moving)
+            restart = None
+            if young and unverified is not None and not known:
+                crowd = unverified if self.mostly_slow else moving
+                restart = self.ego_motion.restart(view.tracked_at(T_image), crowd, self.same_pose)
             if not young:  # a known map labels better than two images
-                moving = moving & (occupancy == UNKNOWN)
+                moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
         slowly = None if slow is None else slow.moving
         return replace(
             by_velocity, T_world_camera=T_image, moving=moving, slow=slowly, moving_before=moving_before,
-            unverified_mask=unverified, crowd_in_map=crowd_in_map,
+            unverified_mask=unverified, restart=restart,
         )  # fmt: skip
 
     def _watch_crowd(
@@ -168,7 +170,7 @@ class PosePredictor(Stateful):
         moving: NDArray[np.bool_],
         *,
         was_moving: bool,
-    ) -> tuple[NDArray[np.bool_] | None, bool]:
+    ) -> NDArray[np.bool_] | None:
         """Record whether most of the view moves, by the pixels ``moving`` (h, w) bool, and whether slowly.
 
         A single comparison of two images may be wrong. A fast crowd is therefore accepted in its second frame
@@ -184,8 +186,8 @@ class PosePredictor(Stateful):
         lasts = self._dynamic_start or (was_moving and self._mostly_moving)
         if slow is not None and is_majority_dynamic(slow.moving, view.labelled):
             self.mostly_slow = True
-            return ~slow.static, lasts
-        return ~motion.static_after | moving if young and lasts else None, lasts
+            return ~slow.static
+        return ~motion.static_after | moving if young and lasts else None
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image for the next comparison: a frame with an accepted pose."""
