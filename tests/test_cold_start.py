@@ -30,10 +30,7 @@ faults = SensorFaults(color_delay=0.02, color_distortion=(0.1, -0.1, 0.0, 0.0))
 recording = synthetic.sequence(frames=100, camera=camera, camera_path="handheld", faults=faults)
 run(recording, Config().override(["volume.voxel_size=0.02"]), sys.argv[1], calibrate=True, progress=False)
 """
-INTEGERS = {
-    "_cell", "_corner_words", "_voxel", "_yield_core", "announce", "block_at", "done", "finish", "inside_window",
-    "load_corners", "place_of", "take", "wait_for_all", "wait_for_work",
-}  # fmt: skip
+INTEGERS = {"_corner_words", "_voxel", "inside_window", "load_corners"}
 """Kernels whose arithmetic has no roundings: on integers, or by powers of two."""
 
 

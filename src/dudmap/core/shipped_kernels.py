@@ -16,6 +16,7 @@ from typing import Any
 
 import llvmlite
 import numba
+import numpy as np
 from llvmlite.binding import get_host_cpu_features
 from numba.core import config
 from numba.core.compiler import CompileResult
@@ -37,7 +38,7 @@ LEVELS = {
 """Instructions of each level of the x86-64 ABI, in LLVM's words, the highest level first."""
 VERSIONS = (
     f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
-    f"-numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
+    f"-numba-{numba.__version__}-llvmlite-{llvmlite.__version__}-numpy-{np.lib.NumpyVersion(np.__version__).major}"
 )
 """Name of the folder of the kernels that this interpreter can load."""
 _settings: Any = config

@@ -6,13 +6,13 @@ a block that becomes free space keeps its entry and releases its voxels.
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 
 EMPTY = -1
 """Content of a free cell of the table."""
 
 
-@kernel
+@scalar
 def _cell(x, y, z, size):
     """First cell of block (x, y, z): the thesis' hash, mixed by Knuth's multiplicative method and scaled to the
     table.
@@ -21,7 +21,7 @@ def _cell(x, y, z, size):
     return (((mixed >> 32) & 0xFFFFFFFF) * size) >> 32
 
 
-@kernel
+@scalar
 def place_of(table, coords, x, y, z):
     """Cell of the table that holds the entry of block (x, y, z), or the free cell for it."""
     cell = _cell(x, y, z, table.size)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.neighbors import load_corners
-from dudmap.core.backends.threads import kernel, scalar, written_out
+from dudmap.core.backends.threads import scalar, written_out
 from dudmap.core.formulas.residual import trilinear
 from dudmap.core.formulas.voxel import sdf_steps
 
@@ -25,7 +25,7 @@ class FinerLevels(NamedTuple):
     colors: tuple[NDArray[np.int32], ...] = ()
 
 
-@kernel
+@scalar
 def block_at(window, shape, children, level, i, j, k):
     """Slot of the block of a level that holds voxel (i, j, k) of that level's lattice; negative = none."""
     bits = level + 3
@@ -53,7 +53,7 @@ def load(window, shape, children, voxels, level, x, y, z, corners):
     if level == 0:
         i, j, k = np.int64(lx), np.int64(ly), np.int64(lz)
         cell, voxel = ((i >> 3) * shape[1] + (j >> 3)) * shape[2] + (k >> 3), ((i & 7) * 8 + (j & 7)) * 8 + (k & 7)
-        load_corners(window, voxels[0], cell, voxel, shape[1], shape[2], corners, 0)
+        load_corners(window, voxels[0], cell, voxel, shape[1], shape[2], corners, np.uintp(0))
         return x - lx, y - ly, z - lz
     for m in range(8):
         i, j, k = np.int64(lx) + (m >> 2), np.int64(ly) + ((m >> 1) & 1), np.int64(lz) + (m & 1)

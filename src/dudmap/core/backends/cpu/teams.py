@@ -12,7 +12,7 @@ from numba import njit
 from numba.core import types
 from numba.extending import intrinsic
 
-from dudmap.core.backends.threads import also_in_other_threads, kernel, num_threads, scalar
+from dudmap.core.backends.threads import also_in_other_threads, num_threads, scalar
 
 TICKET, DONE = 0, 8
 """Places, on two cache lines, of the next ticket (step << 32 | band) and of the number of finished bands."""
@@ -27,7 +27,7 @@ if sys.platform == "win32":
 else:
     _sched_yield = types.ExternalFunction("sched_yield", types.intc())
 
-    @kernel
+    @scalar
     def _yield_core():
         _sched_yield()
 
@@ -66,14 +66,14 @@ def _store(typing_context, array, index, value):
     return types.void(array, types.intp, types.int64), generate
 
 
-@kernel
+@scalar
 def announce(team, step):
     """Leader: offer the bands of the next step to all threads."""
     _store(team, DONE, 0)
     _store(team, TICKET, step << 32)
 
 
-@kernel
+@scalar
 def take(team, num_bands):
     """The next band of the current step, or ``NO_BAND``, and the number of the step; ``FINISHED`` after the last."""
     ticket = _load(team, TICKET)
@@ -88,20 +88,20 @@ def take(team, num_bands):
     return (band if band < num_bands else NO_BAND), ticket >> 32
 
 
-@kernel
+@scalar
 def done(team):
     """Count one finished band."""
     _add(team, DONE, 1)
 
 
-@kernel
+@scalar
 def wait_for_all(team, num_bands):
     """Leader: wait until all bands of the step are done."""
     while _load(team, DONE) < num_bands:
         _yield_core()
 
 
-@kernel
+@scalar
 def wait_for_work(team, num_bands):
     """Other threads: the next band and its step; ``NO_BAND`` if no work is left."""
     for _ in range(PATIENCE):
@@ -121,7 +121,7 @@ def first_band(leads, team, step, num_bands):
     return wait_for_work(team, num_bands)
 
 
-@kernel
+@scalar
 def finish(team):
     """Leader: announce that no further step follows."""
     _store(team, TICKET, FINISHED)
