@@ -30,7 +30,7 @@ faults = SensorFaults(color_delay=0.02, color_distortion=(0.1, -0.1, 0.0, 0.0))
 recording = synthetic.sequence(frames=100, camera=camera, camera_path="handheld", faults=faults)
 run(recording, Config().override(["volume.voxel_size=0.02"]), sys.argv[1], calibrate=True, progress=False)
 """
-INTEGERS = {"_corner_words", "_voxel", "inside_window", "load_corners"}
+INTEGERS = {"_voxel", "inside_window", "load_corners"}
 """Kernels whose arithmetic has no roundings: on integers, or by powers of two."""
 
 

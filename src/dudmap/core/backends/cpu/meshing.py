@@ -21,21 +21,21 @@ BAND = 256
 """Blocks of one band."""
 
 
-@kernel
+@scalar
 def _corner_words(geometry, near, row, words):
-    """Words (9, 9, 9) of a block's voxels and of the voxels one step beyond its upper sides; 0 without a block."""
+    """Words (9, 9, 9) of a block's voxels and of the voxels one step beyond its upper sides; 0 without a block.
+
+    Element by element: the assignment of an array compiles for seconds.
+    """
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
         slot = near[row, 13 + 9 * dx + 3 * dy + dz]
         nx, ny, nz = (1 if dx else 8), (1 if dy else 8), (1 if dz else 8)
         for i in range(nx):
             for j in range(ny):
-                target = words[8 * dx + i, 8 * dy + j, 8 * dz : 8 * dz + nz]
-                if slot < 0:
-                    target[:] = 0
-                else:
-                    first = (i * 8 + j) * 8
-                    target[:] = geometry[slot, first : first + nz]
+                for k in range(nz):
+                    word = geometry[slot, np.uintp((i * 8 + j) * 8 + k)] if slot >= 0 else np.int32(0)
+                    words[np.uintp(8 * dx + i), np.uintp(8 * dy + j), np.uintp(8 * dz + k)] = word
 
 
 @kernel
