@@ -373,5 +373,5 @@ def test_the_map_has_an_end_and_says_so():
         volume.integrate(wall(1.5), edge)
     assert volume.extract_mesh().vertices[:, 0].min() > 52_000
     edge[0, 3] += 4.0
-    with pytest.raises(MapError, match="52429 m from where the map began"):
+    with pytest.raises(MapError, match="52429 m from the origin of the map"):
         volume.integrate(wall(1.5), edge)

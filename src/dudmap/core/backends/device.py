@@ -46,7 +46,7 @@ def make_backend(device: str) -> Backend:
     if name == "cpu":
         return CpuBackend()
     if failure := start_failure(name):
-        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or correct this")
+        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or fix this")
     from dudmap.core.backends.warp.backend import WarpBackend
 
     return WarpBackend(name)
@@ -86,7 +86,7 @@ def _resolved(device: str) -> str:
         raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
     _need_warp(device)
     if found:
-        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or correct this")
+        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or fix this")
     number = int(device.partition(":")[2] or supported_gpus()[0])
     if number not in supported_gpus():
         known = ", ".join(f"cuda:{n}" for n in supported_gpus())
@@ -98,7 +98,7 @@ def _first_that_starts() -> str:
     """The first GPU, or with a warning the CPU if the GPU does not work."""
     name = f"cuda:{supported_gpus()[0]}"
     if failure := start_failure(name):
-        warnings.warn(f"{name} cannot be used ({failure}); the CPU is", DeviceWarning, stacklevel=5)
+        warnings.warn(f"{name} cannot be used ({failure}); the CPU is used", DeviceWarning, stacklevel=5)
         return "cpu"
     return name
 
@@ -119,8 +119,8 @@ def obstacle() -> str:
         return failure
     if not supported_gpus():
         return (
-            f"Warp finds no GPU that it supports: one of compute capability {OLDEST_GPU / 10} or later, whose driver "
-            "starts (nvidia-smi)"
+            f"Warp finds no GPU that it supports; expected compute capability {OLDEST_GPU / 10} or later and a working "
+            "driver (check with nvidia-smi)"
         )
     return ""
 

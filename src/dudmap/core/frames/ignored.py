@@ -55,7 +55,7 @@ class IgnoredRegion:
                 depth = _showing(mask, places, camera.shape)
         if depth.all() or color.all():
             raise ConfigError(
-                "the mask of ignored pixels covers the whole image; expected white where pixels never count"
+                "the mask of ignored pixels covers the whole image; expected white only at pixels that never count"
             )
         return cls(depth.copy(), color, _nearest(color))
 

@@ -129,9 +129,9 @@ class StreamCheck(Stateful):
             return Rejection("order", f"the frame was taken {-step:.3f} s before the last one that was used")
         if len(self._intervals) >= AGREEING and step < BURST_SHARE * self._usual_interval:
             usual = 1000 * self._usual_interval
-            return Rejection("burst", f"the frame is {1000 * step:.1f} ms after the last, {usual:.0f} are usual")
+            return Rejection("burst", f"the frame is {1000 * step:.1f} ms after the last; expected {usual:.0f} ms")
         if step > FURTHEST_STEP:
-            return Rejection("clock", f"the frame is {step:.0f} s after the last, which others must confirm")
+            return Rejection("clock", f"the frame is {step:.0f} s after the last; later frames must confirm this step")
         return None
 
     @property
@@ -153,7 +153,7 @@ class StreamCheck(Stateful):
         if abs(self._unit) < np.log(SMALLEST_FACTOR):
             self._unit = 0.0
             return None
-        return Rejection("unit", f"all depths changed by the factor {np.exp(self._unit):.3g} at once: another unit")
+        return Rejection("unit", f"the depth unit changed: all depths changed by the factor {np.exp(self._unit):.3g}")
 
 
 def repeated(before: Images, after: Images) -> Repeats:

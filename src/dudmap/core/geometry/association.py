@@ -169,8 +169,8 @@ def check_increasing(path: Path, numbers: list[int], stamps: list[float]) -> Non
         k = int(wrong[0])
         raise DatasetError(
             f"{path}, line {numbers[k + 1]}: the timestamp {stamps[k + 1]:.6f} comes after {stamps[k]:.6f}; "
-            "timestamps must increase: sort the list and remove doubles, or, where these are no times and the images "
-            "are numbered in their order, move the list away and give --fps"
+            "timestamps must increase: sort the list and remove duplicates. If they are not times and the images are "
+            "numbered in their order, remove the list and give --fps"
         )
 
 

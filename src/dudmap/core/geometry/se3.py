@@ -263,6 +263,6 @@ def checked_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
         raise FrameError(f"the given pose has the shape {T.shape}; expected (4, 4) finite numbers, camera to world")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > LARGEST_SKEW or np.linalg.det(R) < 0 or np.any(T[3] != (0, 0, 0, 1)):
-        raise FrameError("the given pose is no rigid motion; expected a rotation and metres, camera to world")
+        raise FrameError("the given pose is not a rigid motion; expected a rotation and metres, camera to world")
     T[:3, :3] = nearest_rotation(R)
     return T

@@ -43,7 +43,7 @@ class Trajectory:
         if not np.all(np.isfinite(self.timestamps)) or not np.all(np.isfinite(self.Ts_world_camera)):
             raise DatasetError("trajectory holds NaN or infinite numbers; remove those rows")
         if np.any(np.diff(self.timestamps) <= 0):
-            raise DatasetError("trajectory timestamps are not strictly increasing; sort the rows and remove doubles")
+            raise DatasetError("trajectory timestamps are not strictly increasing; sort the rows and remove duplicates")
 
     def __len__(self) -> int:
         return len(self.timestamps)

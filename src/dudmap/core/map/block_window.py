@@ -78,7 +78,7 @@ class BlockWindow(Stateful):
         near = self.near
         self.fill(self.origin, blocks)
         if not np.array_equal(np.sort(near), self.near):
-            raise ValueError("the blocks around the camera are not those of the map")
+            raise ValueError("the stored window does not match the blocks of the map")
         self.near = near
 
     @property
@@ -135,8 +135,8 @@ class BlockWindow(Stateful):
         if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
             farthest = MAX_COORDINATE * self.block_size
             raise MapError(
-                f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
-                f"{self.block_size / BLOCK} m it cannot be larger: set volume.voxel_size to a larger value"
+                f"a depth measurement lies more than {farthest:.0f} m from the origin of the map, the limit for voxels "
+                f"of {self.block_size / BLOCK} m; set volume.voxel_size to a larger value"
             )
         unknown = int(np.count_nonzero(self.cells[cells] == -1))
         return blocks.entries_at(coords.astype(np.int32), unknown)

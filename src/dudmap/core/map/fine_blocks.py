@@ -52,7 +52,7 @@ class FineBlocks(Stateful):
         """Restore a stored level; the caller then links it (``link``)."""
         blocks, (geometry, colors) = self.blocks, state["voxels"]
         if not len(state["calm"]) == len(geometry) == len(colors) == blocks.num_slots:
-            raise ValueError("blocks with smaller voxels lack some of them")
+            raise ValueError("the arrays of the finer blocks have different lengths")
         blocks.write(np.arange(blocks.num_slots), geometry, colors)
         self.calm = grown(state["calm"], len(blocks.entry_of), 0)
 

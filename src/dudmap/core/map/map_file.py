@@ -111,7 +111,7 @@ def read_map(path: str | Path) -> "TsdfVolume":
     for number, level in enumerate(volume.levels[: len(finer)]):
         level.blocks = finer[number]
         if not np.all(level.link(volume.all_blocks.parents[number])):  # the parents were just read
-            raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
+            raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m have no parent block")
     for level, parents in zip(volume.levels, volume.all_blocks.parents, strict=True):
         level.make_room(parents)
     return volume

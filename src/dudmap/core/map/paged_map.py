@@ -39,7 +39,7 @@ class PagedMap(Stateful):
         parents = self.blocks
         for level in self.levels:
             if not np.all(level.link(parents)):
-                raise ValueError("blocks with smaller voxels lie in no larger block")
+                raise ValueError("blocks with smaller voxels have no parent block")
             parents = level.blocks
         self.window.refill(self.blocks)
 

@@ -139,7 +139,7 @@ class TsdfVolume(PagedMap):
         if not cells <= MAX_WINDOW:  # also if a field of view of almost 180 degrees makes it infinite
             longest = extent * (MAX_WINDOW - 8) / cells
             raise MapError(
-                f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
+                f"voxels of {self.voxel_size} m with depth up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
         self._window_cells = int(cells)

@@ -353,11 +353,11 @@ def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geom
         if array.dtype != kind or array.shape != shape:
             raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {np.dtype(kind)} {shape}")
     if m and not (0 <= entries.min() and entries.max() < n and len(np.unique(entries)) == m):
-        raise ValueError("the voxels of a block belong to no block, or two to one")
+        raise ValueError("a slot of voxels has no block, or two slots have the same block")
     if n and np.abs(coords.astype(np.int64)).max() > MAX_COORDINATE - 1:
-        raise ValueError("a block lies farther away than block coordinates reach")
+        raise ValueError("a block coordinate is out of range")
     if len(np.unique(coords, axis=0)) != n:
-        raise ValueError("a block is there twice")
+        raise ValueError("a block occurs twice")
 
 
 def _row_bytes(array: NDArray) -> int:

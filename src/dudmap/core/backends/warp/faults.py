@@ -33,7 +33,7 @@ def using(device: str) -> Iterator[None]:
     """
     with _locks.setdefault(device, threading.RLock()):
         if device in _lost:
-            raise DeviceError(f"{device} has failed before in this process; begin anew, or take --device cpu")
+            raise DeviceError(f"{device} has failed before in this process; restart the program, or take --device cpu")
         try:
             yield
         except Exception as error:
