@@ -5,8 +5,8 @@ A voxel is two int32 words:
 - colour: red << 20 | green << 10 | blue, each in quarters of a grey level.
 
 A pixel is two int32 words:
-- depth << 16 | free depth, both uint16 in steps of ``depth_unit``; the free depth is the depth up to which the pixel
-  certainly sees free space;
+- depth << 16 | free depth, both uint16 in steps of ``depth_unit``; the pixel certainly sees free space up to the free
+  depth;
 - red << 24 | green << 16 | blue << 8 | weight.
 """
 

@@ -36,10 +36,10 @@ def make_volume(
 
 
 class AdaptiveVolume(TsdfVolume):
-    """A map with smaller voxels where the surface has detail (curvature or texture) that the sensor resolves.
+    """A map with smaller voxels at surface detail (curvature or texture) that the sensor resolves.
 
-    Registration and labels read the coarsest level, so that poses and masks equal those of a map with one voxel size.
-    Mesh and views read the finest level. See ``docs/adaptive.md``.
+    Registration and labels read the coarsest level, so that several voxel sizes change no pose and no mask. Mesh
+    and views read the finest level. See ``docs/adaptive.md``.
 
     ``levels`` are the finer levels, larger voxels first.
     """

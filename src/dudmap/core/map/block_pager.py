@@ -1,4 +1,4 @@
-"""Paging: moves blocks far from the view to a store on disk and back before they are in view.
+"""Paging of blocks far from the view: to a store on disk, and back before they are in view.
 
 Blocks move in regions, cubes of 16x16x16 blocks (Niessner et al. 2013, section 5).
 """

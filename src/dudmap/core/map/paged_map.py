@@ -130,7 +130,7 @@ class PagedMap(Stateful):
             yield self.all_blocks.records(self.blocks.entries_in(first, first + REGION))
 
     def take_colors(self, other: "PagedMap") -> None:
-        """Replace colours and intensities by those of another map of the same world; distances and weights stay.
+        """Replace colours and intensities from another map of the same world; distances and weights stay.
 
         A voxel without colour in the other map loses its colour, and takes the colour of the next measurement near the
         surface.

@@ -124,7 +124,6 @@ def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tol
     """Noise of the pixels of an image, and the mixture of their residuals.
 
     Args:
-        depth: (h, w) float32, metres, 0 = none.
         distance, occupancy: (h, w) of the map at the points of the image, see ``MapSample``.
         noise: NoiseParameters, all float32.
         rules: MixtureRules.

@@ -49,7 +49,6 @@ def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
     ``max(noise_floor, noise z^2) + slope z``, which no measurable surface has.
 
     Args:
-        depth: (H, W) float32, metres, 0 = none.
         noise, noise_floor: Tolerance, 1/m and metres.
         slope: Step per pixel of the steepest measurable surface, as a share of the depth.
         out: (H, W) float32 out.
@@ -107,7 +106,6 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     are longer in both directions.
 
     Args:
-        depth: (H, W) float32, metres, 0 = none.
         slope: Largest depth range over squared depth, 1/m.
         noise_floor: Largest depth range near the camera, metres.
         out: (H, W) float32 out.

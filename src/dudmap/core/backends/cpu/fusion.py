@@ -56,7 +56,6 @@ def touch(
         used: (H, W) bool, pixels to fuse.
         given: Whether ``weights`` is input; otherwise it is computed.
         T_blocks_camera: (3, 4) float32, camera to window blocks.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
         shape, window, free_count, free_after, frame_number, stamps: As for ``mark_blocks``.
         p: FusionParameters.
         depth: (H, W) float32 out, the used depths.

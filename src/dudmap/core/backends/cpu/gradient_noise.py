@@ -22,10 +22,8 @@ def noise_sums(
 
     Args:
         stride: Pixels.
-        depth: (h, w) float32, metres, 0 = none.
         residuals: (h, w) float32 distances and (h, w) float32 intensity differences, NaN off the map.
         weights: (h, w) float32 static weights.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
         parameters: RegistrationParameters.
         filter_px: Standard deviation of the depth filter, pixels of this image.
         scale_px: Pixels of this image per pixel of the images fused into the map.

@@ -34,7 +34,6 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
     The free depth of a pixel is the nearest depth of its 3x3 neighbourhood minus the truncation band there.
 
     Args:
-        depth: (H, W) float32, metres, 0 = none.
         rgb: (H, W, 3) uint8.
         weights: (H, W) uint8, weight of each pixel.
         parameters: FusionParameters.
@@ -76,8 +75,6 @@ def integrate_blocks(
         repeats: (n,) float32, number of frames that this frame stands for.
         coords: (num_slots, 3) int32 relative to the origin of T.
         T: (3, 4) float32, world to camera.
-        intrinsics: (4,) float32.
-        size: (2,) int64 image height and width.
         pixels: (2 * (H * W + 1),) int32, the words of ``pack_pixels``.
         map_geometry, map_colors: (num_slots * 512,) int32, packed.
         parameters: FusionParameters.
@@ -177,8 +174,6 @@ def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out
     depth.
 
     Args:
-        depth: (H, W) float32, metres, 0 = none.
-        intrinsics: (4,) float32.
         noise: SensorNoise, whose sigma(z) is err(z).
         best: Weight at normal incidence and the reference depth.
         out: (H, W) uint8 out, at least 1 for pixels with depth.

@@ -136,7 +136,6 @@ def grow_regions(seeds, open_pixels, depth, tolerance):
     Args:
         seeds: (h, w) bool.
         open_pixels: (h, w) bool, pixels that a region may grow into.
-        depth: (h, w) float32, metres, 0 = none.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
 
     Returns:
@@ -184,7 +183,6 @@ def mean_field(evidence, depth, tolerance, coupling, iterations):
 
     Args:
         evidence: (h, w) float32 log odds static : dynamic of each pixel alone, at most 6; 0 = unknown.
-        depth: (h, w) float32, metres, 0 = none.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
         coupling: Log odds that all neighbours together can add, at most 4.
         iterations: Sweeps.

@@ -30,8 +30,6 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
         start, stop: First and last plane of the window.
         window: (Wx, Wy, Wz) int32.
         T: (3, 4) float32, block indices of the window to metres in the camera frame; block centres at whole numbers.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
-        size: (2,) int64 image height and width.
         radius: Radius of the sphere around a block, metres.
         depth_min, depth_max: Limits of the view, metres.
         near, far: (tiles down, tiles across) float32, in and out.

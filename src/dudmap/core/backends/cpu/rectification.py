@@ -55,8 +55,6 @@ def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, wo
 
     Args:
         rows: Rows of a band.
-        depth: (H, W) float32, metres, 0 = none.
-        intrinsics: (4,) float32.
         projection: ColorProjection of the depth camera into itself, with identity ``place``.
         fallback: Float32, depth of rows without any depth, metres.
         size: H, H, W.

@@ -146,7 +146,6 @@ def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewe
     """Displacement between two images, and number of pixels with equal depth.
 
     Args:
-        depth, intensity: (h, w) float32; depth in metres, 0 = none.
         moving: (h, w) bool, pixels that move.
         gap, difference, marks: Differences to the older image, see ``Reprojection``; marks are its moving pixels.
         noise: NoiseParameters, all float32.

@@ -29,8 +29,6 @@ def mark_blocks(
 
     Args:
         row_start, row_stop, stride: Rows of the band, and the step between pixels.
-        depth: (H, W) float32, metres, 0 = none.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
         T: (3, 4) float32, camera to window blocks: block units, origin at the window's first block.
         shape, window, free_count: See ``VoxelGrid``.
         free_after: Observations that make a block known free space.
@@ -38,7 +36,6 @@ def mark_blocks(
         stamps: (cells,) int32, number of the last frame that found each cell; changed here. Two bands may both find
             one.
         band: TruncationBand.
-        block_size: Edge of a block, metres.
         found: (n,) int32 out.
 
     Returns:
@@ -90,7 +87,6 @@ def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
     """Depth range and share of pixels with depth, per tile of the depth image.
 
     Args:
-        depth: (H, W) float32.
         nearest, farthest, valid: Out, see ``DepthTiles``.
     """
     h, w = depth.shape
@@ -133,9 +129,6 @@ def visible_slots(
         fused: (num_slots,) uint8 frames that were fused into a slot.
         turn: Number of this frame; negative = all blocks are updated in every frame.
         T: (3, 4) float32, world to camera.
-        intrinsics: (4,) float32.
-        size: (2,) int64 image height and width.
-        block_size: Edge of a block, metres.
         farthest: See ``DepthTiles``.
         band: TruncationBand.
         depth_min, depth_max: Depth range, metres.
@@ -198,9 +191,6 @@ def observe_free(
         x_start, x_stop, x_step: Window planes of this call.
         window, shape, origin: See ``VoxelGrid``.
         T: (3, 4) float32, world to camera.
-        intrinsics: (4,) float32.
-        size: (2,) int64 image height and width.
-        block_size: Edge of a block, metres.
         nearest, valid: See ``DepthTiles``.
         band: TruncationBand.
         depth_max: Largest depth, metres.
