@@ -1,6 +1,6 @@
-"""Changes of Numba that shorten its compilations, for all code of the process; made when the first kernel is compiled.
+"""Changes to Numba that speed up its compilations, for all code of the process; made before the first compilation.
 
-Together they save a quarter of the time of a compilation. A process that loads all its kernels changes nothing.
+Together they save a quarter of the compilation time. A process that loads all its kernels changes nothing.
 """
 
 import gc
@@ -14,16 +14,16 @@ from numba.core.targetconfig import ConfigStack, TargetConfig
 
 @cache
 def change_numba() -> None:
-    """Make the changes, unless they are made."""
+    """Make the changes once."""
     event.register("numba:compile", _Uncollected())  # sent under the lock of the compiler
-    if version_info.short == (0, 68):  # whose private parts these are; others compile as they do
+    if version_info.short == (0, 68):  # these are its private parts; other versions compile unchanged
         _optimize_callers()
         _compare_flags_at_once()
 
 
 class _Uncollected(event.Listener):
-    """Suspends the collection of garbage while a kernel is compiled: of the objects that a compilation makes nearly all
-    live until its end, and to look through them again and again takes a tenth of the time."""
+    """Suspends garbage collection while a kernel is compiled. Nearly all objects of a compilation live until its end,
+    and scanning them repeatedly takes a tenth of the time."""
 
     def __init__(self) -> None:
         self._nested, self._collects = 0, True
@@ -41,8 +41,8 @@ class _Uncollected(event.Listener):
 
 
 def _optimize_callers() -> None:
-    """Optimise what is always inlined, a ``Scalar``, only as far as inlining asks: all else is done in its callers, and
-    to do it before as well takes a tenth of the time of all compilations."""
+    """Optimise an always inlined function (``Scalar``) only as far as inlining needs, because its callers optimise the
+    rest. Optimising it before takes a tenth of the total compilation time."""
     optimize = CPUCodeLibrary._optimize_final_module
 
     def optimize_less(self: CPUCodeLibrary) -> None:
@@ -59,8 +59,8 @@ def _optimize_callers() -> None:
 
 
 def _compare_flags_at_once() -> None:
-    """Compare the flags of compilations, which is done a hundred thousand times, by those that are set before all, and
-    hash them by their kind: Numba's own hash is that of their names, which all have."""
+    """Compare compilation flags by their set values first, and hash them by their type. There are a hundred thousand
+    comparisons, and Numba's hash uses the names of the flags, which are always equal."""
     compare = TargetConfig.__eq__
     TargetConfig.__hash__ = lambda self: hash(type(self))
     TargetConfig.__eq__ = lambda self, other: (
