@@ -30,23 +30,24 @@ from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
-"""Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
+"""Largest depth difference of two measurements of one point, in units of the noise threshold of distances."""
 MAP_ROUGHNESS = 0.4
 """Standard deviation of the map's surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
-"""Largest depth step to a neighbour of the same surface: standard deviations of a reading, plus a share of the depth
-per pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
+"""Largest depth step to a neighbour of the same surface: standard deviations of a measurement, plus a share of the
+depth per pixel at REFERENCE_WIDTH. The share equals a surface inclined by 69 degrees at a focal length of 131
+pixels."""
 MAX_LOG_ODDS = 6
-"""Log odds static : dynamic of a pixel that is certain: an error probability of 0.25 %."""
+"""Log odds static : dynamic of a certain pixel: an error probability of 0.25 %."""
 COUPLING = 4
-"""Log odds that the eight neighbours together can add to those of a pixel: less than certainty, so that they cannot
-outvote it; the sum of both is the range of the mean field's hyperbolic tangent."""
+"""Largest log odds that the eight neighbours together add to a pixel, below certainty so that they cannot overrule a
+certain pixel. The sum of both limits is the range of the mean field's hyperbolic tangent."""
 SWEEPS = 4
-"""Sweeps of the mean field over the image."""
+"""Number of mean-field sweeps over the image."""
 MAPPED_SHARE = 0.3
-"""Share of what moves in a segment that must lie on the map for the map to decide about the rest, too."""
+"""Smallest share of a segment's moving pixels on the map that lets the map decide about the rest."""
 MIN_REGION = 0.0008
-"""Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
+"""Smallest moving region, as a share of the image: 15 pixels at 160x120."""
 NONE = np.empty((0, 0), dtype=np.bool_)
 """No pixels."""
 
@@ -59,10 +60,10 @@ class _Comparison:
         timestamp: Seconds.
         level: The image.
         T_world_camera: (4, 4).
-        exposure: Gain and offset that make the image's intensities those of the map.
+        exposure: Gain and offset from the image's intensities to the map's.
         sample: The map at the points of the image.
         sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        noise: What the noise of the readings follows from.
+        noise: Parameters of the measurement noise.
     """
 
     timestamp: float
@@ -75,7 +76,7 @@ class _Comparison:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels in space the map knows to be free."""
+        """(h, w) bool, pixels in space that is free in the map."""
         return self.sample.occupancy == FREE
 
 
@@ -84,11 +85,11 @@ class DynamicDetector(Stateful):
 
     Args:
         config: Thresholds and times.
-        sensor: Noise of the depth readings.
+        sensor: Noise of the depth measurements.
 
     Attributes:
         memory: Remembered frames.
-        background: The static background behind pixels without a reading.
+        background: The static background behind pixels without depth.
     """
 
     memory: Remembered[TemporalMemory]
@@ -101,15 +102,15 @@ class DynamicDetector(Stateful):
         self.background = BackgroundModel(config)
 
     def segment(self, levels: Callable[[], Pyramid], voxel_size: float, *, now: bool) -> Callable[[], Segmentation]:
-        """Segments of the surface an image shows; needs no map.
+        """Surface segments of an image; needs no map.
 
         Args:
             levels: Returns the pyramid of the image.
             voxel_size: Edge of the map's voxels, metres.
-            now: Begin to compute them in another thread, where the configuration needs them.
+            now: Start the computation in another thread, if the configuration needs segments.
 
         Returns:
-            A function that waits for the segmentation, or computes it when it is first called.
+            A function that waits for the segmentation, or computes it at the first call.
         """
 
         def compute() -> Segmentation:
@@ -119,13 +120,7 @@ class DynamicDetector(Stateful):
         return cache(submit(compute) if now and self.config.enabled else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
-        """Begin with the first frame of a map, of which no pixel is known to move.
-
-        Args:
-            timestamp: Seconds.
-            level: The image.
-            T_world_camera: (4, 4).
-        """
+        """Begin with the first frame of a map, an image at a pose (4, 4), without known moving pixels."""
         self.memory.start(timestamp)
         self.memory.update(timestamp, level, T_world_camera, np.zeros(level.depth.shape, dtype=bool), None)
 
@@ -144,17 +139,17 @@ class DynamicDetector(Stateful):
         exposure: tuple[float, float] = (1.0, 0.0),
         slow: NDArray[np.bool_] | None = None,
     ) -> Labels:
-        """Labels of a frame that has been registered to a map.
+        """Labels of a frame that is registered to a map.
 
         Args:
             volume: The map.
             level: The image, at the resolution of the labels.
             T_world_camera: (4, 4) pose of the registration.
             timestamp: Seconds.
-            segmentation: Waits for the segments of the image, as ``segment`` returns it.
-            moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
-            exposure: Gain and offset that make the image's intensities those of the map.
-            slow: (h, w) bool, those of them that an older image shows to move; None for none.
+            segmentation: Returns the segments of the image, see ``segment``.
+            moving: (h, w) bool, moving pixels by comparison of images; None without comparison.
+            exposure: Gain and offset from the image's intensities to the map's.
+            slow: (h, w) bool, the part of ``moving`` found with an older image; None for none.
         """
         depth = level.depth
         noise = noise_parameters(self.config, self.sensor, level, volume.voxel_size)
@@ -194,20 +189,15 @@ class DynamicDetector(Stateful):
         exposure: tuple[float, float],
         labels: Labels,
     ) -> None:
-        """Remember a tracked frame, which the next ones are compared with.
+        """Remember a tracked frame (pose (4, 4), timestamp in seconds) for comparison with later frames.
 
-        Args:
-            timestamp: Seconds.
-            level: The image, at the resolution of the labels.
-            T_world_camera: (4, 4).
-            exposure: Gain and offset that make the image's intensities those of the map.
-            labels: Labels of the frame.
+        ``exposure``: gain and offset from the image's intensities to the map's.
         """
         self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.segmentation)
         self.background.update(timestamp, unsaturated(level, exposure), T_world_camera, labels.dynamic)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
-        """Move what is remembered with a correction (4, 4) of the world."""
+        """Move the remembered state with a correction (4, 4) of the world."""
         self.memory.apply_correction(T_new_old)
         self.background.apply_correction(T_new_old)
 
@@ -217,8 +207,10 @@ class DynamicDetector(Stateful):
         self.background.reset()
 
     def _seen_free(self, frame: _Comparison, unknown: float) -> NDArray[np.bool_]:
-        """Pixels (h, w) in space that single frames have seen to be free, of size 0 without such frames; ``unknown``
-        is the share of the readings in space unknown to the map."""
+        """Pixels (h, w) in space that single frames have seen to be free; size 0 if no frames apply.
+
+        ``unknown``: share of the measurements in space unknown to the map.
+        """
         if not (older := self.memory.free_space_frames(frame.timestamp, unknown)):
             return NONE
         gap = np.float32(MAX_GAP) * noise_threshold(self.config, frame.sigma)
@@ -231,8 +223,7 @@ class DynamicDetector(Stateful):
         seeds: NDArray[np.bool_],
         segmentation: Segmentation,
     ) -> tuple[NDArray[np.bool_], Segmentation]:
-        """Dynamic pixels (h, w) decided by segment (``moving_segments``), without those that have settled, and the
-        segments."""
+        """Dynamic pixels (h, w) decided by segment (``moving_segments``) without settled segments, and the segments."""
         level, T_world_camera, sigma = frame.level, frame.T_world_camera, frame.sigma
         before = self.memory.last_dynamic(level, T_world_camera)
         least, (gain, offset) = self.config.noise_threshold / 3, frame.exposure
@@ -248,11 +239,11 @@ class DynamicDetector(Stateful):
     def _stands_on_map(
         self, frame: _Comparison, moving: NDArray[np.bool_], segmentation: Segmentation
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) that images show to move, but whose segment stands where the map has it (``stand_still``).
+        """Moving pixels (h, w) whose segment is static in the map (``stand_still``).
 
-        Corners go astray on silhouettes, in blur and on patterns that repeat. What of the moving part of a segment lies
-        on the map decides for all of it: the rest has come into view. Less than MAPPED_SHARE of it says nothing. Not to
-        be asked about slow motion: the map may be as young as that.
+        Corners are mismatched on silhouettes, in blur and on repetitive patterns. The moving part of a segment that
+        lies on the map decides for the whole segment, because the rest has come into view. A part below MAPPED_SHARE
+        decides nothing. Not applicable to slow motion, because the map may be too young.
         """
         sample, (gain, offset) = frame.sample, frame.exposure
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))
@@ -267,7 +258,7 @@ class DynamicDetector(Stateful):
 
 
 def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
-    """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
+    """Parameters of the measurement noise of an image, for a map with this voxel size, metres."""
     parameters = NoiseParameters(
         sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
         DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas,
@@ -276,13 +267,14 @@ def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level,
 
 
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-    """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
+    """Standard deviation (h, w) of the distance of a static point, metres: measurement and map combined."""
     map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
     return np.asarray(static_sigma.py_func(sensor.sigma(depth), map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
-    """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w) is that of the depth."""
+    """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w): standard deviation of the
+    depth."""
     slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
     return np.asarray(edge_tolerance.py_func(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
 

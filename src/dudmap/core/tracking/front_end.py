@@ -1,4 +1,4 @@
-"""Registration and labelling of a frame, each of which needs the other (thesis algorithm 4)."""
+"""Alternating registration and labelling of a frame (thesis algorithm 4)."""
 
 from dataclasses import replace
 
@@ -24,10 +24,10 @@ from dudmap.core.tracking.quality_monitor import QualityMonitor, Verdict
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 
 NO_CHANCE = 3
-"""Excess of readings that come nearer to the map over those that do not, in standard deviations of chance."""
+"""Significance of an improvement: excess of improved over worsened measurements, in standard deviations of chance."""
 UNCHANGED_SHARE = 0.02
-"""Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
-on at the finest level alone."""
+"""Largest share of changed labels on the map, relative to the previous frame, for registration at the finest level
+alone."""
 
 
 class FrontEnd(Stateful):
@@ -38,7 +38,7 @@ class FrontEnd(Stateful):
         tracker: Registers an image pyramid.
         detector: Labels the pixels of a registered image.
         motion: Velocity of the camera.
-        monitor: Knows the residuals of the previous frames.
+        monitor: Provides the residuals of the previous frames.
         color_motion: Registers the colours of a frame with the camera's motion.
 
     Attributes:
@@ -71,8 +71,8 @@ class FrontEnd(Stateful):
     ) -> tuple[FrameView, PoseEstimate, Verdict]:
         """A frame, its pose and labels, and the outcome of the checks.
 
-        If the checks reject the frame and the light has changed, which differs from place to place, its images say
-        nothing: it is registered and judged once more, by its distances alone, which have to determine all directions.
+        A rejected frame in changed light is registered and judged again by its distances alone, because the change of
+        light differs from place to place. The distances must then determine all directions.
         """
         estimate = self.register(volume, view, prediction)
         verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
@@ -85,18 +85,19 @@ class FrontEnd(Stateful):
         return view, estimate, verdict
 
     def _is_relit(self, view: FrameView) -> bool:
-        """Whether the mean intensity of the image shows another light than in the map."""
+        """Whether the mean intensity of the image shows another light than the map."""
         mean = float(view.pyramid.coarse.intensity.mean())
         return self._brightness is None or not mean / LARGE_GAIN < self._brightness < LARGE_GAIN * mean
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
-        """Pose and labels of a frame, from its predicted pose on.
+        """Pose and labels of a frame, starting at its predicted pose.
 
-        A registration that fits unusually badly, or that did not settle and moved far from its prediction, is repeated
-        from the pose that the ego-motion between the last two images gives, without what does not follow it; the one
-        that fits better is returned. Somebody near who begins to walk has more shape than the floor, which fits the map
-        wherever the camera is: registered as static, he carries the camera along, and only the colours of the floor
-        contradict.
+        The registration is repeated if it fits unusually badly, or did not settle and moved far from the prediction.
+        The second one starts at the pose of the ego-motion between the last two images and excludes the pixels that do
+        not follow it. The better fit is returned.
+
+        The reason is a near person who starts walking. Registered as static, the person drags the camera, because the
+        floor fits the map at any camera position; only its colours contradict.
         """
         if self.motion.is_given:
             return self._at_given(volume, view, prediction)
@@ -122,10 +123,10 @@ class FrontEnd(Stateful):
     def register_from(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_init: NDArray[np.float64]
     ) -> PoseEstimate:
-        """Pose and labels of a frame from one initial pose (4, 4) on.
+        """Pose and labels of a frame from one initial pose (4, 4).
 
-        The coarse levels bring the pose near enough to label the frame; the fine levels are registered with the static
-        weights that follow from the labels.
+        The coarse levels give a pose for labelling; the fine levels are registered with the static weights of the
+        labels.
         """
         levels, unverified = view.pyramid.tracked, prediction.unverified_mask
         tracker = self.blind_tracker if view.without_image else self.tracker
@@ -163,7 +164,7 @@ class FrontEnd(Stateful):
         return PoseEstimate(tracking, labels, unverified, view)
 
     def _at_given(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
-        """Labels of a frame whose pose is given, which is not registered."""
+        """Labels of a frame with a given pose, which is not registered."""
         coarse, fine = view.pyramid.coarse, view.pyramid.fine
         T_world_camera, unverified = prediction.T_world_camera, prediction.unverified_mask
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
@@ -181,7 +182,7 @@ class FrontEnd(Stateful):
         return PoseEstimate(tracking, labels, unverified)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""
+        """Accept the pose and labels of a frame, and update velocity and detector."""
         tracking, labels = estimate.tracking, estimate.labels
         observed = len(tracking.unobservable) == 0
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
@@ -196,15 +197,15 @@ class FrontEnd(Stateful):
             self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
     def lose(self, timestamp: float) -> None:
-        """A frame was not tracked; after some time what the previous frames showed is no longer used."""
+        """Handle a lost frame; after some time, the state of the previous frames is dropped."""
         self.monitor.lose()
         if self.motion.lost(timestamp):
             self.detector.reset()
             self.last_dynamic = self._brightness = None
 
     def _labels_unchanged(self, labels: Labels) -> bool:
-        """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not
-        be registered again."""
+        """Whether so few labels on the map changed since the previous frame that the coarser level need not be
+        registered again."""
         changed = labels.dynamic if self.last_dynamic is None else labels.dynamic != self.last_dynamic
         on_map = labels.sample.occupancy == SURFACE
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
@@ -212,11 +213,14 @@ class FrontEnd(Stateful):
     def _by_distances(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, found: TrackingResult | Minimum
     ) -> NDArray[np.float64]:
-        """Pose (4, 4) near the one found of both terms at which the distances of the labelled image are smallest.
+        """Pose (4, 4) near the found one with the smallest distances of the labelled image.
 
-        Not while images are compared: a mover of the first frame is part of the young map, and distances follow it. Nor
-        where the farther half of the readings comes no nearer to the map: what is close to the camera weighs most in
-        this minimum, and may be what moves.
+        Returns the input pose in these cases:
+
+        * Images are compared: a moving object of the first frame is part of the young map, and the distances would
+          follow it.
+        * Only the distances determine the found pose, too.
+        * The far half of the measurements does not improve: near surfaces dominate this cost and may be moving.
         """
         level, T_world_camera = view.labelled, found.T_world_camera
         if view.without_image or prediction.moving is not None or self.tracker.config.color_weight == 0:
@@ -240,10 +244,10 @@ class FrontEnd(Stateful):
     def _label(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult | Minimum
     ) -> Labels:
-        """Labels of a registered frame, compared with the map from where it fits its distances best.
+        """Labels of a registered frame, compared with the map at the pose that fits its distances best.
 
-        Colours beside their place bend the pose, and a cupboard's front that lies off the map for it looks like motion:
-        what fits under a pose that the registration cannot tell from its own is static.
+        Misregistered colours bias the pose, so that a static surface lies off the map and resembles motion. Surface
+        that fits at an indistinguishable pose is static.
         """
         with view.timer("label"):
             labels = self.detector.detect(
