@@ -50,21 +50,19 @@ class ThresholdScore(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceResult:
-    """Comparison of an estimated surface with the true one.
+    """Comparison of an estimated surface with the true one. Areas of a point cloud are None.
 
     Attributes:
         accuracy: Distances from the estimate to the reference.
         completeness: Distances from the reference to the estimate.
         scores: Precision, recall and F-score per distance.
-        area_m2: Area of the estimate; None for a point cloud.
-        reference_area_m2: Area of the surface on which completeness is measured; None for a point cloud.
-        ghost_distance: Distance from the reference above which the estimate counts as ghost, metres.
-        ghost_area_m2: Area of the ghosts; None for a point cloud.
+        area_m2, reference_area_m2, ghost_area_m2: Area of the estimate, of the reference for completeness, and of the
+            ghosts.
+        ghost_distance: Distance from the reference beyond which the estimate is a ghost, metres.
         ghost_share: Share of the ghosts in the area of the estimate.
         missing_share: Share of the reference farther than the ghost distance from the estimate.
         histogram_edges: (B + 1,) metres; the last bin also counts everything beyond.
-        accuracy_histogram: (B,) share of the estimate per bin.
-        completeness_histogram: (B,) share of the reference per bin.
+        accuracy_histogram, completeness_histogram: (B,) share of the estimate, and of the reference, per bin.
         num_samples: Number of points sampled on each surface.
     """
 

@@ -37,17 +37,15 @@ class MaskResult:
 
     Attributes:
         timestamps: (N,) seconds.
-        coverage: (N,) share of the image that is dynamic in the true mask.
-        found_share: (N,) share of the image that is dynamic in the estimated mask.
+        coverage: (N,) dynamic share of the image in the true mask.
+        found_share: (N,) dynamic share of the image in the estimated mask.
         precision: (N,) share of the estimated mask that is in the true mask.
         recall: (N,) share of the true mask that is in the estimated mask.
         iou: (N,) intersection over union.
-        overall_precision: Precision over the pixels of all frames together.
-        overall_recall: Recall over the pixels of all frames together.
-        overall_iou: Intersection over union over the pixels of all frames together.
+        overall_precision, overall_recall, overall_iou: The same over the pixels of all frames.
         mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``SCORED_COVERAGE``.
         num_scored: Number of those frames.
-        false_alarm_share: Mean ``found_share`` over the frames whose true mask is empty.
+        false_alarm_share: Mean ``found_share`` over the frames with an empty true mask.
         num_missing: Number of true masks without an estimated one.
     """
 

@@ -152,16 +152,10 @@ class ColorCalibration(Stateful):
     def update(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
     ) -> bool:
-        """Learn from a tracked frame.
+        """Learn from a tracked frame with its pose (4, 4) and dynamic pixels (H, W) bool; ``corrected``: it closed a
+        loop.
 
-        Args:
-            view: The frame.
-            T_world_camera: (4, 4) its pose.
-            dynamic_mask: (H, W) bool.
-            corrected: A loop was closed with the frame.
-
-        Returns:
-            Whether the next frame is the first with a new calibration; the maps have been repainted with it.
+        Returns whether the next frame is the first with a new calibration; the maps have been repainted with it.
         """
         if self._estimation is None or (self._estimation.finished and self._next is None):
             return False

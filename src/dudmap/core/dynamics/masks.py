@@ -117,10 +117,7 @@ def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Dynamic pixels (H, W) bool at full size, including depth holes within dynamic regions.
 
-    Args:
-        labels: Labels of the frame.
-        level: The labelled image.
-        depth: (H, W) float32, metres, 0 = none.
+    ``level``: the labelled image. ``depth``: (H, W) float32, metres, 0 = none.
     """
     import cv2
 

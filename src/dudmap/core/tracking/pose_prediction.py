@@ -112,10 +112,7 @@ class PosePredictor(Stateful):
     ) -> PosePrediction:
         """Initial pose for the registration of a frame to a map.
 
-        Args:
-            volume: The map.
-            view: The frame.
-            previously_dynamic: (h, w) bool, dynamic pixels of the previous frame; None for none.
+        ``previously_dynamic``: (h, w) bool, dynamic pixels of the previous frame; None for none.
         """
         timestamp, pyramid = view.timestamp, view.pyramid
         if self._known_poses and not self.ego_motion.started:

@@ -89,12 +89,9 @@ class Minimum:
     """End of a registration.
 
     Attributes:
-        T_world_camera: (4, 4).
-        exposure: Gain and offset from the frame's intensities to the map's.
+        T_world_camera, exposure, iterations, settled: See ``TrackingResult``.
         equations: Normal equations at this pose.
         level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
-        iterations: Number of linearisations over all levels.
-        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
         seen: Directions of motion that the view determines.
     """
 
