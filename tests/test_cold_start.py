@@ -140,7 +140,7 @@ def test_two_processes_do_not_write_one_file_of_the_kernel_cache(tmp_path, monke
 
 
 def test_what_a_second_process_compiles_are_parts_of_the_system():
-    assert {*warmup.BESIDE, *warmup.BESIDE_RUN} <= {name for name, _ in warmup.steps()}
+    assert {*warmup.SECOND_PROCESS, *warmup.DURING_RUN} <= {name for name, _ in warmup.steps()}
 
 
 def test_the_second_process_compiles_what_a_run_needs_after_its_first_poses():
@@ -152,7 +152,7 @@ later = color_pairs.linearize_pairs, linear_systems.solve, rectification.rectify
 later += segment_motion.stand_still, consensus.count_votes, labeling.upsample
 assert not any(kernel.signatures for kernel in later)
 parts = dict(warmup.steps())
-for name in warmup.BESIDE_RUN:
+for name in warmup.DURING_RUN:
     parts[name]()
 assert all(kernel.signatures for kernel in later), later
 """

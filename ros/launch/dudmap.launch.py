@@ -1,4 +1,4 @@
-"""Start the node with a parameter file; arguments name the camera's topics, by default of realsense2."""
+"""Start the node with a parameter file; arguments name the camera topics. Defaults: the topics of realsense2."""
 
 from pathlib import Path
 

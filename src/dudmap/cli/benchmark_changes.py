@@ -39,7 +39,7 @@ def changes(
     from dudmap.io.sequences import open_sequence
     from dudmap.lab.synthetic.visits import parsed_changes
 
-    def told(row: dict[str, Any]) -> None:
+    def announce(row: dict[str, Any]) -> None:
         hits = sum(thing["found"] is not None for thing in row["things"])
         outcome = row.get("error") or f"{hits} of {len(row['things'])} found, {len(row['false'])} false"
         say(f"pair {row['pair']}, {row['scene']}: {outcome}", err=True)
@@ -48,6 +48,6 @@ def changes(
     given: dict[str, Any] = {} if changes is None else {"changes": parsed_changes(changes)}
     given |= {} if edge is None else {"size": edge}
     config = o.read_config(None, None, assignments)
-    rows, text = measure_changes(seed, count, config, out, min_size, told, recording, given, keep_runs)
+    rows, text = measure_changes(seed, count, config, out, min_size, announce, recording, given, keep_runs)
     tree = {"rows": rows, "figures": figures(rows), "out": out}
     answer(tree, f"{text}\nwritten to {out}", as_json=as_json)

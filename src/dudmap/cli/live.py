@@ -43,13 +43,13 @@ def live(
     from dudmap.app.pipeline.run import PREVIEW, run
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.cameras import open_camera
-    from dudmap.lab.warmup import run_compiled_beside
+    from dudmap.lab.warmup import compiled_during_run
 
     config, saved_map = run_parameters(parameters, mapped, out)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
     config = for_range(config, parameters, mapped, source.preview(PREVIEW))
-    with observers(watching) as watchers, run_compiled_beside(live=True):
+    with observers(watching) as watchers, compiled_during_run(live=True):
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),
             max_frames=max_frames, save_masks=save_masks, ignore=ignore, record=record, calibration=given,

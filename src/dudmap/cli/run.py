@@ -96,7 +96,7 @@ def run(
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.pipeline.storing import Storing
     from dudmap.core.geometry.calibration import Calibration
-    from dudmap.lab.warmup import run_compiled_beside
+    from dudmap.lab.warmup import compiled_during_run
 
     if resume is not None:
         if sequence is not None or out is not None:
@@ -128,7 +128,7 @@ def run(
     )
     if watch and mapped.saved is None:
         raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
-    with observers(watching) as watchers, run_compiled_beside(live=live):
+    with observers(watching) as watchers, compiled_during_run(live=live):
         if watch and mapped.saved is not None:
             from dudmap.core.places.saved_map import SavedMap
             from dudmap.fleet.change_watch import ChangeWatch

@@ -15,15 +15,15 @@ def warmup(quiet: o.QuietOption = False, as_json: o.JsonOption = False) -> None:
     from contextlib import nullcontext
 
     from dudmap.app.terminal import plain_console
-    from dudmap.lab.warmup import BESIDE, compiled_beside, steps
+    from dudmap.lab.warmup import SECOND_PROCESS, compiled_in_background, steps
 
     console = plain_console(stderr=True, quiet=quiet or as_json)
     taken: dict[str, float] = {}
-    with compiled_beside(BESIDE) as wait:
+    with compiled_in_background(SECOND_PROCESS) as wait:
         for name, step in steps():
             with console.status(name) if console.is_terminal else nullcontext():
                 begin = time.perf_counter()
-                if name in BESIDE:
+                if name in SECOND_PROCESS:
                     wait()
                 step()
             taken[name] = round(time.perf_counter() - begin, 3)

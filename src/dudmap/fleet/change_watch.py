@@ -169,9 +169,9 @@ class ChangeWatch(RunObserver):
         rows, u, v = camera.nearest_pixels(local[near], border=1)
         near = near[rows]
         z, reading = local[near, 2], depth[v, u]
-        beside = np.minimum.reduce([reading, depth[v, u - 1], depth[v, u + 1], depth[v - 1, u]])
+        nearest = np.minimum.reduce([reading, depth[v, u - 1], depth[v, u + 1], depth[v - 1, u]])
         margin = self._margin(z, self.volume.sensor)
-        return near[beside > z + 2 * margin], near[np.abs(reading - z) < margin]
+        return near[nearest > z + 2 * margin], near[np.abs(reading - z) < margin]
 
     def _margin(self, z: NDArray[np.float64], sensor: Any) -> NDArray[np.float64]:  # noqa: ANN401 - its configuration
         return 2 * self.volume.voxel_size + DEVIATIONS * sensor.sigma(z)

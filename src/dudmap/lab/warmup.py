@@ -41,9 +41,9 @@ from dudmap.thesis_config import ThesisConfig
 
 SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
-BESIDE = "labels", "several voxel sizes"
+SECOND_PROCESS = "labels", "several voxel sizes"
 """Parts that a second process compiles, which take about as long as the others."""
-BESIDE_RUN = "motion between images", "labels", "calibration", "mesh"
+DURING_RUN = "motion between images", "labels", "calibration", "mesh"
 """Parts that the second process compiles while a run begins, in the order of their use."""
 
 
@@ -161,7 +161,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 
 @contextmanager
-def compiled_beside(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
+def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
     """Compile parts in other processes during the block, if there are a second core and a cache folder.
 
     The yielded function waits for the first process.
@@ -188,20 +188,20 @@ def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
         return
     if not quiet:
         say(COMPILING, err=True)
-    with compiled_beside(("tracking, labels and map", "synthetic frames"), BESIDE_RUN) as wait:
+    with compiled_in_background(("tracking, labels and map", "synthetic frames"), DURING_RUN) as wait:
         wait()
         yield
 
 
-def run_compiled_beside(*, live: bool = False) -> AbstractContextManager[object]:
-    """``compiled_beside`` for the first run, which has no compiled kernels.
+def compiled_during_run(*, live: bool = False) -> AbstractContextManager[object]:
+    """``compiled_in_background`` for the first run, which has no compiled kernels.
 
     A later ``live`` run first loads the kernels of a calibration, which would delay its frames.
     """
     cold = kernel_cache.is_cold()
     if live and not cold:
         dict(steps())["colour camera"]()
-    return compiled_beside(*((BESIDE_RUN,) if cold else ()))
+    return compiled_in_background(*((DURING_RUN,) if cold else ()))
 
 
 if __name__ == "__main__":

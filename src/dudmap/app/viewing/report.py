@@ -46,7 +46,7 @@ POSES = 5000
 """Most poses in the page; longer trajectories are thinned evenly."""
 POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
 """Content security policy: only the page's own scripts (by hash), styles and pictures."""
-BESIDE = "preprocess", "movers"
+NOT_INCLUDED = "preprocess", "movers"
 """Stages outside of the time to the result: the first runs in the reader's thread, the second after the result."""
 COLORS = "#2f6fb5", "#d98a00", "#2e8b57", "#c8322d", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5", "#9aa7b6"
 """Colours of the stages; the last one is for all further ones together."""
@@ -322,7 +322,7 @@ def _stages(run: RunFiles) -> Html:
     if not run.stages:
         return Html("")
     times = {stage: float(run.column(stage).mean()) for stage in run.stages}
-    beside = {stage: times.pop(stage) for stage in BESIDE if stage in times}
+    excluded = {stage: times.pop(stage) for stage in NOT_INCLUDED if stage in times}
     ranked = sorted(times.items(), key=lambda item: -item[1])
     total = float(run.column("total").mean())
     ranked = ranked[: len(COLORS) - 1]
@@ -335,7 +335,7 @@ def _stages(run: RunFiles) -> Html:
         )
         for form in (part, row)
     )
-    also = ", ".join(f"{_words(name)} {ms:.1f} ms" for name, ms in beside.items())
+    also = ", ".join(f"{_words(name)} {ms:.1f} ms" for name, ms in excluded.items())
     return html(
         '<p>Time per stage: {total:.1f} ms per frame on average{also}.</p><div class="bar">{bar}</div>'
         '<ul class="legend">{legend}</ul>',

@@ -132,16 +132,16 @@ from dudmap.config import Config
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.io.sequences import open_sequence
-from dudmap.lab.warmup import run_compiled_beside
+from dudmap.lab.warmup import compiled_during_run
 
 class First(RunObserver):
     def frame(self, index, read, result, ms):
         if index == 1:
-            beside.__exit__(None, None, None)
+            compiling.__exit__(None, None, None)
             os._exit(0)
 
-beside = run_compiled_beside()
-with beside:
+compiling = compiled_during_run()
+with compiling:
     run(
         open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False,
         observers=(First(),),

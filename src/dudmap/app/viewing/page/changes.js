@@ -1,4 +1,4 @@
-// The 3D scene of the page on changes: both maps, and the boxes of what changed. World frame of the visit before, metres.
+// The 3D scene of the page on changes: both maps and the boxes of changes. World frame of the earlier visit, metres.
 "use strict";
 
 const data = JSON.parse(document.getElementById("scene").textContent);

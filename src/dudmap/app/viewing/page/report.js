@@ -1,4 +1,4 @@
-// The 3D scene of the report: the map, the trajectory, the camera and what moves at a time. World frame, metres.
+// The 3D scene of the report: map, trajectory, and camera and moving objects at one time. World frame, metres.
 "use strict";
 
 const run = JSON.parse(document.getElementById("run").textContent);
@@ -59,7 +59,7 @@ class View extends Stage {
     this.scene.add(this.mesh);
   }
 
-  // From behind and above the first camera, as far away as it takes to see the whole map and the trajectory; walls are
+  // From behind and above the first camera, at a distance that shows the whole map and the trajectory. Walls are
   // transparent from behind.
   home() {
     const back = new THREE.Vector3().setFromMatrixColumn(this.poses[0], 2).negate().addScaledVector(this.up, 0.5);
@@ -82,7 +82,7 @@ class View extends Stage {
     this.controls.update();
   }
 
-  // Every so many points of the map, and the places of all cameras.
+  // Evenly chosen points of the map, and the positions of all cameras.
   mapPoints() {
     const points = this.poses.map((pose) => new THREE.Vector3().setFromMatrixPosition(pose));
     const vertices = this.mesh?.geometry.getAttribute("position");
@@ -262,7 +262,7 @@ async function start() {
       view.setMesh(await meshGeometry(run.mesh, byId("mesh").textContent));
       notice.textContent = "";
     }
-    view.draw(); // which finds the shape of the window
+    view.draw(); // sets the aspect ratio of the window
     view.home();
   }
   connect(view);

@@ -1,4 +1,4 @@
-// What the pages share: meshes, as they hold them, gzip in base64; boxes; and the view of a scene.
+// Shared by both pages: meshes (gzip in base64), boxes, and the view of a scene.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
@@ -40,7 +40,7 @@ function boxEdges([[x0, y0, z0], [x1, y1, z1]], color) {
   return edges;
 }
 
-// The canvas. Colours are shown as they were recorded: without tone mapping or conversion of colour spaces.
+// The canvas. Recorded colours are shown without tone mapping or conversion of colour spaces.
 class Stage {
   constructor(up) {
     this.renderer = new THREE.WebGLRenderer({ canvas: byId("canvas"), antialias: true, preserveDrawingBuffer: true });
