@@ -119,6 +119,8 @@ MOVES_SHARE = 0.08
 FEWEST = 15
 """Smallest number of inliers of an accepted motion. A wrong motion has about one by chance: of 1000 corners with flow
 up to 20 pixels, the share (NOISE_PX / 20)^2."""
+MANY = 4 * FEWEST
+"""Corners that leave no doubt about a motion which most of them follow."""
 NEIGHBOURS = 5
 """Number of nearest corners that vote on a pixel in a segment with disagreeing corners."""
 FEWEST_MOVING = 3

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.dynamics.dominant_motion import (
     AGREED,
+    MANY,
     DominantMotion,
     dominant_motion,
     exceeds_noise_share,
@@ -208,7 +209,7 @@ class EgoMotionSegmenter(Stateful):
         for image in images:
             image = replace(image, T_world_camera=corrections[-1] @ image.T_world_camera)
             motion = later.motion_to(image, np.inf)
-            if motion is None or motion.share < AGREED:
+            if motion is None or motion.share < AGREED or np.count_nonzero(motion.before.static) < MANY:
                 return None
             T = later.T_world_camera @ se3.inverse(motion.T_after_before)
             corrections.append(T @ se3.inverse(image.T_world_camera) @ corrections[-1])

@@ -174,12 +174,14 @@ class PoseEstimate:
         unverified_mask: (h, w) bool, label resolution, pixels not verified as static while most of the view moves; None
             for none.
         view: The frame with the registered colours; None if they did not change.
+        from_corners: Whether the corners of the last image determine the directions that the view does not observe.
     """
 
     tracking: TrackingResult
     labels: Labels | None = None
     unverified_mask: NDArray[np.bool_] | None = None
     view: FrameView | None = None
+    from_corners: bool = False
 
     @classmethod
     def at_origin(cls, gain: float = 1.0, T_world_camera: NDArray[np.float64] | None = None) -> "PoseEstimate":
@@ -199,9 +201,14 @@ class PoseEstimate:
         return self.tracking.exposure
 
     @property
+    def is_observed(self) -> bool:
+        """Whether the view, or the corners of the last image, determine all directions of motion."""
+        return self.from_corners or len(self.tracking.unobservable) == 0
+
+    @property
     def unobserved_motion(self) -> str:
-        """Reason why the pose is uncertain: directions that the view does not determine; empty if there are none."""
-        return unobserved_motion(self.tracking.unobservable)
+        """Reason why the pose is uncertain: directions that nothing determines; empty if there are none."""
+        return "" if self.is_observed else unobserved_motion(self.tracking.unobservable)
 
     def doubt(self, view: FrameView) -> str:
         """Reason why the pose is uncertain, empty if there is none: unobserved directions, or changed light with a

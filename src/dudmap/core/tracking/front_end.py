@@ -9,10 +9,10 @@ from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.dominant_motion import exceeds_noise_share
+from dudmap.core.dynamics.dominant_motion import AGREED, exceeds_noise_share
 from dudmap.core.dynamics.ego_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels
-from dudmap.core.frames.observation import reduced
+from dudmap.core.frames.observation import is_majority_dynamic, reduced
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
@@ -71,18 +71,27 @@ class FrontEnd(Stateful):
     ) -> tuple[FrameView, PoseEstimate, Verdict]:
         """A frame, its pose and labels, and the outcome of the checks.
 
-        A rejected frame in changed light is registered and judged again by its distances alone, because the change of
-        light differs from place to place. The distances must then determine all directions.
+        A frame that the checks reject is judged once more by other evidence:
+
+        * if the light has changed, registered by its distances alone, because the change differs from place to place;
+        * else at the pose by the corners of the last image, if these clearly follow one motion.
         """
         estimate = self.register(volume, view, prediction)
         verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
-        if verdict.reason and not view.blind and self._brightness is not None and self._is_relit(view):
-            unlit = replace(view, blind=True)
-            other = self.register(volume, unlit, prediction)
-            judged = self.monitor.judge(last, unlit, other, prediction.image_pose)
-            if not judged.reason and len(other.tracking.unobservable) == 0:
-                return unlit, other, judged
-        return view, estimate, verdict
+        if not verdict.reason or view.blind:
+            return view, estimate, verdict
+        if self._brightness is not None and self._is_relit(view):
+            other_view = replace(view, blind=True)
+            other = self.register(volume, other_view, prediction)
+        elif (T_image := self._clear_image_pose(view, prediction)) is not None:
+            other_view = view
+            other = self._at_given(volume, view, replace(prediction, T_world_camera=T_image))
+            other = replace(other, from_corners=True)
+        else:
+            return view, estimate, verdict
+        judged = self.monitor.judge(last, other_view, other, prediction.image_pose)
+        accepted = not judged.reason and other.is_observed
+        return (other_view, other, judged) if accepted else (view, estimate, verdict)
 
     def _is_relit(self, view: FrameView) -> bool:
         """Whether the mean intensity of the image shows another light than the map."""
@@ -102,6 +111,11 @@ class FrontEnd(Stateful):
         if self.motion.is_given:
             return self._at_given(volume, view, prediction)
         estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
+        if not estimate.is_observed:  # along these directions, a registration keeps its initial pose
+            T_image = self._clear_image_pose(view, prediction)
+            if T_image is not None:
+                estimate = replace(self.register_from(volume, view, prediction, T_image), from_corners=True)
+            return estimate
         tracking = estimate.tracking
         same_pose = SAME_POSE[0] * self.config.sensor.reference_depth, SAME_POSE[1]
         arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *same_pose)
@@ -119,6 +133,14 @@ class FrontEnd(Stateful):
         misfit, other_misfit = (sum(self.monitor.relative_misfit(e.tracking)) for e in (estimate, other))
         better = other.tracking.converged and (not tracking.converged or other_misfit < CLEARLY_BETTER * misfit)
         return other if better else estimate
+
+    @staticmethod
+    def _clear_image_pose(view: FrameView, prediction: PosePrediction) -> NDArray[np.float64] | None:
+        """Pose (4, 4) by the corners of the last image; None unless they clearly follow one motion."""
+        T_image, motion = prediction.image_pose(), prediction.image_motion()
+        if T_image is None or motion is None or motion.share < AGREED:
+            return None
+        return None if is_majority_dynamic(motion.moving_after, view.labelled) else T_image
 
     def register_from(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_init: NDArray[np.float64]
@@ -184,8 +206,7 @@ class FrontEnd(Stateful):
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Accept the pose and labels of a frame, and update velocity and detector."""
         tracking, labels = estimate.tracking, estimate.labels
-        observed = len(tracking.unobservable) == 0
-        self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
+        self.motion.update(view.timestamp, tracking.T_world_camera, observed=estimate.is_observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
         if not view.blind:

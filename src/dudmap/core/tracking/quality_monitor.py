@@ -16,6 +16,7 @@ from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.reprojection import compare_images, reproject
 from dudmap.core.dynamics.detector import noise_parameters
+from dudmap.core.dynamics.dominant_motion import MANY
 from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
 from dudmap.core.frames.observation import Level, reduced
 from dudmap.core.geometry import se3
@@ -38,8 +39,6 @@ CLEARLY_LESS = 0.5
 a pixel to both in the median frame of a hand-held camera."""
 MIN_PIXELS = 100
 """Smallest number of pixels of the coarsest level that show the same static surface in both images."""
-MIN_CORNERS = 60
-"""Smallest number of corners from which a common motion would be found: four times its minimum."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class ImageConsistency:
         T_image = image_pose()
         if T_image is None:
             change = estimate.exposure[0] / last.gain
-            return len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN
+            return len(view.pyramid.corners) < MANY or max(change, 1 / change) > LARGE_GAIN
         other = self.compare(last, view, estimate, T_image)
         return not other.shift < CLEARLY_LESS * seen.shift or (seen.confirms and not other.confirms)
 
@@ -253,7 +252,7 @@ class QualityMonitor(Stateful):
             figures = {
                 **tracking.figures,
                 **self.motion.figures(view.timestamp, tracking.T_world_camera, level),
-                "drift_mm": 1000 * self.motion.drift(view.timestamp) if len(tracking.unobservable) else 0.0,
+                "drift_mm": 0.0 if estimate.is_observed else 1000 * self.motion.drift(view.timestamp),
                 "dynamic_share": share,
                 "verified_share": (1 - share) * tracking.inlier_share,
                 "image_shift_px": seen.shift,
