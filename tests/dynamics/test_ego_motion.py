@@ -102,7 +102,7 @@ def test_a_shaken_image_makes_nothing_move(monkeypatch):
     shaken = image(room, 5, intensity=bent)
     assert compare(before, shaken).moving_after.mean() < dominant.NOISE_SHARE
     monkeypatch.setattr(dominant, "MOVES_SIGMAS", 0.5)  # without regard to how well the other corners fit
-    assert compare(before, shaken).moving_after.mean() > 0.1
+    assert compare(before, shaken).moving_after.mean() > 0.03
 
 
 def test_a_corner_that_could_as_well_rest_is_told_from_one_that_moved():
@@ -185,7 +185,7 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
     assert monitor.judge(None, view, well_known, lambda *_: None).reason == ""
-    assert "rest where the map" in monitor.judge(None, view, unknown, lambda *_: None).reason
+    assert "are static on the map" in monitor.judge(None, view, unknown, lambda *_: None).reason
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd, followed):

@@ -178,18 +178,3 @@ def test_the_weighted_median_is_that_of_repeated_values():
         values, weights = rng.normal(size=count), rng.integers(1, 9, count)
         repeated = np.sort(np.repeat(values, weights))
         assert dominant.weighted_median(values, weights.astype(float)) == repeated[(len(repeated) - 1) // 2]
-
-
-def test_the_nearest_points_of_the_same_group_vote():
-    rng = np.random.default_rng(3)
-    points, group_of = rng.normal(size=(300, 3)), rng.integers(1, 4, 300).astype(np.int32)
-    moving = rng.random(300) < 0.5
-    queries, groups = (
-        np.cumsum(0.02 * rng.normal(size=(1500, 3)), axis=0),
-        np.repeat([1, 3, 2, 3], 375).astype(np.int32),
-    )
-    votes = consensus.neighbour_votes(queries, groups, points, group_of, moving, 5)
-    for query, group, vote in zip(queries, groups, votes, strict=True):
-        known = np.flatnonzero(group_of == group)
-        nearest = known[np.argsort(np.linalg.norm(points[known] - query, axis=1))[:5]]
-        assert vote == np.count_nonzero(moving[nearest])

@@ -27,7 +27,7 @@ from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
 from dudmap.core.calibration.depth_readout import rectified_keyframe
 from dudmap.core.calibration.keyframes import keyframe
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.dominant_motion import neighbour_votes, reproject, rigid_motion
+from dudmap.core.dynamics.dominant_motion import reproject, rigid_motion
 from dudmap.core.dynamics.masks import fit_mixture, full_size
 from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.frame import Frame
@@ -83,7 +83,6 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     def image_motion() -> None:
         seen = np.random.default_rng(0).uniform(1, 2, (60, 3))
         rigid_motion(seen, reproject(start, seen, CAMERA), CAMERA, start)
-        neighbour_votes(seen, np.zeros(60, np.int32), seen, np.zeros(60, np.int32), np.ones(60, bool), 5)
 
     def labels() -> None:
         slam, detector = Slam(CAMERA, config), DynamicDetector(config.dynamics, config.sensor)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import consensus
-from dudmap.core.backends.cpu.consensus import ConsensusParams, neighbour_votes
+from dudmap.core.backends.cpu.consensus import ConsensusParams
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import FLOW_WIDTH, WINDOW, Level, Pyramid, scaled_window
 from dudmap.core.frames.optical_flow import (
@@ -121,12 +121,10 @@ FEWEST = 15
 up to 20 pixels, the share (NOISE_PX / 20)^2."""
 MANY = 4 * FEWEST
 """Corners that leave no doubt about a motion which most of them follow."""
-NEIGHBOURS = 5
-"""Number of nearest corners that vote on a pixel in a segment with disagreeing corners."""
 FEWEST_MOVING = 3
 """Smallest number of moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
 AGREED = 0.7
-"""Smallest share of moving corners of a segment that moves as a whole, and of the neighbours of a moving pixel."""
+"""Smallest share of moving corners of a segment that moves, and of the surface that clearly follows one motion."""
 SAME_SURFACE = 0.02
 """Largest relative change of depth between neighbouring measurements of one surface, and by noise at 5 m."""
 NOISE_SHARE = 0.02
@@ -352,32 +350,12 @@ def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -
     return float(values[order[total.searchsorted(total[-1] / 2)]])
 
 
-def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
-    """Moving pixels (h, w) of an image, by propagation of the corner labels to their segments.
-
-    A segment moves as a whole if at least AGREED of its corners move. If its corners disagree, a pixel moves if at
-    least AGREED of the NEIGHBOURS nearest corners of the same segment move, by distance in space. ``whole_only``
-    excludes such segments.
-    """
-    level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
-    if np.count_nonzero(moving) < FEWEST_MOVING:
-        return np.zeros(level.depth.shape, dtype=bool)
-    num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
-    enough = num_moving >= FEWEST_MOVING
-    whole = enough & (num_moving >= AGREED * num_all)
-    mixed = enough & ~whole
-    whole[0] = mixed[0] = False
-    out = whole[labels]
-    if whole_only:
-        return out
-    rows, columns = np.nonzero(mixed[labels] & (level.depth > 0))
-    if len(rows) == 0:
-        return out
-    queries = level.camera.points(columns, rows, level.depth[rows, columns].astype(np.float64))
-    # a segment of three moving and other corners has at least five
-    votes = neighbour_votes(queries, labels[rows, columns], corners.points, corners.segment_of, moving, NEIGHBOURS)
-    out[rows, columns] = votes >= AGREED * NEIGHBOURS
-    return out
+def propagate_to_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
+    """Pixels (h, w) of the segments that move: at least AGREED of their corners, and FEWEST_MOVING, move."""
+    num_moving, num_all = corners.count_by_segment(corners.moving), corners.count_by_segment()
+    moves = (num_moving >= FEWEST_MOVING) & (num_moving >= AGREED * num_all)
+    moves[0] = False
+    return moves[corners.segmentation.labels]
 
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:

@@ -62,7 +62,7 @@ class TrackedImage:
         segmentations = self.segmentation, later.segmentation
         motion = dominant_motion(self.pyramid, later.pyramid, segmentations, self.moving, T_expected, intervals)
         if motion is not None:
-            moving = propagate_to_segments(motion.before, whole_only=True)
+            moving = propagate_to_segments(motion.before)
             self.moving = moving if self.moving is None else self.moving | moving
         return motion
 
@@ -240,11 +240,11 @@ class EgoMotionSegmenter(Stateful):
         if motion is None:
             return None
         now = replace(now, T_world_camera=oldest.T_world_camera @ se3.inverse(motion.T_after_before))
-        moving, static = propagate_to_segments(motion.after, whole_only=True), motion.static_after
+        moving, static = propagate_to_segments(motion.after), motion.static_after
         first = oldest.moving if oldest.timestamp == self._started else None
         if newest is not oldest and exceeds_noise_share(moving, now.pyramid.labelled):
             motion = newest.motion_to(now, (timestamp - newest.timestamp) / interval)
             if motion is not None:
-                moving = moving | propagate_to_segments(motion.after, whole_only=True)
+                moving = moving | propagate_to_segments(motion.after)
                 static = static | motion.static_after
         return SlowMotion(now.T_world_camera, moving, static & ~moving, first)

@@ -20,10 +20,6 @@ hypothesis comes from three noisy corners."""
 REGULAR = 1e-9
 """Added to the diagonals of linear systems: absolutely for samples with a repeated point, whose hypotheses get no
 support; relative to the trace for least squares."""
-VOTED = 1024
-"""Queries of one band of votes."""
-CHUNK = 32
-"""Points whose distances are computed together."""
 
 
 class ConsensusParams(NamedTuple):
@@ -291,82 +287,3 @@ def linearized(T, found, inlier_px):
             else:
                 H[i, j] = H[j, i] = total
     return H, gradient, np.int64(count)
-
-
-def neighbour_votes(
-    queries: NDArray[np.float64],
-    groups: NDArray[np.int32],
-    points: NDArray[np.float64],
-    group_of: NDArray[np.int32],
-    moving: NDArray[np.bool_],
-    neighbours: int,
-) -> NDArray[np.int64]:
-    """Number (q,) of moving points among the nearest points of the same group.
-
-    Args:
-        queries, groups: (q, 3) positions, and the group (q,) of each, which has at least ``neighbours`` points.
-        points, group_of, moving: (n, 3), (n,), (n,): the points, their groups, and whether they move.
-        neighbours: Number of points that vote.
-    """
-    order = np.argsort(group_of, kind="stable")
-    first = np.searchsorted(group_of[order], np.arange(int(group_of.max(initial=0)) + 2))
-    by_axis, moves, votes = np.ascontiguousarray(points[order].T), moving[order], np.empty(len(queries), np.int64)
-    run_team(count_votes, -(-len(queries) // VOTED), queries, groups, by_axis, first, moves, neighbours, votes)
-    return votes
-
-
-@kernel
-def count_votes(leads, team, queries, groups, points, first, moving, neighbours, votes):
-    """Loop of ``neighbour_votes``, for a team of threads; points (3, n) are sorted by group, and ``first`` holds the
-    start of each group."""
-    num_bands = -(-len(queries) // VOTED)
-    band, _ = first_band(leads, team, 0, num_bands)
-    while band != NO_BAND:
-        start, stop = band * VOTED, min(band * VOTED + VOTED, len(queries))
-        vote(start, stop, queries, groups, points, first, moving, neighbours, votes)
-        done(team)
-        band, _ = take(team, num_bands)
-    if leads:
-        wait_for_all(team, num_bands)
-        finish(team)
-
-
-@scalar
-def vote(start, stop, queries, groups, points, first, moving, neighbours, votes):
-    """Votes of the queries ``start`` to ``stop``.
-
-    The voters of the previous query, a neighbour in the image, bound the distances of the current one.
-    """
-    squares, group = np.empty(CHUNK), -1
-    distances, voters = np.empty(neighbours), np.zeros(neighbours, np.int64)
-    for q in range(start, stop):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        bound = 0.0
-        for k in range(neighbours):
-            dx, dy, dz = points[0, voters[k]] - x, points[1, voters[k]] - y, points[2, voters[k]] - z
-            bound = max(bound, dx * dx + dy * dy + dz * dz)
-        bound = bound * (1 + 1e-9) if group == groups[q] else np.inf
-        group = groups[q]
-        distances[:] = np.inf
-        for begin in range(first[group], first[group + 1], CHUNK):
-            size, nearest = min(CHUNK, first[group + 1] - begin), np.inf
-            for n in range(size):
-                m = np.uintp(begin + n)
-                dx, dy, dz = points[0, m] - x, points[1, m] - y, points[2, m] - z
-                squares[np.uintp(n)] = dx * dx + dy * dy + dz * dz
-            for n in range(size):
-                nearest = min(nearest, squares[np.uintp(n)])
-            if nearest > bound:
-                continue
-            for n in range(size):
-                square, place = squares[n], neighbours - 1
-                if square > bound or square >= distances[place]:
-                    continue
-                while place > 0 and distances[place - 1] > square:
-                    distances[place], voters[place] = distances[place - 1], voters[place - 1]
-                    place -= 1
-                distances[place], voters[place] = square, begin + n
-        count = 0
-        for k in range(neighbours):
-            count += 1 if moving[voters[k]] else 0
-        votes[q] = count
