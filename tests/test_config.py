@@ -19,7 +19,7 @@ def test_a_file_may_name_a_few_keys_only(tmp_path):
     (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.03\n")
     config = Config.load(tmp_path / "mine.toml")
     assert config.tracker.huber == 0.03
-    assert config.tracker.damping == Config().tracker.damping
+    assert config.tracker.color_weight == Config().tracker.color_weight
 
 
 def test_the_system_of_the_thesis_has_the_values_of_the_thesis():
@@ -50,6 +50,9 @@ def test_keys_of_earlier_versions_are_read_where_they_change_nothing(tmp_path):
         assert Config().override([f"{key}={str(left).lower()}"]) == Config()
         with pytest.raises(ConfigError, match=re.escape(f"{key} = 'other' is gone; {instead}")):
             Config().override([f"{key}=other"])
+    near = Config.for_range("near")
+    old = near.model_dump() | {"loops": near.loops.model_dump() | {"min_distance": 0.004}}
+    assert Config.from_tree(old) == near  # as that version scaled it
 
 
 @pytest.mark.parametrize(

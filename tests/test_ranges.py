@@ -11,7 +11,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError
 from dudmap.lab import synthetic
-from dudmap.ranges import POWERS, RANGES, SHRINKING, scaled
+from dudmap.ranges import POWERS, RANGES, scaled
 
 LENGTHS = "metres", "m/s", "1/m"
 """Units in the docstrings of parameters that have a length in them."""
@@ -32,7 +32,6 @@ def test_a_room_keeps_its_values():
 
 def test_all_parameters_with_a_length_are_scaled():
     known = {f"{section}.{key}" for section, powers in POWERS.items() for key in powers}
-    known |= {f"{section}.{key}" for section, names in SHRINKING.items() for key in names}
     described = set()
     for name, section in Config.model_fields.items():
         if name != "thesis" and isinstance(section.default, ConfigSection):  # the baseline knows rooms only

@@ -71,8 +71,6 @@ class PreprocessConfig(ConfigSection):
     """Fill pixels without depth with the mean of their 5x5 neighbours, if these lie on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11) or no filter."""
-    filter_alpha: float = Field(default=0.012, gt=0)
-    """Range standard deviation sigma_c = filter_alpha z^2, 1/m (alpha = 12 of the thesis is in millimetres at 1 m)."""
     filter_sigma_px: float = Field(default=4.0, gt=0)
     """Spatial standard deviation sigma_s, pixels (thesis section 4.3)."""
     filter_radius: int = Field(default=6, ge=1, le=16)
@@ -99,8 +97,6 @@ class SimilarityConfig(ConfigSection):
     """Share of the view that the map knows by its weights above which it is redundant (thesis section 4.3)."""
     max_translation: float = Field(default=0.005, ge=0)
     """Translation since the last fused frame above which a view counts as new without the test, metres; 0 tests all."""
-    max_rotation_deg: float = Field(default=0.3, ge=0)
-    """Rotation since the last fused frame above which a view counts as new without the test, degrees."""
 
 
 class VolumeConfig(ConfigSection):
@@ -138,8 +134,6 @@ class VolumeConfig(ConfigSection):
     adaptive_bend: float = Field(default=0.4, gt=0)
     """Smallest curvature times voxel size at which voxels are halved (adaptive only): 0.4 is a radius of two and a half
     voxels, as of edges and thin things."""
-    adaptive_texture: float = Field(default=0.6, gt=0)
-    """Smallest bend of the intensities (0..1) between neighbouring voxels at which they are halved (adaptive only)."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":
@@ -156,38 +150,15 @@ class TrackerConfig(ConfigSection):
 
     huber: float = Field(default=0.01, gt=0)
     """Huber threshold of the distance residual, metres at the reference depth (thesis eq. 4.44, table 6.1)."""
-    damping: float = Field(default=0.02, gt=0)
-    """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1); at most 1e-4
-    on the finest level."""
     color_weight: float = Field(default=0.1325, ge=0)
     """Weight of the squared intensity residual (intensity in [0, 1]) relative to the squared distance residual
     (metres); thesis eq. 4.32, table 6.2."""
-    color_huber: float = Field(default=0.07, gt=0)
-    """Huber threshold of the intensity residual, intensity in [0, 1]."""
     exposure: bool = True
     """Fit gain and offset between image and map intensities on the coarsest pyramid level."""
     iterations: tuple[int, ...] = (8, 6, 6)
     """Largest number of iterations per pyramid level, coarse to fine; 0 skips the level."""
     widths: tuple[int, ...] = (80, 160, 320)
     """Image width per pyramid level, coarse to fine, pixels; rounded to a halving of the camera image."""
-    stop: float = Field(default=5e-4, gt=0)
-    """Norm of the twist update (m, rad) below which the finest level has converged (thesis: 1e-3)."""
-    stop_coarse: float = Field(default=1e-3, gt=0)
-    """The same for the coarser levels, which only lead to the next."""
-    stop_gain: float = Field(default=3e-3, ge=0, lt=1)
-    """Relative change of the cost below which a short step also ends a coarse level; 0 disables this criterion."""
-    min_inliers: float = Field(default=0.15, ge=0, le=1)
-    """Smallest share of the measurements that lie on the map in a tracked frame."""
-    max_residual: float = Field(default=4.0, gt=0)
-    """Largest robust root mean square of the distance residuals of a tracked frame, in standard deviations sigma(z) of
-    a measurement."""
-    min_condition: float = Field(default=1e-4, ge=0, lt=1)
-    """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
-    min_information: float = Field(default=2.3, ge=0)
-    """Smallest information on a direction of motion with which the registration always moves along it, in multiples of
-    the information from gradient noise alone. Below it, the registration moves only if map and image have the same
-    texture along the direction; otherwise it keeps the predicted motion and reports it. An endless tunnel gives 2 from
-    noise; some textured corridors at 320x240 give less than the limit. 0 always moves."""
     max_speed: float = Field(default=5.0, gt=0)
     """Largest plausible speed of the camera, m/s."""
     max_turn_deg: float = Field(default=360.0, gt=0)
@@ -211,14 +182,8 @@ class DynamicsConfig(ConfigSection):
     """Detect dynamic pixels; otherwise every pixel is static."""
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; rounded to a halving of the camera image."""
-    noise_threshold: float = Field(default=0.03, gt=0)
-    """Smallest distance to the static map of a dynamic measurement, metres (theta in thesis eq. 4.57)."""
-    noise_sigmas: float = Field(default=3.0, ge=0)
-    """The same distance in standard deviations of the measurement; the larger of the two applies."""
     settle_time: float = Field(default=1.5, gt=0, le=60)
     """Time for which an object must be at rest before it counts as static again and is fused, seconds."""
-    max_share: float = Field(default=0.9, gt=0, le=1)
-    """Largest share of dynamic measurements in a tracked frame; above it the frame is lost."""
     start_seconds: float = Field(default=1.0, ge=0)
     """Time after the first frame in which motion between images, with compensated ego-motion, also detects objects,
     seconds; the map has no free space yet. It is extended while this finds objects that the map does not reveal; 0
@@ -240,22 +205,6 @@ class RelocalizationConfig(ConfigSection):
     """Smallest number of tracked frames between two keyframes."""
     max_keyframes: int = Field(default=200, ge=2)
     """Largest number of keyframes; the one nearest to another is removed first."""
-    max_features: int = Field(default=400, ge=50)
-    """Largest number of features per keyframe."""
-    image_width: int = Field(default=320, ge=80)
-    """Width of the image in which features are detected, pixels."""
-    ratio: float = Field(default=0.85, gt=0, lt=1)
-    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance."""
-    min_inliers: int = Field(default=15, ge=4)
-    """Smallest number of RANSAC inliers of a match."""
-    min_share: float = Field(default=0.25, ge=0, le=1)
-    """Smallest share of RANSAC inliers among the matches with a keyframe."""
-    min_on_map: float = Field(default=0.4, ge=0, le=1)
-    """Smallest share of the measurements that are static and lie on the map at an accepted pose."""
-    max_distance: float = Field(default=0.06, gt=0)
-    """Largest correction of the feature-based pose by the registration, metres,"""
-    max_angle_deg: float = Field(default=3.0, gt=0)
-    """and degrees."""
 
 
 class LoopsConfig(ConfigSection):
@@ -267,17 +216,8 @@ class LoopsConfig(ConfigSection):
     """Smallest time since the camera was last near a place for it to close a loop, seconds."""
     gap: int = Field(default=15, ge=1)
     """Smallest number of frames between two attempts."""
-    min_distance: float = Field(default=0.02, ge=0)
-    """Corrections below this, metres,"""
-    min_angle_deg: float = Field(default=0.7, ge=0)
-    """and below this, degrees, are within the noise and not applied."""
-    max_drift: float = Field(default=0.1, gt=0)
-    """Largest plausible drift as a share of the path since the last visit to the place; 1 rad of rotation counts as 1
-    m."""
     keep_distance: float = Field(default=0.08, gt=0)
-    """A fused frame is stored on disk if it is this far from the last stored one, metres,"""
-    keep_angle_deg: float = Field(default=5.0, gt=0)
-    """or rotated by this, degrees,"""
+    """A fused frame is stored on disk if it is this far from the last stored one, metres, or rotated by 5 degrees,"""
     keep_gap: int = Field(default=15, ge=1)
     """or this many fused frames after it."""
 
@@ -289,8 +229,6 @@ class SubmapsConfig(ConfigSection):
     """Start a new submap when relocalisation fails, and merge it when a known place is recognised."""
     patience: float = Field(default=1.0, ge=0)
     """Time since tracking was lost before a new submap is started, seconds."""
-    min_readings: float = Field(default=0.2, ge=0, le=1)
-    """Smallest share of valid depth pixels in the first frame of a submap."""
 
 
 class MoversConfig(ConfigSection):
@@ -300,14 +238,6 @@ class MoversConfig(ConfigSection):
     """Track moving objects and report their identity and velocity."""
     min_area: float = Field(default=0.015, ge=0)
     """Smallest visible surface area of an object, square metres."""
-    merge_distance: float = Field(default=0.3, ge=0)
-    """Distance below which a small region is merged with a larger one, metres."""
-    max_jump: float = Field(default=0.4, gt=0)
-    """Largest distance from the predicted position in data association, metres; overlapping boxes also match."""
-    memory: float = Field(default=0.7, ge=0)
-    """Time for which an object out of view keeps its identity, seconds."""
-    velocity_window: float = Field(default=0.2, gt=0)
-    """Time over which the velocity is averaged, seconds."""
     meshes: bool = False
     """Also reconstruct each rigid object and estimate its pose (movers/<id>.ply and .txt of a run)."""
     mesh_voxel_size: float = Field(default=0.005, ge=0.001, le=0.1)

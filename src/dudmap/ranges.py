@@ -25,18 +25,15 @@ FEW = 0.2
 
 POWERS = {
     "sensor": {"reference_depth": 1, "sigma_base": 1, "sigma_scale": -1},
-    "preprocess": {"depth_min": 1, "depth_max": 1, "filter_alpha": -1},
+    "preprocess": {"depth_min": 1, "depth_max": 1},
     "similarity": {"max_translation": 1},
     "volume": {"voxel_size": 1},
     "tracker": {"huber": 1, "color_weight": 2, "max_speed": 1},
-    "dynamics": {"noise_threshold": 1},
-    "relocalization": {"keyframe_distance": 1, "max_distance": 1},
-    "loops": {"min_distance": 1, "keep_distance": 1},
-    "movers": {"min_area": 2, "merge_distance": 1, "max_jump": 1, "mesh_voxel_size": 1},
+    "relocalization": {"keyframe_distance": 1},
+    "loops": {"keep_distance": 1},
+    "movers": {"min_area": 2, "mesh_voxel_size": 1},
 }
 """Exponent of the size of the scene in a parameter's scale. All other parameters contain no length."""
-SHRINKING = {"tracker": ("stop", "stop_coarse")}
-"""Parameters in both metres and radians: they shrink with smaller scenes and do not grow with larger ones."""
 
 
 def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
@@ -47,9 +44,6 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
     for section, powers in POWERS.items():
         for key, power in powers.items():
             out[section][key] = _rounded(out[section][key] * size**power)
-    for section, keys in SHRINKING.items():
-        for key in keys:
-            out[section][key] = _rounded(out[section][key] * min(size, 1.0))
     return out
 
 

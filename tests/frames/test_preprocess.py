@@ -148,14 +148,15 @@ def test_missing_pixels_neither_give_nor_receive():
 
 
 @pytest.mark.parametrize("radius", [1, 6, 16])
-def test_any_values_give_finite_output(radius):
+def test_any_values_give_finite_output(radius, monkeypatch):
     rng = np.random.default_rng(3)
     depth = rng.uniform(-1, 8, (48, 64)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.3] = 0
     for value in (np.nan, np.inf, -np.inf, 1e-30, 1e30, -1e9):
         depth[rng.random(depth.shape) < 0.03] = value
     for alpha in (1e-9, 0.012, 100.0):
-        result = observe(depth, fill_holes=True, filter="bilateral", filter_alpha=alpha, filter_radius=radius)
+        monkeypatch.setattr("dudmap.core.frames.preprocess.FILTER_ALPHA", alpha)
+        result = observe(depth, fill_holes=True, filter="bilateral", filter_radius=radius)
         for level in range(4):
             for image in result.halved(level):
                 assert np.isfinite(image).all()

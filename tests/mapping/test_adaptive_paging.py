@@ -21,7 +21,7 @@ SENSOR = SensorConfig(sigma_base=0.0005, sigma_scale=0.0005)
 CONFIG = CONSTANT.model_copy(
     update={
         "min_weight": 1, "voxel_size": 0.02, "carving": True, "adaptive": True, "adaptive_levels": 2,
-        "adaptive_bend": 0.2, "adaptive_texture": 9.0,
+        "adaptive_bend": 0.2,
     }
 )  # fmt: skip
 DEPTH = 1.2

@@ -125,11 +125,11 @@ def test_objects_that_touch_stay_two():
 
 
 def test_an_object_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
-    tracker = ObjectTracker(MoversConfig(memory=0.5))
+    tracker = ObjectTracker(MoversConfig())
     mask, level = board(0.0)
     nothing = np.zeros_like(mask)
     numbers = []
-    for t, seen in [(0, 1), (0.1, 0), (0.4, 1), (0.5, 0), (1.2, 1)]:
+    for t, seen in [(0, 1), (0.1, 0), (0.6, 1), (0.7, 0), (1.4, 1)]:
         numbers += [mover.id for mover in tracker.update(t, mask if seen else nothing, level, np.eye(4))]
     assert numbers == [1, 1, 2]
 

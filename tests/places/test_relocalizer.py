@@ -57,6 +57,7 @@ def relocalizer(candidates=(), *, current=1, prior_map=None, num_features=100, h
         volumes={0: "map 0", 1: "map 1"},
         volume_around=lambda number, T_world_camera: f"map {number}",
         current=current,
+        unit=1.0,
         history=object() if history else None,
     )
     return Relocalizer(Config().override(overrides), atlas, prior_map)

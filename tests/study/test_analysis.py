@@ -10,7 +10,7 @@ from dudmap.lab.study.response_surface import confirm, fit_surface, predict_opti
 from dudmap.lab.study.responses import Scale
 
 RANGES = {"tracker.huber": {"range": [0.005, 0.025]}, "volume.voxel_size": {"range": [0.01, 0.04], "scale": "log"},
-          "tracker.damping": {"range": [0.002, 0.02]}}  # fmt: skip
+          "tracker.color_weight": {"range": [0.025, 0.175]}}  # fmt: skip
 
 
 def factors_of(table=RANGES):

@@ -8,13 +8,13 @@ import pytest
 
 from dudmap import Config, Slam
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
+from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, RULES, Limits, first_failure
 from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 
 CONFIG = Config()
-LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, 0.9, "recovering", True, True, 2.0, 0.9, 0.02)
+LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, RULES, "recovering", True, True, 2.0, 0.9, 0.02)
 GOOD = {
     "readings": 5000.0, "overlap": 0.9, "residual_mm": 2.0, "condition": 0.1, "color_residual": 0.02,
     "speed_m_s": 0.3, "turn_deg_s": 20.0, "step": np.nan, "drift_mm": 0.0, "dynamic_share": 0.3,

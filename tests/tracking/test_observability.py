@@ -15,7 +15,7 @@ from dudmap.core.slam import Slam
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, unobserved_motion
-from dudmap.core.tracking.tracker import Tracker
+from dudmap.core.tracking.tracker import COLOR_HUBER, Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
@@ -162,7 +162,7 @@ def test_noise_is_the_sum_over_the_readings():
             variance += 2 * (2 / 3) ** 2 * step**2 / 12 / 0.03**2
             distances += stride**2 * w * variance * J.T @ J
             total += w * variance
-            shade = t.color_weight * weights[v, u] * t.color_huber / max(c, t.color_huber)
+            shade = t.color_weight * weights[v, u] * COLOR_HUBER / max(c, COLOR_HUBER)
             intensities += stride**2 * shade * 2 * (2 / 3) ** 2 * (INTENSITY_SIGMA / 0.03) ** 2 * J.T @ J
     assert total > 0
     np.testing.assert_allclose(found.distances, distances, rtol=1e-3, atol=1e-4 * distances.max())

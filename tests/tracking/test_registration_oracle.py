@@ -1,7 +1,6 @@
 """The registration against plain NumPy and against numerical derivatives; the tracker's checks."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import retract
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.tracking.checks import RELATIVE, first_failure
+from dudmap.core.tracking.checks import RELATIVE, RegistrationRules, first_failure
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
@@ -53,9 +52,10 @@ def test_the_gradient_is_that_of_the_cost(volume):
     assert np.linalg.norm(b - numerical) < 0.05 * np.linalg.norm(numerical)
 
 
-def test_normal_equations_equal_a_plain_sum_over_pixels(volume):
+def test_normal_equations_equal_a_plain_sum_over_pixels(volume, monkeypatch):
     """H and b rebuilt from numerically differentiated residuals of every pixel, with quadratic cost."""
-    config = TrackerConfig(huber=10.0, color_huber=10.0, color_weight=0.3)
+    monkeypatch.setattr("dudmap.core.tracking.tracker.COLOR_HUBER", 10.0)
+    config = TrackerConfig(huber=10.0, color_weight=0.3)
     tracker, level = Tracker(config, SENSOR), level_of(corner())
     T = retract(np.eye(4), np.array([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]))
     step = 1e-4
@@ -93,9 +93,10 @@ def test_alignment_finds_a_known_motion(volume):
     assert np.degrees(se3.rotation_angle(error)) < 0.15
 
 
-def test_a_coarse_level_that_gains_nothing_more_ends_there(volume):
+def test_a_coarse_level_that_gains_nothing_more_ends_there(volume, monkeypatch):
     """Noise makes steps that lead nowhere; poses found in fewer of them are as good."""
     xi = np.array([0.004, -0.003, 0.002, 0.002, -0.003, 0.003])
+    monkeypatch.setattr("dudmap.core.tracking.tracker.STOP_COARSE", 2e-4)
     found: dict[float, list[TrackingResult]] = {0.0: [], 3e-3: []}
     for seed in range(8):
         rng, level = np.random.default_rng(seed), level_of(corner(xi))
@@ -103,9 +104,9 @@ def test_a_coarse_level_that_gains_nothing_more_ends_there(volume):
         intensity = level.intensity + rng.normal(0, 0.1, level.depth.shape)
         noisy = Level(CAMERA, depth.astype(np.float32), intensity.astype(np.float32))
         for stop_gain, results in found.items():
-            config = TrackerConfig(  # of two levels, of which the first is given
-                widths=(80, 160), iterations=(30, 30), stop_coarse=2e-4, stop_gain=stop_gain, exposure=False
-            )
+            monkeypatch.setattr("dudmap.core.tracking.tracker.STOP_GAIN", stop_gain)
+            # of two levels, of which the first is given
+            config = TrackerConfig(widths=(80, 160), iterations=(30, 30), exposure=False)
             results.append(Tracker(config, SENSOR).align(volume, [noisy], np.eye(4)))
     iterations = {gain: sum(result.iterations for result in results) for gain, results in found.items()}
     errors = {
@@ -244,8 +245,8 @@ def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
     assert doubt(result(0.0035, 0.3)) == ""
 
 
-AS_IT_IS: dict[str, Any] = {"widths": (80,), "iterations": (1,), "stop": 1e3, "damping": 1e9, "min_condition": 0.0}
-"""The first guess is judged: the damping leaves no step."""
+ANY = RegistrationRules(min_condition=0.0)
+"""A wall does not determine its pose."""
 
 
 def wall(offset: float, far: float) -> tuple[TsdfVolume, Level]:
@@ -266,8 +267,7 @@ def test_distances_are_judged_in_units_of_the_noise_at_their_depth(far, sigmas, 
     sigma, sigma_one = (SENSOR.sigma(z) for z in (far, 1.0))
     volume, level = wall(sigmas * sigma, far)
     # a Huber constant beyond all residuals, so that the mean square is that of the offset
-    config = TrackerConfig(**AS_IT_IS, huber=1.0)
-    result = Tracker(config, SENSOR).align(volume, [level], np.eye(4))
+    result = Tracker(TrackerConfig(huber=1.0), SENSOR, rules=ANY).judge(volume, level, np.eye(4), ones(level))
     assert result.residual == pytest.approx(sigmas * sigma_one, rel=0.1)
     assert result.converged is (not reason)
     assert reason in result.reason
@@ -278,7 +278,9 @@ def test_a_change_of_exposure_is_no_difference_from_the_map(exposure):
     volume, level = wall(0.0, 1.5)
     brighter = exposed(level, (1.1, 0.05))
     other = Level(CAMERA, level.depth, np.ascontiguousarray(level.intensity[:, ::-1]))
-    tracker = Tracker(TrackerConfig(**AS_IT_IS, exposure=exposure), SENSOR)
-    same, changed, wrong = (tracker.align(volume, [x], np.eye(4)).color_residual for x in (level, brighter, other))
+    tracker = Tracker(TrackerConfig(exposure=exposure), SENSOR)
+    same, changed, wrong = (
+        tracker.judge(volume, x, np.eye(4), ones(x)).color_residual for x in (level, brighter, other)
+    )
     assert changed < same + 0.01
     assert wrong > 0.05

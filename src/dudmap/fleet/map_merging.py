@@ -12,7 +12,12 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase
+from dudmap.core.places.place_recognition import (
+    MAX_CORRECTION,
+    MAX_CORRECTION_DEG,
+    Keyframe,
+    KeyframeDatabase,
+)
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.fleet.agreement import Agreement, agreement
 from dudmap.fleet.map_fusion import fuse_maps
@@ -31,9 +36,6 @@ MIN_KEYFRAMES, MIN_FEATURES = 2, 40
 """Keyframes of one map that must be recognised in the other at one relative pose. A single keyframe needs this many
 matching features. Look-alike places reach 200 and are left to the checks."""
 NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
-MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
-"""Largest correction of the features' relative pose by the surface alignment, at the middle of the common surface (m,
-deg): the limits of a relocalised frame (``relocalization.max_distance``)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dudmap.config import TrackerConfig
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.tracker import COLOR_HUBER
 from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
 MAX_ITERATIONS = 40
@@ -81,7 +82,7 @@ def align_maps(
         scale = max(SCALE * a.voxel_size, SHRINKING * scale)
         weights = 1 / np.square(1 + np.square(rows.distance / scale))
         H, g = _normal_equations(rows.J_distance, rows.distance, weights)
-        lit = tracker.color_weight * np.minimum(1.0, tracker.color_huber / np.maximum(np.abs(rows.shade), 1e-12))
+        lit = tracker.color_weight * np.minimum(1.0, COLOR_HUBER / np.maximum(np.abs(rows.shade), 1e-12))
         if changed and len(rows.shade):
             close = np.abs(rows.distance[np.abs(rows.distance) <= 2 * scale])
             spread = min(spread, max(MAD * float(np.median(np.abs(rows.shade))), LEAST_SHADE))

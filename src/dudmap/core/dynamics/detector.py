@@ -31,6 +31,9 @@ from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
 """Largest depth difference of two measurements of one point, in units of the noise threshold of distances."""
+SMALLEST_MOTION, MOTION_SIGMAS = 0.03, 3.0
+"""Smallest distance to the static map of a dynamic measurement (theta in thesis eq. 4.57): reference depths, and
+standard deviations of the measurement; the larger of the two applies."""
 MAP_ROUGHNESS = 0.4
 """Standard deviation of the map's surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
@@ -98,6 +101,7 @@ class DynamicDetector(Stateful):
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config
         self.sensor = sensor
+        self._least_sigma = SMALLEST_MOTION * sensor.reference_depth / MOTION_SIGMAS
         self.memory = TemporalMemory(config, sensor.reference_depth)
         self.background = BackgroundModel(config)
 
@@ -152,7 +156,7 @@ class DynamicDetector(Stateful):
             slow: (h, w) bool, the part of ``moving`` found with an older image; None for none.
         """
         depth = level.depth
-        noise = noise_parameters(self.config, self.sensor, level, volume.voxel_size)
+        noise = noise_parameters(self.sensor, level, volume.voxel_size)
         sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
         if (dark := saturated(level, exposure, sample.difference)) is not None:
             sample.difference[dark] = np.nan
@@ -213,7 +217,7 @@ class DynamicDetector(Stateful):
         """
         if not (older := self.memory.free_space_frames(frame.timestamp, unknown)):
             return NONE
-        gap = np.float32(MAX_GAP) * noise_threshold(self.config, frame.sigma)
+        gap = np.float32(MAX_GAP) * noise_threshold(self.sensor, frame.sigma)
         return self.memory.seen_free(frame.level, frame.T_world_camera, gap, older)
 
     def _segments(
@@ -226,7 +230,7 @@ class DynamicDetector(Stateful):
         """Dynamic pixels (h, w) decided by segment (``moving_segments``) without settled segments, and the segments."""
         level, T_world_camera, sigma = frame.level, frame.T_world_camera, frame.sigma
         before = self.memory.last_dynamic(level, T_world_camera)
-        least, (gain, offset) = self.config.noise_threshold / 3, frame.exposure
+        least, (gain, offset) = self._least_sigma, frame.exposure
         labels, count = moving_segments(
             segmentation.with_noise(sigma, least), before, seeds, frame.sample, level.intensity,
             np.float32(1 - gain), np.float32(offset), dynamic,
@@ -249,7 +253,7 @@ class DynamicDetector(Stateful):
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))
         difference = sample.difference + (np.float32(1 - gain) * frame.level.intensity - np.float32(offset))
         difference[np.isnan(difference)] = 0  # a surface without a colour
-        segments = segmentation.with_noise(frame.sigma, self.config.noise_threshold / 3)
+        segments = segmentation.with_noise(frame.sigma, self._least_sigma)
         mapped = moving & (sample.occupancy == SURFACE)
         known, asked = (np.bincount(segments.labels[mask], minlength=segments.count + 1) for mask in (mapped, moving))
         still = (np.arange(segments.count + 1) > 0) & (known > MAPPED_SHARE * asked)
@@ -257,11 +261,11 @@ class DynamicDetector(Stateful):
         return moving & still[segments.labels]
 
 
-def noise_parameters(config: DynamicsConfig, sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
+def noise_parameters(sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
     """Parameters of the measurement noise of an image, for a map with this voxel size, metres."""
     parameters = NoiseParameters(
         sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
-        DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas,
+        DEPTH_EDGE_SLOPE / pixel_scale(level), SMALLEST_MOTION * sensor.reference_depth, MOTION_SIGMAS,
     )  # fmt: skip
     return single(parameters)
 
@@ -279,6 +283,6 @@ def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.floa
     return np.asarray(edge_tolerance.py_func(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
 
 
-def noise_threshold(config: DynamicsConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
+def noise_threshold(sensor: SensorConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
     """Distance (h, w) to the map below which nothing is called motion (theta in eq. 4.57), metres."""
-    return noise_limit.py_func(sigma, np.float32(config.noise_threshold), np.float32(config.noise_sigmas))
+    return noise_limit.py_func(sigma, np.float32(SMALLEST_MOTION * sensor.reference_depth), np.float32(MOTION_SIGMAS))

@@ -20,6 +20,9 @@ HOLE_NOISE = 0.01
 """Largest depth difference around a small hole that is always allowed, reference depths."""
 STEEPEST = 9.5
 """Tangent of the largest angle of incidence that sensors measure, 84 degrees."""
+FILTER_ALPHA = 0.012
+"""Range standard deviation of the bilateral filter, sigma_c = FILTER_ALPHA z^2, reference depths (thesis section 4.3:
+alpha = 12, in millimetres at 1 m)."""
 BORDER = 0.02
 """Share of its width by which the colour image is extended at its borders; depth pixels beyond have no colour."""
 TYPICAL_DEPTH = 2.0
@@ -71,7 +74,7 @@ class Preprocessor:
             fill_holes=self.config.fill_holes,
             hole_noise=HOLE_NOISE * reference_depth,
             smooth=self.config.filter == "bilateral",
-            alpha=self.config.filter_alpha,
+            alpha=FILTER_ALPHA / reference_depth,
             sigma_px=self.config.filter_sigma_px,
             radius=self.config.filter_radius,
         )

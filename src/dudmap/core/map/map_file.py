@@ -1,5 +1,6 @@
 """Map file: a NumPy archive written in parts, so that the map need not be in memory as a whole."""
 
+import json
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 from dudmap.errors import MapError
+from dudmap.gone_keys import without_gone
 from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
@@ -130,7 +132,7 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Came
         raise ValueError(f"its depths reach {data['depth_max']} m; expected up to {LARGEST_DEPTH:g} m")
     fx, fy, cx, cy = (float(value) for value in data["camera"])
     width, height = (int(value) for value in data["image"])
-    config = VolumeConfig.model_validate_json(str(data["config"]))
+    config = VolumeConfig.model_validate(without_gone({"volume": json.loads(str(data["config"]))})["volume"])
     sensor = SensorConfig.model_validate_json(str(data["sensor"]))
     return Camera(fx, fy, cx, cy, width, height), config, sensor, float(data["depth_max"])
 

@@ -13,6 +13,8 @@ FIRST = 3
 """Number of fused frames at which a block is examined first."""
 PERIOD = 16
 """Frames between two examinations of a block."""
+TEXTURE = 0.6
+"""Smallest bend of the intensities (0..1) between neighbouring voxels at which they are halved."""
 HYSTERESIS = 0.5
 """Share of the thresholds below which a block with smaller voxels no longer needs them."""
 MAX_CALM = 3
@@ -63,7 +65,7 @@ def refine(
     bend, texture, found = examine(parents.geometry, near, unit, saturated)
     surface = found.astype(bool)
     noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (coarser.voxel_size * np.sqrt(np.minimum(fused, 64)))
-    needed = np.maximum(bend / np.hypot(config.adaptive_bend, noise)[:, None], texture / config.adaptive_texture)
+    needed = np.maximum(bend / np.hypot(config.adaptive_bend, noise)[:, None], texture / TEXTURE)
     children = level.children[slots]
     rows, octants = map(np.ascontiguousarray, np.nonzero(surface & (needed > 1) & (children < 0)))
     if len(rows):

@@ -18,10 +18,13 @@ from dudmap.core.frames.observation import Level, Observation, exposed_color
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.objects.object_map import ObjectTrack, ObjectVolume, RigidObject
-from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.objects.object_tracker import MEMORY, VELOCITY_WINDOW, Mover
 from dudmap.core.state import Remembered, Stateful
+from dudmap.core.tracking.checks import RegistrationRules
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
+RULES = RegistrationRules(damping=1e-4, min_overlap=0.1, min_condition=1e-6, min_information=0.0)
+"""Rules of an object's registration: it fills a small part of the view and may turn about an axis of symmetry."""
 MAX_OBJECTS = 4
 """Largest number of objects registered in one frame; each costs a few milliseconds and some megabytes."""
 MAX_MESHES = 50
@@ -150,15 +153,11 @@ class ObjectFusion(Stateful):
         tracker = config.tracker.model_copy(
             update={
                 "iterations": (8, 8, 6),
-                "damping": 1e-4,
                 "exposure": False,
-                "min_inliers": 0.1,
-                "min_condition": 1e-6,
-                "min_information": 0.0,
                 "color_weight": COLOR_SHARE * config.tracker.color_weight,
             }
         )
-        self.tracker = Tracker(tracker, config.sensor, config.preprocess.smoothing_px)
+        self.tracker = Tracker(tracker, config.sensor, config.preprocess.smoothing_px, RULES)
         self._volume_config = config.volume.model_copy(update={"voxel_size": config.movers.mesh_voxel_size})
         self._rng = np.random.default_rng(0)
         self._tracks = {}
@@ -190,7 +189,7 @@ class ObjectFusion(Stateful):
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):
-            if now - track.last_seen > self.config.movers.memory:
+            if now - track.last_seen > MEMORY:
                 self._close(id)
         for mover in sorted(movers, key=lambda mover: -np.count_nonzero(mover.mask)):
             track = self._tracks.get(mover.id)
@@ -283,8 +282,7 @@ class ObjectFusion(Stateful):
         translation = T[:3, 3] - track.T_world_object[:3, 3]
         track.velocity = np.concatenate([translation, se3.log_rotation(rotation)]) / duration
         track.T_world_object = T
-        window = self.config.movers.velocity_window
-        track.recent_poses = [pose for pose in track.recent_poses if now - pose[0] < window] + [(now, T)]
+        track.recent_poses = [pose for pose in track.recent_poses if now - pose[0] < VELOCITY_WINDOW] + [(now, T)]
         if seen_through > MAX_SEEN_THROUGH:
             track.misfits.append(f"{seen_through:.0%} of its surface is seen through")
         elif off_surface > MAX_OFF_SURFACE:

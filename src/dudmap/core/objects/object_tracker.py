@@ -29,6 +29,14 @@ from dudmap.core.state import Remembered, Stateful
 OUTLIER_SPEED = 0.7
 """Largest deviation of a displacement's velocity from the median, reference depths per second; a larger one is a change
 of the mask."""
+MERGE_DISTANCE = 0.3
+"""Distance below which a small region is merged with a larger one, reference depths."""
+MAX_JUMP = 0.4
+"""Largest distance from the predicted position in data association, reference depths; overlapping boxes also match."""
+MEMORY = 0.7
+"""Time for which an object out of view keeps its identity, seconds."""
+VELOCITY_WINDOW = 0.2
+"""Time over which the velocity is averaged, seconds."""
 ESTABLISHED = 0.5
 """Age after which separate objects stay separate when they touch, seconds."""
 
@@ -96,7 +104,7 @@ class ObjectTracker(Stateful):
     The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel.
     If two separate objects touch, their connected region is split by the nearest predicted pixel.
 
-    Velocities are estimated over the last ``velocity_window`` seconds:
+    Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
 
     * A fully visible object: slope of a line through its positions, because the visible surface of a rolling ball is
       faster than the ball.
@@ -118,7 +126,7 @@ class ObjectTracker(Stateful):
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]
     ) -> list[Mover]:
         """Moving objects of a tracked frame, by number; ``dynamic`` (h, w) marks the moving pixels of ``level``."""
-        self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= self.config.memory]
+        self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= MEMORY]
         predicted_ids = self._predicted_ids(timestamp, level.camera, T_world_camera)
         pixels = connected_regions(dynamic, level, T_world_camera, predicted_ids)
         objects = [] if pixels is None else self._segment(pixels)
@@ -133,7 +141,7 @@ class ObjectTracker(Stateful):
         known_displacements: dict[int, NDArray[np.float64]] = {}
         if self._last is not None and self._last.ids.shape == frame.ids.shape:
             known = [track.id for track in self._tracks if track.last_seen == self._last.timestamp]
-            known_displacements = displacements(self._last, frame, known, self.config.max_jump)
+            known_displacements = displacements(self._last, frame, known, MAX_JUMP * self.reference_depth)
         movers = []
         for indices, track, centroid, box in zip(objects, tracks, centroids, boxes, strict=True):
             mask = frame.ids == track.id
@@ -220,7 +228,7 @@ class ObjectTracker(Stateful):
         return same + [group for group in groups if region.area < 0.5 * sum(part.area for part in group)]
 
     def _is_near(self, region: Region, group: list[Region]) -> bool:
-        return any(region.is_near(part, self.config.merge_distance) for part in group)
+        return any(region.is_near(part, MERGE_DISTANCE * self.reference_depth) for part in group)
 
     def _is_established(self, track: _Track, area: float) -> bool:
         """Whether an object has been seen for some time and ``area`` (m^2) is a substantial part of it."""
@@ -240,7 +248,7 @@ class ObjectTracker(Stateful):
         A pair is considered if it shares more than 0.3 of the pixels, lies closer than ``max_jump`` or has overlapping
         boxes. An object without a track begins a new one.
         """
-        candidates, max_jump = [], self.config.max_jump
+        candidates, max_jump = [], MAX_JUMP * self.reference_depth
         if self._tracks:
             ids = [track.id for track in self._tracks]
             shifts = np.array([track.velocity * (timestamp - track.last_seen) for track in self._tracks])
@@ -267,7 +275,7 @@ class ObjectTracker(Stateful):
 
     def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
         """Velocity of an object: median of the estimates from displacements and from the slopes of its positions."""
-        recent = [m for m in track.measurements if measurement.time - m.time < self.config.velocity_window]
+        recent = [m for m in track.measurements if measurement.time - m.time < VELOCITY_WINDOW]
         track.measurements = [*recent, measurement]
         estimates = []
         velocities = np.array(

@@ -23,6 +23,8 @@ DEPTH_UNIT = 0.0005
 """Step of the stored depth, reference depths. Its rounding error, 0.29 steps rms, is 0.14 mm in a room, a seventh of
 ``sigma_base``."""
 JPEG_QUALITY = 95
+KEEP_ANGLE_DEG = 5.0
+"""Rotation since the last stored frame at which a fused frame is stored, degrees."""
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` blocks."""
 CELLS = 8, 6
@@ -117,7 +119,7 @@ class FrameStore(Stateful):
         if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
             return None
         unit = DEPTH_UNIT * config.sensor.reference_depth
-        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap, depth_unit=unit)
+        return cls(camera, loops.keep_distance, KEEP_ANGLE_DEG, loops.keep_gap, depth_unit=unit)
 
     def __len__(self) -> int:
         return len(self.frames)

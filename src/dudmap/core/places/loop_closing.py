@@ -25,6 +25,8 @@ CHECK_INTERVAL = 5
 """Frames between two checks for nearby keyframes, and between start and evaluation of a search."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.03, 1.0
 """Largest difference of the corrections of two frames that confirm each other, reference depths and degrees."""
+NO_DRIFT, NO_DRIFT_DEG = 0.02, 0.7
+"""Smaller corrections (reference depths, deg) are within the noise and not applied."""
 MAX_VERIFIED = 2
 """Largest number of matches of one frame that are verified by registration."""
 MAX_BACKOFF = 4
@@ -140,7 +142,7 @@ class LoopCloser(Stateful):
 
     def _evaluate(self, search: LoopSearch, newest: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Verify the matches of a search; returns the correction of the pose, None if none was made."""
-        query, limits = search.query, self.config.loops
+        query, distance = search.query, NO_DRIFT * self.atlas.unit
         T = query.tracking.T_world_camera
         pending, self._pending = self._pending, None
         failed = search.returned
@@ -148,7 +150,7 @@ class LoopCloser(Stateful):
             submap = place.keyframe.submap
             in_current = submap == self.atlas.current
             # the feature pose is less accurate than the registration
-            if in_current and agree(place.T_world_camera, T, 1.5 * limits.min_distance, 1.5 * limits.min_angle_deg):
+            if in_current and agree(place.T_world_camera, T, 1.5 * distance, 1.5 * NO_DRIFT_DEG):
                 return self._confirm_no_drift(place, query)
             if in_current and not self.verifier.is_plausible(place, T):
                 continue
@@ -157,7 +159,7 @@ class LoopCloser(Stateful):
                 failed = True
                 continue
             self._failures = 0
-            if in_current and agree(T_found, T, limits.min_distance, limits.min_angle_deg):
+            if in_current and agree(T_found, T, distance, NO_DRIFT_DEG):
                 return self._confirm_no_drift(place, query)
             confirmed = (
                 pending is not None
@@ -176,7 +178,7 @@ class LoopCloser(Stateful):
             failed = True
         if failed:  # registration is expensive: linear back-off
             self._failures = min(self._failures + 1, MAX_BACKOFF)
-            self._next_search = self._frame + self._failures * limits.gap
+            self._next_search = self._frame + self._failures * self.config.loops.gap
         return None
 
     def _confirm_no_drift(self, place: PlaceMatch, query: LoopQuery) -> None:

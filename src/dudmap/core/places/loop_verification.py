@@ -27,8 +27,9 @@ LOCAL_FRAMES = 8
 """Number of stored frames in the local map of a place, the nearest ones to the recognised pose."""
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
 """Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
-DRIFT_ALLOWANCE = 0.05
-"""Drift that is plausible after any path, reference depths and radians."""
+DRIFT_ALLOWANCE, DRIFT_SHARE = 0.05, 0.1
+"""Drift that is plausible after any path, reference depths and radians, and further drift as a share of the path since
+the last visit; 1 rad of rotation counts as one reference depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class LoopVerifier:
         since = [pose.T_world_camera for pose in self._poses_since(place)]
         unit = self.atlas.unit
         path = step_lengths(np.reshape(since[::3], (-1, 4, 4)), unit).sum()  # every third pose: less jitter
-        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
+        limit = DRIFT_ALLOWANCE + DRIFT_SHARE * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
         return bool(np.linalg.norm(drift[:3, 3]) < limit * unit) and se3.rotation_angle(drift) < limit
 
@@ -86,7 +87,7 @@ class LoopVerifier:
             return None
         exposure = query.tracking.exposure
         found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
-        confirmed = place.is_confirmed(found, self.config.relocalization) and not monitor.misfit_reason(found)
+        confirmed = place.is_confirmed(found, self.atlas.unit) and not monitor.misfit_reason(found)
         return found.T_world_camera if confirmed else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:

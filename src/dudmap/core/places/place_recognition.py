@@ -22,6 +22,16 @@ from dudmap.core.places.features import SiftExtractor, match_descriptors, reduce
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.tracker import TrackingResult
 
+MAX_FEATURES, IMAGE_WIDTH = 400, 320
+"""Largest number of features of a frame, and width of the image in which they are detected, pixels."""
+RATIO = 0.85
+"""Threshold of the ratio test: nearest over second nearest descriptor distance (Lowe 2004: 0.8)."""
+MIN_INLIERS, MIN_SHARE = 15, 0.25
+"""Smallest number of RANSAC inliers of a match, and their smallest share among the matches with a keyframe."""
+MIN_ON_MAP = 0.4
+"""Smallest share of the measurements that are static and lie on the map at an accepted pose."""
+MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
+"""Largest correction of the feature-based pose by the registration, reference depths and degrees."""
 COARSE_FEATURES = 64
 """Number of strongest features per keyframe in the coarse comparison that selects keyframes for matching."""
 MAX_MATCHED = 5
@@ -103,14 +113,16 @@ class PlaceMatch:
     T_world_camera: NDArray[np.float64]
     num_inliers: int
 
-    def is_confirmed(self, found: TrackingResult, limits: RelocalizationConfig, static_share: float = 1.0) -> bool:
-        """Whether a registration of the frame confirms the pose from features; ``static_share``: static share of its
-        measurements."""
+    def is_confirmed(self, found: TrackingResult, unit: float, static_share: float = 1.0) -> bool:
+        """Whether a registration of the frame confirms the pose from features.
+
+        ``unit``: reference depth, metres. ``static_share``: static share of its measurements.
+        """
         return (
             found.converged
             and len(found.unobservable) == 0
-            and static_share * found.inlier_share >= limits.min_on_map
-            and agree(found.T_world_camera, self.T_world_camera, limits.max_distance, limits.max_angle_deg)
+            and static_share * found.inlier_share >= MIN_ON_MAP
+            and agree(found.T_world_camera, self.T_world_camera, MAX_CORRECTION * unit, MAX_CORRECTION_DEG)
         )
 
 
@@ -129,7 +141,7 @@ class KeyframeDatabase(Stateful):
         self.camera = camera
         self.sensor = sensor or SensorConfig()
         self.keyframes = []
-        self._sift = SiftExtractor(config.max_features)
+        self._sift = SiftExtractor(MAX_FEATURES)
         self._frames_since_last = config.keyframe_gap
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
@@ -149,7 +161,7 @@ class KeyframeDatabase(Stateful):
         return self._extract(observation, dynamic_mask)
 
     def _extract(self, observation: Observation, dynamic_mask: NDArray[np.bool_] | None) -> PlacedFeatures:
-        features = self._sift.extract(reduced_grey(observation.rgb, self.config.image_width))
+        features = self._sift.extract(reduced_grey(observation.rgb, IMAGE_WIDTH))
         if len(features) == 0:
             return NO_FEATURES
         height, width = observation.depth.shape
@@ -160,7 +172,7 @@ class KeyframeDatabase(Stateful):
         if dynamic_mask is not None:
             usable &= ~np.any(_neighbourhood(dynamic_mask, pixels), axis=1)
         order = np.argsort(-features.responses, kind="stable")
-        order = order[usable[order]][: self.config.max_features]
+        order = order[usable[order]][:MAX_FEATURES]
         u, v = pixels[order].T
         points = self.camera.points(u, v, depth[order].astype(np.float64))
         descriptors = features.descriptors[order]
@@ -177,7 +189,7 @@ class KeyframeDatabase(Stateful):
         """Make a tracked frame a keyframe if no keyframe of its submap is near; call with every tracked frame.
 
         A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. ``settle`` removes
-        it if it has fewer than ``relocalization.min_inliers`` features.
+        it if it has fewer than ``MIN_INLIERS`` features.
         """
         self.settle()
         self._frames_since_last += 1
@@ -216,14 +228,14 @@ class KeyframeDatabase(Stateful):
         if self.last is not None and len(self.last.keyframe.features) == 0:
             self.last.keyframe.features = self.extract(self.last.observation, self.last.dynamic_mask)
         last = [] if self.last is None else [self.last.keyframe]
-        return self.match(features, last, self.config.min_inliers // 2) + self.match(features)
+        return self.match(features, last, MIN_INLIERS // 2) + self.match(features)
 
     def settle(self) -> None:
         """Wait for the features of the newest keyframe, and remove it if they are too few."""
         features, self._unsettled = self._unsettled(), _nothing
         if features is None:
             return
-        if len(features) < self.config.min_inliers:
+        if len(features) < MIN_INLIERS:
             self.keyframes.pop()
             return
         self.keyframes[-1].features = features
@@ -235,23 +247,21 @@ class KeyframeDatabase(Stateful):
     ) -> list[PlaceMatch]:
         """Keyframes that match the features of a frame, each with the frame's pose; distinct poses, most inliers first.
 
-        ``among`` limits the keyframes (None = all). ``min_inliers`` None takes the configured number.
+        ``among`` limits the keyframes (None = all). ``min_inliers`` None takes ``MIN_INLIERS``.
         """
         among = self.keyframes if among is None else among
-        fewest = self.config.min_inliers if min_inliers is None else min_inliers
+        fewest = MIN_INLIERS if min_inliers is None else min_inliers
         if len(features) < fewest or not among:
             return []
         found: list[PlaceMatch] = []
         for keyframe in _most_similar(features, among):
-            pairs = match_descriptors(features.descriptors, keyframe.features.descriptors, self.config.ratio)
+            pairs = match_descriptors(features.descriptors, keyframe.features.descriptors, RATIO)
             if len(pairs) < fewest:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
-            T_keyframe_camera, inliers = rigid_ransac(
-                a, b, self._tolerance(a) + self._tolerance(b), self.config.min_share
-            )
+            T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b), MIN_SHARE)
             num_inliers = int(np.count_nonzero(inliers))
-            if num_inliers >= max(fewest, self.config.min_share * len(pairs)):
+            if num_inliers >= max(fewest, MIN_SHARE * len(pairs)):
                 found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
         found.sort(key=lambda match: -match.num_inliers)
         distinct, nearby = list[PlaceMatch](), DUPLICATE_DISTANCE * self.sensor.reference_depth

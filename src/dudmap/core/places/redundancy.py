@@ -18,6 +18,10 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
+MAX_ROTATION_DEG = 0.3
+"""Rotation since the last fused frame above which a view counts as new without the test, degrees: 0.7 pixels at the
+resolution of the labels."""
+
 
 @dataclass(eq=False)
 class _Place:
@@ -103,7 +107,7 @@ class RedundantViews(Stateful):
         volume.look_at(T_world_camera)
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)
-        on_surface = np.abs(sample.distance) < noise_threshold(self.config.dynamics, sigma)
+        on_surface = np.abs(sample.distance) < noise_threshold(self.config.sensor, sigma)
         return np.where(on_surface, volume.known_share(level.depth, level.camera, T_world_camera), np.float32(0))
 
     def _is_behind(self, place: _Place, level: Level, volume: TsdfVolume) -> NDArray[np.bool_]:
@@ -117,7 +121,7 @@ class RedundantViews(Stateful):
         config = self.config.similarity
         if config.max_translation == 0:
             return True
-        return agree(place.T_world_camera, T_world_camera, config.max_translation, config.max_rotation_deg)
+        return agree(place.T_world_camera, T_world_camera, config.max_translation, MAX_ROTATION_DEG)
 
 
 def _static(view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:

@@ -14,10 +14,13 @@ from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.place_recognition import MIN_INLIERS
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 
+MIN_READINGS = 0.2
+"""Smallest share of valid depth pixels in the first frame of a submap."""
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
 """Registers and labels the lost frame against a map, starting at a pose (4, 4) in the world of that map."""
 
@@ -87,10 +90,7 @@ class Relocalizer(Stateful):
         number of feature matches. The result is the first pose that its registration confirms and ``accept`` accepts.
         The view's timer records feature matching as stage ``recognise``.
         """
-        limits = self.config.relocalization
-        if not limits.enabled:
-            return None
-        if not view.observation.has_color:
+        if not (self.config.relocalization.enabled and view.observation.has_color):
             return None
         with view.timer("recognise"):
             keyframes = self.atlas.keyframes
@@ -107,7 +107,7 @@ class Relocalizer(Stateful):
             estimate = register(volume, T_features)
             tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
-            if candidate.is_confirmed(tracking, limits, static_share) and accept(tracking):
+            if candidate.is_confirmed(tracking, self.atlas.unit, static_share) and accept(tracking):
                 return Relocalization(estimate, submap)
         return None
 
@@ -126,7 +126,7 @@ class Relocalizer(Stateful):
         * The image motion is camera motion (``_shows_static_world``). The last lost image reveals fast people, and an
           image LONGEST_BASELINE older reveals slow people.
         """
-        config, observation = self.config.submaps, view.observation
+        observation = view.observation
         if not self.may_start_submaps or self._lost_since is None:
             return False
         while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
@@ -134,14 +134,14 @@ class Relocalizer(Stateful):
         recent = [(pyramid, segmentation) for _, pyramid, segmentation in self._recent]
         if self._compares_images:
             self._recent.append((view.timestamp, view.pyramid, view.segmentation()))
-        if observation.timestamp - self._lost_since < config.patience:
+        if observation.timestamp - self._lost_since < self.config.submaps.patience:
             return False
-        if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
+        if np.count_nonzero(observation.depth) < MIN_READINGS * observation.depth.size:
             return False
         timestamp, count = self._counted
         if timestamp != observation.timestamp and observation.has_color:  # relocalization is off
             count = len(self.atlas.keyframes.extract(observation))
-        if observation.has_color and count < self.config.relocalization.min_inliers:
+        if observation.has_color and count < MIN_INLIERS:
             return False
         if len(recent) < 2:
             return self._shows_static_world(recent[0] if recent else None, view)

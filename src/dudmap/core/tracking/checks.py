@@ -10,6 +10,7 @@ than their predecessors, but often within any fixed limit. Independent evidence 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,10 @@ CONFIRMED_SHARE, CONFIRMED_OF_SEEN = 0.5, 0.8
 """Smallest shares of measurements whose depth agrees with the last frame, of all and of those visible in it, to confirm
 a pose. They leave no room for a second motion. At a correct pose noise leaves 99.7 %, depth edges a few percent less.
 At wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
+MAX_RESIDUAL = 4.0
+"""Largest robust root mean square of the distance residuals, in standard deviations sigma(z) of a measurement."""
+MAX_DYNAMIC_SHARE = 0.9
+"""Largest share of dynamic measurements; above it the frame is lost."""
 STRICTNESS = {
     "tracking": (4.0, 4.0, 0.03),
     "mostly dynamic": (2.0, 4.0, 0.03),
@@ -48,6 +53,28 @@ USUAL_OVERLAP = 0.6
 """Smallest share of static measurements on the map after a loss, in multiples of the usual share."""
 
 
+class RegistrationRules(NamedTuple):
+    """Damping of a registration and limits of its result.
+
+    Attributes:
+        damping: Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1).
+        min_overlap: Smallest share of the static measurements that lie on the map.
+        min_condition: Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J.
+        min_information: Smallest information on a direction of motion with which the registration always moves along
+            it, in multiples of the information from gradient noise alone. Below it, the registration moves only if map
+            and image have the same texture along the direction. An endless tunnel gives 2 from noise. 0 always moves.
+    """
+
+    damping: float = 0.02
+    min_overlap: float = 0.15
+    min_condition: float = 1e-4
+    min_information: float = 2.3
+
+
+RULES = RegistrationRules()
+"""Rules of the camera's registration."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """Quantities that determine the limits of the checks.
@@ -55,7 +82,7 @@ class Limits:
     Attributes:
         config: Configured limits.
         sensor: Noise of the sensor.
-        max_dynamic_share: Configured largest share of dynamic measurements.
+        rules: Limits of the registration.
         mode: Key of STRICTNESS.
         mostly_dynamic: Most of the measurements are dynamic.
         blind: The image carries no information.
@@ -64,7 +91,7 @@ class Limits:
 
     config: TrackerConfig
     sensor: SensorConfig
-    max_dynamic_share: float = 1.0
+    rules: RegistrationRules = RULES
     mode: str = "tracking"
     mostly_dynamic: bool = False
     blind: bool = False
@@ -102,18 +129,18 @@ REGISTRATION = (
     Check("readings", lambda _: MIN_READINGS, "only {figure:.0f} static measurements fall on the map", at_least=True),
     Check(
         "overlap",
-        lambda limits: limits.config.min_inliers,
+        lambda limits: limits.rules.min_overlap,
         "only {figure:.0%} of the static measurements fall on the map",
         at_least=True,
     ),
     Check(
         "residual_mm",
-        lambda limits: limits.config.max_residual * limits.sigma_mm,
+        lambda limits: MAX_RESIDUAL * limits.sigma_mm,
         "measurements lie {figure:.1f} mm off the map",
     ),
     Check(
         "condition",
-        lambda limits: limits.config.min_condition,
+        lambda limits: limits.rules.min_condition,
         "the view does not constrain all directions of motion",
         at_least=True,
     ),
@@ -156,7 +183,7 @@ CHECKS = (
     *RELATIVE,
     Check(
         "dynamic_share",
-        lambda limits: limits.max_dynamic_share,
+        lambda _: MAX_DYNAMIC_SHARE,
         "{figure:.0%} of the measurements seem to move: the static world is ambiguous",
     ),
     Check(

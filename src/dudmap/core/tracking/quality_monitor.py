@@ -27,6 +27,7 @@ from dudmap.core.tracking.checks import (
     CONFIRMED_SHARE,
     MAX_IMAGE_SHIFT,
     RELATIVE,
+    RULES,
     Limits,
     first_failure,
 )
@@ -142,7 +143,7 @@ class ImageConsistency:
         )  # fmt: skip
         shift, agreeing, readings, seen = compare_images(
             level.depth, level.intensity, dynamic, gaps[0], differences[0], marks[0],
-            noise_parameters(self.config.dynamics, self.config.sensor, level, 0.0), MIN_PIXELS,
+            noise_parameters(self.config.sensor, level, 0.0), MIN_PIXELS,
             (level.ceiling, older.ceiling),
         )  # fmt: skip
         shift = np.nan if view.without_image or last.blind else shift
@@ -196,7 +197,7 @@ class QualityMonitor(Stateful):
     """Decides whether the registration of a frame can be trusted.
 
     Args:
-        config: ``tracker``, ``dynamics.max_share`` and the sensor's noise.
+        config: ``tracker`` and the sensor's noise.
         motion: Velocity of the camera.
     """
 
@@ -276,9 +277,8 @@ class QualityMonitor(Stateful):
     def limits(self, mode: str, *, mostly_dynamic: bool = False, blind: bool = False) -> Limits:
         """Configuration and medians of earlier registrations, from which limits follow; NaN before there are enough."""
         config, (residual, overlap, color) = self.config, self._usual
-        share = config.dynamics.max_share
         return Limits(
-            config.tracker, config.sensor, share, mode, mostly_dynamic, blind, 1000 * residual, overlap, color
+            config.tracker, config.sensor, RULES, mode, mostly_dynamic, blind, 1000 * residual, overlap, color
         )
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from dudmap.core.backends.parameters import (
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
+from dudmap.core.tracking.checks import REGISTRATION, RULES, Limits, RegistrationRules, first_failure
 from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, GradientAgreement, Observability, gradient_noise
 
 FINEST_DAMPING = 1e-4
@@ -27,6 +27,13 @@ FINEST_DAMPING = 1e-4
 weak directions, in which more damping shortens the steps until they seem converged."""
 NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0)
 """Rules for the normal equations at the initial pose, without a step."""
+COLOR_HUBER = 0.07
+"""Huber threshold of the intensity residual, intensity in [0, 1]."""
+STOP, STOP_COARSE = 5e-4, 1e-3
+"""Norms of the twist update (m, rad) below which the finest level and the coarser ones have converged (thesis algorithm
+2: 1e-3). They shrink with scenes that are smaller than a room."""
+STOP_GAIN = 3e-3
+"""Relative change of the cost below which a short step also ends a coarse level."""
 EXPOSURE_NOISE = 0.01
 """Largest change of gain and offset in total that is noise of the fit and not applied."""
 NEAREST_STEPS = 3
@@ -112,14 +119,20 @@ class Tracker:
         config: Residual weights, iterations, stop criteria, checks.
         sensor: Noise of the depth measurements.
         filter_px: Spatial standard deviation of the depth filter, pixels.
+        rules: Damping and limits.
     """
 
     def __init__(
-        self, config: TrackerConfig, sensor: SensorConfig, filter_px: float = PreprocessConfig().smoothing_px
+        self,
+        config: TrackerConfig,
+        sensor: SensorConfig,
+        filter_px: float = PreprocessConfig().smoothing_px,
+        rules: RegistrationRules = RULES,
     ) -> None:
         self.config = config
         self.sensor = sensor
         self.filter_px = filter_px
+        self.rules = rules
         self._sigma = sensor.reference_sigma
 
     def align(
@@ -247,7 +260,7 @@ class Tracker:
         parameters: RegistrationParameters,
     ) -> Observability:
         """Directions that a level determines at a pose; all directions if too little is on the map to decide."""
-        least, R = self.config.min_information, T_world_camera[:3, :3]
+        least, R = self.rules.min_information, T_world_camera[:3, :3]
         if least == 0:
             return COMPLETE
         noise = gradient_noise(
@@ -288,10 +301,10 @@ class Tracker:
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
         """Step rules of a level for all directions."""
-        config, basis = self.config, COMPLETE.observable
+        basis, damping, unit = COMPLETE.observable, self.rules.damping, min(self.sensor.reference_depth, 1.0)
         if finest:
-            return DescentRules(basis, min(config.damping, FINEST_DAMPING), limit, config.stop, stop_gain=0.0)
-        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain)
+            return DescentRules(basis, min(damping, FINEST_DAMPING), limit, STOP * unit, stop_gain=0.0)
+        return DescentRules(basis, damping, limit, STOP_COARSE * unit, STOP_GAIN)
 
     def linearize(
         self,
@@ -316,7 +329,7 @@ class Tracker:
             band=band,
             huber=config.huber,
             color_weight=config.color_weight if color_weight is None else color_weight,
-            color_huber=config.color_huber,
+            color_huber=COLOR_HUBER,
             sigma_at_reference=self._sigma,
         )
 
@@ -344,5 +357,5 @@ class Tracker:
             T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
             color_residual, found.settled, found.seen.unobservable, system.weight,
         )  # fmt: skip
-        reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor))
+        reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules))
         return replace(result, converged=False, reason=reason) if reason else result
