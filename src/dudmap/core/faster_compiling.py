@@ -1,6 +1,7 @@
-"""Changes to Numba that speed up its compilations, for all code of the process; made before the first compilation.
+"""Changes of Numba that shorten its compilations, for all code of the process; made when the first kernel is compiled.
 
-Together they save a quarter of the compilation time. A process that loads all its kernels changes nothing.
+35 kernels take 69.7 s of a processor with all changes, 80.2 s without ``_optimize_callers`` and 81.9 s without
+``_compare_flags_at_once`` (one run each, on a busy machine). A process that loads all its kernels changes nothing.
 """
 
 import gc

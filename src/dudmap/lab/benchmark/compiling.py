@@ -38,8 +38,8 @@ class _Times(event.Listener):
 
 
 def _caller() -> str:
-    """The nearest function of dudmap on the stack that is not of the cache or the decorators."""
-    own = {__name__, "dudmap.core.backends.threads", "dudmap.core.kernel_cache"}
+    """The nearest function of dudmap on the stack that is not of the cache, the decorators or the threads."""
+    own = {__name__, "dudmap.core.backends.cpu.teams", "dudmap.core.backends.threads", "dudmap.core.kernel_cache"}
     frame = sys._getframe()
     while frame.f_back is not None:
         frame = frame.f_back
@@ -68,7 +68,7 @@ def compile_all(steps: list[tuple[str, Callable[[], object]]]) -> dict[str, Any]
 
 
 def compile_warmup(_: None = None) -> dict[str, Any]:
-    """``compile_all`` of what ``dudmap warmup`` compiles."""
+    """``compile_all`` of the steps of ``dudmap warmup``."""
     from dudmap.lab.warmup import steps
 
     return compile_all(steps())
