@@ -20,6 +20,7 @@ FOUNDATION = {
     "own_folder",
     "config_section",
     "thesis_config",
+    "version",
 }
 """Modules of the root, which every part may import, and which import only each other."""
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from dudmap.version import __version__
 
 _HOMES = {
     "Calibration": "core.geometry.calibration",

@@ -12,9 +12,9 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from dudmap import __version__
 from dudmap.errors import DudmapError
 from dudmap.extras import install
+from dudmap.version import __version__
 
 COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
 """Message before a first frame without compiled kernels."""

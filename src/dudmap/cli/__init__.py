@@ -18,9 +18,10 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
-from dudmap import __version__, interruption
+from dudmap import interruption
 from dudmap.cli.options import arranged, grouped
 from dudmap.errors import DudmapError
+from dudmap.version import __version__
 
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dudmap import __version__
+from dudmap.version import __version__
 
 
 def peak_rss_mb() -> float | None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dudmap import __version__
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run_folder import WRITTEN
 from dudmap.app.viewing.metrics_table import metrics_table
@@ -28,6 +27,7 @@ from dudmap.core.geometry.mesh_simplification import simplified
 from dudmap.errors import DudmapError, FrameError, printable
 from dudmap.input_files import damaged
 from dudmap.own_folder import OwnFolder, make_folder, remove_files
+from dudmap.version import __version__
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.frame_source import FrameRead

@@ -57,7 +57,7 @@ def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64] | None = None, *, doubl
         T_gltf_mesh: (4, 4) motion of its node; None keeps the axes of the mesh.
         double_sided: Whether its back can be seen.
     """
-    from dudmap import __version__
+    from dudmap.version import __version__
 
     T = np.eye(4) if T_gltf_mesh is None else T_gltf_mesh
     low, high = mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import __version__
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
+from dudmap.version import __version__
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera

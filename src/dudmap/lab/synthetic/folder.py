@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import __version__
 from dudmap.errors import DatasetError
 from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.version import __version__
 
 PENDING = 8
 """Largest number of frames waiting to be written."""
