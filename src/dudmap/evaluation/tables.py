@@ -13,6 +13,9 @@ FORMATS = {"md": "md", "csv": "csv", "latex": "tex"}
 Cells = list[str] | tuple[str, ...]
 """Texts of one line of a table."""
 
+Row = dict[str, Any]
+"""One row of a table: sequence, system and metrics by name, or ``error`` with a sentence."""
+
 
 class Column(NamedTuple):
     """Format of one metric: heading with unit, factor from the stored unit, number of decimals."""

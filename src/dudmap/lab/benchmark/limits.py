@@ -7,8 +7,7 @@ The share of people in the image grows, for several speeds, for several camera p
 from collections.abc import Collection
 from typing import Any
 
-from dudmap.evaluation.tables import grid
-from dudmap.lab.benchmark.measure import Row
+from dudmap.evaluation.tables import Row, grid
 from dudmap.lab.data import tables
 
 LARGEST_ATE = 0.02

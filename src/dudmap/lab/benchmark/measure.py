@@ -22,7 +22,7 @@ from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
-from dudmap.evaluation.tables import Column, grid, shown
+from dudmap.evaluation.tables import Column, Row, grid, shown
 from dudmap.evaluation.trajectory import RUN_FIGURES, accuracy, ate
 from dudmap.io.exporting.mesh_editing import cropped
 from dudmap.lab.benchmark.suites import PASSES, Entry
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
     from dudmap.io.sequences import Sequence
 
-Row = dict[str, Any]
-"""One row of a table: sequence, system and metrics by name, or ``error`` with a sentence."""
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
 """Metrics of a trajectory; the drift is measured after aligning the first pose only."""
 COMPLETE_WITHIN = 0.02
