@@ -98,3 +98,25 @@ def test_every_key_has_a_meaning():
 def test_parts_are_frozen():
     with pytest.raises(ValueError, match="frozen"):
         Config().tracker.huber = 1.0  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"volume": {"voxel_sizee": 0.02}}, "the nearest known key is 'volume.voxel_size'"),
+        ({"volume": {"voxel_size": "large"}}, "volume.voxel_size = 'large' is not acceptable"),
+        ({"preset": "thesis"}, "--system thesis"),
+    ],
+)
+def test_a_configuration_made_in_python_gives_the_same_errors_as_a_file(values, said):
+    with pytest.raises(ConfigError) as made:
+        Config(**values)
+    with pytest.raises(ConfigError) as read:
+        Config.from_tree(values)
+    assert str(made.value) == str(read.value)
+    assert said in str(made.value)
+
+
+def test_sections_are_given_as_mappings_or_as_objects():
+    by_mapping = Config(volume={"voxel_size": 0.02})
+    assert by_mapping == Config(volume=by_mapping.volume) == Config().override(["volume.voxel_size=0.02"])

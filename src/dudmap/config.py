@@ -265,6 +265,22 @@ class Config(ConfigSection):
     movers: MoversConfig = MoversConfig()
     thesis: ThesisConfig = ThesisConfig()
 
+    def __init__(self, **values: Any) -> None:  # noqa: ANN401 - sections, mappings and values alike
+        """Parameters by section: ``Config(volume={"voxel_size": 0.02})``.
+
+        Raises:
+            ConfigError: A key is unknown or a value invalid.
+        """
+        tree = {key: value.model_dump() if isinstance(value, ConfigSection) else value for key, value in values.items()}
+        tree = without_gone(tree)
+        _check_keys(tree)
+        try:
+            super().__init__(**tree)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"]) or "configuration"
+            raise ConfigError(f"{key} = {first['input']!r} is not acceptable: {first['msg']}") from None
+
     @classmethod
     def for_range(cls, name: str) -> "Config":
         """The defaults for a ``near`` (0.1 to 0.5 m), ``room`` or ``far`` (6 to 15 m) scene, see ``dudmap.ranges``.
@@ -300,12 +316,7 @@ class Config(ConfigSection):
         """
         tree = without_gone(tree)
         _check_keys(tree)
-        try:
-            return cls.model_validate(_merged(scaled(cls().model_dump(), size), tree))
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"]) or "configuration"
-            raise ConfigError(f"{key} = {first['input']!r} is not acceptable: {first['msg']}") from None
+        return cls(**_merged(scaled(cls().model_dump(), size), tree))
 
     def override(self, assignments: Iterable[str]) -> "Config":
         """Configuration with assignments ``key=value`` applied, e.g. ``tracker.huber=0.02``.
@@ -329,7 +340,7 @@ class Config(ConfigSection):
             branch[parts[-1]] = _value(text.strip())
         known = without_gone(tree)
         _check_keys(known)
-        return self.from_tree(_merged(self.model_dump(), known))
+        return Config(**_merged(self.model_dump(), known))
 
     def check_used(self) -> None:
         """Refuse changed parameters that ``system`` does not have.
