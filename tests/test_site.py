@@ -13,7 +13,7 @@ from dudmap.cli import COMMANDS, application_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-SHOWN = ["first-mesh.md", "extending.md"]
+SHOWN = ["first-mesh.md", "extending.md", "python.md"]
 
 
 def blocks():

@@ -21,6 +21,7 @@ _HOMES = {
     "MissingExtraError": "errors",
     "Mover": "core.objects.object_tracker",
     "RunObserver": "app.pipeline.observer",
+    "SavedMap": "core.places.saved_map",
     "Sequence": "io.sequences",
     "Slam": "core.slam",
     "Trajectory": "core.geometry.trajectory",
@@ -49,6 +50,7 @@ __all__ = [
     "MissingExtraError",
     "Mover",
     "RunObserver",
+    "SavedMap",
     "Sequence",
     "Slam",
     "Trajectory",
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.core.map.volume import TsdfVolume
     from dudmap.core.objects.object_tracker import Mover
+    from dudmap.core.places.saved_map import SavedMap
     from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
     from dudmap.errors import (
