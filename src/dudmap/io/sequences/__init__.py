@@ -1,7 +1,7 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple, replace
 from functools import cache
 from importlib import import_module
@@ -119,6 +119,10 @@ class Recording(ABC):
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames in the order of time."""
+        return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
         """Frame number ``index``.
