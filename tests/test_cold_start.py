@@ -146,10 +146,10 @@ def test_what_a_second_process_compiles_are_parts_of_the_system():
 def test_the_second_process_compiles_what_a_run_needs_after_its_first_poses():
     """In a process of its own, since others may have loaded these kernels."""
     program = """
-from dudmap.core.backends.cpu import color_pairs, consensus, labeling, linear_systems, rectification, segment_motion
+from dudmap.core.backends.cpu import color_pairs, labeling, linear_systems, rectification, segment_motion
 from dudmap.lab import warmup
 later = color_pairs.linearize_pairs, linear_systems.solve, rectification.rectify, labeling.fit_mixture._alone
-later += segment_motion.stand_still, consensus.count_votes, labeling.upsample
+later += segment_motion.stand_still, labeling.upsample
 assert not any(kernel.signatures for kernel in later)
 parts = dict(warmup.steps())
 for name in warmup.DURING_RUN:

@@ -85,7 +85,7 @@ def test_a_map_is_exposed_as_usual_though_the_camera_begins_in_the_dark(recordin
 @pytest.mark.parametrize(
     "assignments",
     [
-        ["sensor.sigma_scale=0", "tracker.exposure=false"],
+        ["sensor.sigma_base=0.005", "sensor.sigma_scale=0", "tracker.exposure=false"],
         ["volume.weighting=constant", "volume.carving=false"],
         ["volume.truncation_voxels=6", "volume.truncation_behind_voxels=3"],
         ["preprocess.filter=none", "preprocess.fill_holes=false"],

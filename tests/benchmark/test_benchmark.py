@@ -60,7 +60,7 @@ def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
 def test_recordings_are_found_one_folder_down(data):
     suite = find_suite("thesis", data)
     assert [entry.name for entry in suite.entries] == ["rgbd_dataset_freiburg3_walking_xyz"]
-    assert len(suite.missing) == 11
+    assert len(suite.missing) == 12
     assert len(find_suite("local", data / "tum").entries) == 1
     assert find_suite("tum-dynamic", data, quick=True).entries[0].max_frames == 60
     (one,) = find_suite("tum-dynamic", suite.entries[0].path).entries  # the recording itself

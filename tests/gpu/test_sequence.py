@@ -25,7 +25,7 @@ def processed(frames, device):
 
 @pytest.fixture(scope="module")
 def runs():
-    recording = sequence(frames=FRAMES, camera=CAMERA.resized(320, 240), noise="none")
+    recording = sequence(frames=FRAMES, camera=CAMERA.resized(320, 240), noise="none", start_dynamic=True)
     frames = [recording[index] for index in range(FRAMES)]
     return [processed(frames, device) for device in ("cpu", "warp-cpu", "warp-cpu")]
 

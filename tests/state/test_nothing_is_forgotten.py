@@ -24,7 +24,7 @@ NO_STATE = {
     "threads, files, and what is of one process": (
         "BlockPager._returned", "BlockPager._store", "SiftExtractor._detector", "FrameStore._encoder",
         "FrameStore._file", "FrameStore._pending", "LoopCloser._executor", "StageTimer._running", "StageTimer._stage",
-        "StageTimer._within", "TsdfVolume.map_id",
+        "StageTimer._within", "TsdfVolume.map_id", "_Uncollected._nested", "_Uncollected._collects",
     ),
     "observers, which begin anew": (
         "IncrementalMesh._coords_of", "IncrementalMesh._map_id", "IncrementalMesh._seen", "IncrementalMesh.chunks",

@@ -288,7 +288,7 @@ class Slam(SlamResults, Stateful):
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
         restarted = T_world_camera is not None
-        return self._result(view, None, mask, T_world_camera=T_start, fused=True, corrected=restarted)
+        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True, corrected=restarted)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
@@ -372,8 +372,9 @@ class Slam(SlamResults, Stateful):
     ) -> bool:
         """Update the calibration of the colour camera; returns whether the next frame uses a new one."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
-        if calibrated:  # the colours move relative to the last image
+        if calibrated:  # earlier images have colours registered with another calibration
             self.predictor.ego_motion.reset()
+            self.bootstrap.abandon()
         return calibrated
 
     def _result(

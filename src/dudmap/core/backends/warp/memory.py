@@ -1,6 +1,7 @@
 """Device arrays: persistent copies of the map, upload and download of images."""
 
-# Warp's annotations say float for any type of number
+# Warp's annotations name float for any type of number
+# pyright: reportArgumentType=false, reportReturnType=false
 
 from typing import Any
 
