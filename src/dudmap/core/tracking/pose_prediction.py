@@ -174,8 +174,7 @@ class PosePredictor(Stateful):
         (``was_moving`` in the last one), or if it lasts since the start of the map.
 
         Returns:
-            The pixels (h, w) bool not verified as static if most of the view moves, else None. Whether it has moved in
-            more than this frame.
+            The pixels (h, w) bool not verified as static if most of the view moves, else None.
         """
         young = self.ego_motion.map_is_young(view.timestamp)
         self._mostly_moving = is_majority_dynamic(moving, view.labelled)
