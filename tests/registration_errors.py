@@ -13,7 +13,7 @@ from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
-from dudmap.core.tracking.tracker import Tracker
+from dudmap.core.tracking.tracker import STOP, Tracker
 from dudmap.io.sequences import Sequence
 
 ITERATIONS = 8
@@ -82,7 +82,7 @@ def _registered(
         damped = H + np.diag(DAMPING * diagonal + 1e-12 * (1 + diagonal.max()))
         step = np.asarray(-np.linalg.solve(damped, b), dtype=np.float64)
         T = se3.retract(T, step)
-        if np.linalg.norm(step) < tracker.config.stop / 10:
+        if np.linalg.norm(step) < STOP / 10:
             break
     return T
 

@@ -166,7 +166,7 @@ def test_a_tree_of_another_type_is_refused_with_its_place(node, match, path):
     (tuple[int, str], {"items": [1], "id": 1}, "found 1 values; expected 2"),
     (MotionModel, {"state": {}, "id": 1}, "found a MotionModel, which a new object of this kind does not have"),
     (Config, {"json": "{}", "__class__": 1, "id": 1}, ""),
-    (Config, {"json": '{"no such section": 1}', "id": 1}, "ValidationError"),
+    (Config, {"json": '{"no such section": 1}', "id": 1}, "ConfigError unknown configuration key"),
     (list[str], {"items": {"stack": 0}, "id": 1}, "found other values than"),
     (Callable[[], str], {"result": 1, "id": 1}, "found int; expected str"),
     (TsdfVolume, {"map": 0, "state": {}, "id": 1}, "KeyError 'settings'"),

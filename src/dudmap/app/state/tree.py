@@ -27,7 +27,7 @@ from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.state import Stateful, remembered
-from dudmap.errors import DatasetError, StateError
+from dudmap.errors import ConfigError, DatasetError, StateError
 from dudmap.input_files import DAMAGE, parse_json
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ class TreeReader:
         self._at = [name]
         try:
             return self._value(self._tree[name], hint, current)
-        except (*DAMAGE, DatasetError, MemoryError) as error:
+        except (*DAMAGE, DatasetError, ConfigError, MemoryError) as error:
             what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
             place = "".join(self._at)
             raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
