@@ -204,7 +204,7 @@ class Slam(SlamResults, Stateful):
                 self.motion.apply_correction(correction)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_first_frame(view, prediction)
-        if prediction.restart is not None:
+        if prediction.restart is not None and self.prior_map is None:
             return self._restart_map(view, prediction.restart)
         last = self.predictor.ego_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
