@@ -9,6 +9,7 @@ import numpy as np
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.verdict import ACCEPTED, Verdict
 from recordings import HEIGHT, WIDTH
 
 TRIANGLE = Mesh(
@@ -36,7 +37,7 @@ class FakeResult:
     calibrated: bool = False
     rejected: str = ""
     repeats: str = ""
-    checks: dict = field(default_factory=dict)
+    verdict: Verdict = ACCEPTED
     unobservable: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0

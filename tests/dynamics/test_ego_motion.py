@@ -16,11 +16,12 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.mapper import Mapper
 from dudmap.core.slam import Slam
-from dudmap.core.tracking.checks import RELATIVE, first_failure
+from dudmap.core.tracking.checks import RELATIVE, judged
 from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import ACCEPTED
 from dudmap.evaluation.trajectory import ate
 from dudmap.lab import synthetic
 from rendered import Rendered
@@ -218,14 +219,14 @@ def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
 
 
 def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
-    good = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.002, 0.01, 3, 0.01)
+    good = TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, 0.9, 0.002, 0.01, 3, 0.01)
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
     for _ in range(6):
         monitor.accept(good)
     dragged = replace(good, residual=0.0045).figures
-    assert not first_failure(RELATIVE, dragged, monitor.limits("tracking"))
-    assert "4.5 mm" in first_failure(RELATIVE, dragged, monitor.limits("mostly dynamic"))
-    assert not first_failure(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("mostly dynamic"))
+    assert judged(RELATIVE, dragged, monitor.limits("tracking")).accepted
+    assert "4.5 mm" in judged(RELATIVE, dragged, monitor.limits("mostly dynamic")).reason
+    assert judged(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("mostly dynamic")).accepted
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

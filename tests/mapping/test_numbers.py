@@ -19,6 +19,7 @@ from dudmap.core.map.volume import TsdfVolume, fusion_parameters
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.frame_view import PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import ACCEPTED
 from dudmap.fleet.map_fusion import MAX_COUNT, BlockSums, fused
 from dudmap.lab import synthetic
 
@@ -139,7 +140,7 @@ def run_from(place, camera, frames, monkeypatch):
     """Poses relative to the first, and the mesh, of a run that begins at a place (3,)."""
     T = np.eye(4)
     T[:3, 3] = place
-    start = classmethod(lambda cls, gain, _: cls(TrackingResult(T, (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0)))
+    start = classmethod(lambda cls, gain, _: cls(TrackingResult(T, (gain, 0.0), ACCEPTED, 1.0, 0.0, 1.0, 0)))
     monkeypatch.setattr(PoseEstimate, "at_origin", start)
     slam = Slam(camera, CONFIG)
     results = [slam.process(frame) for frame in frames]

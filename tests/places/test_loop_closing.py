@@ -22,6 +22,7 @@ from dudmap.core.places.loop_verification import LoopQuery, LoopVerifier
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
+from dudmap.core.verdict import ACCEPTED
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import moved
 from dudmap.lab.synthetic.recording import SyntheticSequence
@@ -80,7 +81,7 @@ def query_of(T, timestamp):
     """A tracked frame without images at a pose."""
     image = np.zeros(TINY.shape, np.float32)
     observation = Observation(timestamp, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
-    tracking = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
+    tracking = TrackingResult(T, (1.0, 0.0), ACCEPTED, 0.9, 0.001, 0.1, 5)
     return LoopQuery(observation, [], tracking, np.zeros(TINY.shape, dtype=bool))
 
 
@@ -111,7 +112,7 @@ def test_drift_must_be_plausible_for_the_path():
     turn = se3.exp(np.array([0, 0, 0, 0, 0.06, 0]))
     for drift, plausible in ((shifted(0.05), True), (shifted(0.06), False), (turn, False)):
         place = PlaceMatch(atlas.keyframes.keyframes[0], T @ drift, 20)
-        assert verifier.is_plausible(place, T) == plausible
+        assert verifier.plausibility(place, T).accepted == plausible
 
 
 @pytest.mark.parametrize("off_now", [True, False])
@@ -143,7 +144,7 @@ def test_a_correction_is_confirmed_by_the_search_that_follows_or_not_at_all(monk
     corrected = []
     T = atlas.poses[-1].T_world_camera
     drift = shifted(0.3)
-    monkeypatch.setattr(loops.verifier, "is_plausible", lambda *_: True)
+    monkeypatch.setattr(loops.verifier, "plausibility", lambda *_: ACCEPTED)
     monkeypatch.setattr(loops.verifier, "register", lambda *_: drift @ T)
     monkeypatch.setattr(loops.verifier, "is_drifted", lambda *_: True)
     monkeypatch.setattr(loops, "_correct", lambda *_: corrected.append(True))

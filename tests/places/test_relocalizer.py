@@ -13,9 +13,11 @@ from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, Place
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import ACCEPTED, Outcome, Verdict
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)
-GOOD = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
+FAILED = Verdict((Outcome("check", reason="it failed"),))
+GOOD = TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, 0.9, 0.001, 0.1, 5)
 
 
 def shifted(x):
@@ -74,7 +76,7 @@ class Registration:
         return PoseEstimate(replace(self.tracking, T_world_camera=shifted(self.moved) @ T_init), self.labels)
 
 
-def recover(subject, register, accept=lambda tracking: True, known_dynamic=None):
+def recover(subject, register, judge=lambda tracking: ACCEPTED, known_dynamic=None):
     level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
     view = FrameView(
         frame(5.0),
@@ -83,7 +85,7 @@ def recover(subject, register, accept=lambda tracking: True, known_dynamic=None)
         StageTimer(),
         known_dynamic,
     )
-    return subject.recover(view, register, accept)
+    return subject.recover(view, register, judge)
 
 
 def lost_view(timestamp, depth=1.0):
@@ -102,22 +104,24 @@ def test_the_features_of_a_lost_frame_are_found_once():
     subject = relocalizer(overrides=["submaps.patience=0.0", "dynamics.start_seconds=0"])
     recover(subject, Registration())
     subject.lost(5.0)
-    assert subject.wants_new_submap(lost_view(5.0))
+    assert subject.start_verdict(lost_view(5.0)).accepted
     assert len(subject.atlas.keyframes.masks) == 1
-    assert subject.wants_new_submap(lost_view(6.0))  # which nobody tried to recognise
+    assert subject.start_verdict(lost_view(6.0)).accepted  # which nobody tried to recognise
     assert len(subject.atlas.keyframes.masks) == 2
 
 
 def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
     subject, register = relocalizer([match(0, 0.1), match(1, 0.2), match(0, 0.3), match(1, 0.4)]), Registration()
-    assert recover(subject, register, accept=lambda tracking: False) is None
+    assert recover(subject, register, judge=lambda tracking: FAILED) is None
     assert register.calls == [("map 1", 0.2), ("map 1", 0.4), ("map 0", 0.1), ("map 0", 0.3)]
     assert subject.atlas.current == 1
 
 
 def test_the_first_verified_candidate_is_returned_with_its_submap():
     subject, register = relocalizer([match(1, 0.2), match(0, 0.1), match(0, 0.3)]), Registration(labels=None)
-    result = recover(subject, register, accept=lambda tracking: tracking.T_world_camera[0, 3] < 0.15)
+    result = recover(
+        subject, register, judge=lambda tracking: ACCEPTED if tracking.T_world_camera[0, 3] < 0.15 else FAILED
+    )
     assert (result.submap, result.estimate.T_world_camera[0, 3], result.estimate.labels) == (0, 0.1, None)
     assert len(register.calls) == 2
     assert subject.atlas.current == 1
@@ -127,7 +131,7 @@ def test_the_first_verified_candidate_is_returned_with_its_submap():
     ("register", "passes"),
     [
         (Registration(), True),
-        (Registration(replace(GOOD, converged=False)), False),
+        (Registration(replace(GOOD, verdict=FAILED)), False),
         (Registration(replace(GOOD, inlier_share=0.39)), False),
         (Registration(replace(GOOD, inlier_share=0.41)), True),
         (Registration(moved=0.05), True),
@@ -161,15 +165,15 @@ def test_a_second_pass_verifies_against_the_map_of_the_first():
 
 def test_a_new_submap_is_wanted_after_a_while():
     subject = relocalizer(overrides=["dynamics.start_seconds=0"])
-    assert not subject.wants_new_submap(lost_view(100.0))  # not lost
+    assert not subject.start_verdict(lost_view(100.0)).accepted  # not lost
     subject.lost(1.0)
     subject.lost(1.5)  # lost since 1.0 still
     assert subject.is_lost
-    assert not subject.wants_new_submap(lost_view(1.9))
-    assert subject.wants_new_submap(lost_view(2.1))
+    assert not subject.start_verdict(lost_view(1.9)).accepted
+    assert subject.start_verdict(lost_view(2.1)).accepted
     subject.found()
     assert not subject.is_lost
-    assert not subject.wants_new_submap(lost_view(2.1))
+    assert not subject.start_verdict(lost_view(2.1)).accepted
 
 
 @pytest.mark.parametrize(
@@ -179,13 +183,13 @@ def test_a_new_submap_is_wanted_after_a_while():
 def test_reasons_against_a_new_submap(options):
     subject = relocalizer(**options)
     subject.lost(0.0)
-    assert not subject.wants_new_submap(lost_view(10.0))
+    assert not subject.start_verdict(lost_view(10.0)).accepted
 
 
 def test_a_frame_without_depth_starts_no_submap():
     subject = relocalizer()
     subject.lost(0.0)
-    assert not subject.wants_new_submap(lost_view(10.0, depth=0.0))
+    assert not subject.start_verdict(lost_view(10.0, depth=0.0)).accepted
 
 
 def motion_of(*, moving_share, share):
@@ -206,8 +210,8 @@ def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, sh
     monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: motion)
     subject = relocalizer()
     subject.lost(0.0, mostly_dynamic=crowded)
-    assert not subject.wants_new_submap(lost_view(0.5))
-    assert subject.wants_new_submap(lost_view(10.0)) == wanted
+    assert not subject.start_verdict(lost_view(0.5)).accepted
+    assert subject.start_verdict(lost_view(10.0)).accepted == wanted
 
 
 @pytest.mark.parametrize("slow", [False, True])
@@ -223,7 +227,7 @@ def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeyp
     for timestamp in np.arange(0.1, 3, 0.1):
         view = lost_view(timestamp)
         view.pyramid = timestamp
-        wanted.append(subject.wants_new_submap(view))
+        wanted.append(subject.start_verdict(view).accepted)
     assert any(wanted) != slow
 
 
@@ -232,7 +236,7 @@ def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monke
     monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: None)
     subject = relocalizer()
     subject.lost(0.0, mostly_dynamic=crowded)
-    assert subject.wants_new_submap(lost_view(10.0)) != crowded
+    assert subject.start_verdict(lost_view(10.0)).accepted != crowded
 
 
 def test_lost_images_from_before_the_camera_was_found_are_not_compared(monkeypatch):
@@ -241,8 +245,8 @@ def test_lost_images_from_before_the_camera_was_found_are_not_compared(monkeypat
     monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *pair: compared.append(pair))
     subject = relocalizer()
     subject.lost(0.0)
-    assert not subject.wants_new_submap(lost_view(0.5))
+    assert not subject.start_verdict(lost_view(0.5)).accepted
     subject.found()
     subject.lost(1.0)
-    assert subject.wants_new_submap(lost_view(10.0))
+    assert subject.start_verdict(lost_view(10.0)).accepted
     assert not compared

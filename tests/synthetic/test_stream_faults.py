@@ -99,8 +99,12 @@ def observation(stamp, seed=None, scale=1.0):
     return Observation(stamp, SMALL, depth, np.zeros((60, 80), np.float32), color)
 
 
+def name_of(verdict):
+    return "".join(one.name for one in verdict.failed)
+
+
 def kinds(check, stamps):
-    return [found.kind if (found := check.rejection(observation(stamp))) else "" for stamp in stamps]
+    return [name_of(check.judge(observation(stamp))) for stamp in stamps]
 
 
 def test_stamps_must_increase():
@@ -129,10 +133,10 @@ def test_one_wrong_stamp_changes_nothing_but_a_clock_set_forwards_is_believed():
 def test_repeated_images_are_recognised():
     check = StreamCheck(5.0)
     frozen = observation(0.0)
-    assert check.rejection(frozen) is None
+    assert check.judge(frozen).accepted
     repeats = []
     for stamp, depth, rgb in ((0.1, 0.0, 0.0), (0.2, 0.0, 0.2), (0.3, 0.3, 0.2), (0.4, 0.4, 0.4)):
-        assert check.rejection(replace(observation(depth), rgb=observation(rgb).rgb, timestamp=stamp)) is None
+        assert check.judge(replace(observation(depth), rgb=observation(rgb).rgb, timestamp=stamp)).accepted
         repeats.append(check.repeats)
     assert repeats == ["frame", "depth", "color", ""]
 
@@ -141,8 +145,8 @@ def test_change_of_the_unit_is_recognised_until_it_is_taken_back():
     check = StreamCheck(5.0)
     stamps = np.arange(9) / 10
     scales = [1, 1, 0.2, 0.2, 0.2, 1, 1, 3, 1]
-    found = [check.rejection(observation(t, scale=s)) for t, s in zip(stamps, scales, strict=True)]
-    assert [item.kind if item else "" for item in found] == ["", "", "unit", "unit", "unit", "", "", "unit", ""]
+    found = [check.judge(observation(t, scale=s)) for t, s in zip(stamps, scales, strict=True)]
+    assert [name_of(verdict) for verdict in found] == ["", "", "unit", "unit", "unit", "", "", "unit", ""]
     assert "0.2" in found[2].reason
 
 

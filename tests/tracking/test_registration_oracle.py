@@ -15,10 +15,11 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.se3 import retract
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.tracking.checks import RELATIVE, RegistrationRules, first_failure
+from dudmap.core.tracking.checks import RELATIVE, RegistrationRules, judged
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
+from dudmap.core.verdict import ACCEPTED
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 
@@ -88,7 +89,7 @@ def test_alignment_finds_a_known_motion(volume):
     )
     result = tracker.align(volume, [coarse, level_of(frame)], np.eye(4))
     error = se3.inverse(se3.exp(xi)) @ result.T_world_camera
-    assert result.converged
+    assert result.accepted
     assert np.linalg.norm(error[:3, 3]) < 0.003
     assert np.degrees(se3.rotation_angle(error)) < 0.15
 
@@ -171,8 +172,8 @@ def test_a_view_of_nothing_known_is_not_converged(volume):
     away = np.eye(4)
     away[0, 3] = 30.0
     result = tracker.align(volume, [level_of(corner())], away)
-    assert not result.converged
-    assert "fall on the map" in result.reason
+    assert not result.accepted
+    assert "fall on the map" in result.verdict.reason
 
 
 def test_a_flat_wall_without_texture_is_degenerate():
@@ -181,7 +182,7 @@ def test_a_flat_wall_without_texture_is_degenerate():
     for _ in range(3):
         volume.integrate(flat, np.eye(4))
     result = Tracker(TrackerConfig(widths=(80,), iterations=(5,)), SENSOR).align(volume, [level_of(flat)], np.eye(4))
-    assert result.converged
+    assert result.accepted
     assert result.unobservable.shape == (3, 6)
     assert np.allclose(result.T_world_camera, np.eye(4), atol=1e-4)
 
@@ -224,13 +225,13 @@ def test_constant_velocity_goes_on_and_stops_some_time_after_a_loss():
 
 def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
     def result(residual: float, share: float) -> TrackingResult:
-        return TrackingResult(np.eye(4), (1.0, 0.0), True, "", share, residual, 0.1, 3)
+        return TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, share, residual, 0.1, 3)
 
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
 
     def doubt(tracking: TrackingResult) -> str:
         mode = "recovering" if monitor.recovering else "tracking"
-        return first_failure(RELATIVE, tracking.figures, monitor.limits(mode))
+        return judged(RELATIVE, tracking.figures, monitor.limits(mode)).reason
 
     for _ in range(10):
         assert doubt(result(0.001, 0.9)) == ""
@@ -269,8 +270,8 @@ def test_distances_are_judged_in_units_of_the_noise_at_their_depth(far, sigmas, 
     # a Huber constant beyond all residuals, so that the mean square is that of the offset
     result = Tracker(TrackerConfig(huber=1.0), SENSOR, rules=ANY).judge(volume, level, np.eye(4), ones(level))
     assert result.residual == pytest.approx(sigmas * sigma_one, rel=0.1)
-    assert result.converged is (not reason)
-    assert reason in result.reason
+    assert result.accepted is (not reason)
+    assert reason in result.verdict.reason
 
 
 @pytest.mark.parametrize("exposure", [False, True])

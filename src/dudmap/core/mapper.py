@@ -19,6 +19,7 @@ from dudmap.core.tracking.color_motion import ColorMotion, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer, initial_weights
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.tracker import Tracker
+from dudmap.core.verdict import Outcome, Verdict
 
 WINDOW, WINDOW_STEP = 30, 2
 """Number of fused frames after which the poses of a new map are refined, and step between the refined frames."""
@@ -99,11 +100,12 @@ class Bootstrap(Stateful):
         self._window = []
 
     @staticmethod
-    def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:
-        """Reason why a frame cannot start a map, empty if it can."""
+    def verdict(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> Verdict:
+        """Whether a frame can start a map."""
         depth = view.observation.depth
-        enough = np.count_nonzero(depth[~dynamic_mask]) >= MIN_READINGS * depth.size
-        return "" if enough else "the depth image has hardly any measurements"
+        share = np.count_nonzero(depth[~dynamic_mask]) / depth.size
+        sparse = "the depth image has hardly any measurements"
+        return Verdict((Outcome.of("static_depth_share", share, MIN_READINGS, sparse, at_least=True),))
 
     def start(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Record the frame that starts a map."""
@@ -290,7 +292,7 @@ class Mapper:
             color_weight *= motion_discount(level, velocity, time_sigma, volume.voxel_size)
             weights = initial_weights([level], None, [fused.dynamic_mask])
             found = tracker.align(volume, [level], fused.T_world_camera, weights, finest, fused.exposure, color_weight)
-            if not found.converged:
+            if not found.accepted:
                 return None
             Ts.append(found.T_world_camera)
         before = np.stack([fused.T_world_camera for fused in window])

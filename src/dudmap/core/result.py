@@ -1,6 +1,6 @@
 """Results of a system: the result of each frame, and the maps, trajectories and calibration so far."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -28,6 +28,7 @@ from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.motion_model import GivenRole
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import ACCEPTED, Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class FrameResult:
             prediction (``core/tracking/observability.py``). Such a frame is ``uncertain``.
         repeats: Part that equals the frame before bit for bit: the whole ``frame``, its ``depth`` or its ``color``. A
             frame with repeated colour is tracked by its distances alone (``blind``).
-        checks: Values of all checks of the frame (``tracking/checks.py``), NaN if unknown; empty without registration.
+        verdict: Outcomes of the checks that decided on the frame (``tracking/checks.py``); empty without registration.
     """
 
     timestamp: float
@@ -88,7 +89,7 @@ class FrameResult:
     calibrated: bool = False
     rejected: str = ""
     repeats: Repeats = ""
-    checks: Mapping[str, float] = field(default_factory=dict)
+    verdict: Verdict = ACCEPTED
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
 
     def __repr__(self) -> str:

@@ -16,7 +16,7 @@ from dudmap.core.dynamics.ego_motion import Restart
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
-from dudmap.core.frames.stream_check import Rejection, StreamCheck
+from dudmap.core.frames.stream_check import StreamCheck
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import make_volume
@@ -28,7 +28,7 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.loop_closing import LoopCloser
 from dudmap.core.places.loop_verification import LoopQuery
 from dudmap.core.places.redundancy import RedundantViews
-from dudmap.core.places.relocalizer import Relocalizer
+from dudmap.core.places.relocalizer import Relocalization, Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import FrameResult, SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
@@ -40,6 +40,7 @@ from dudmap.core.tracking.motion_model import GivenRole, MotionModel
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
+from dudmap.core.verdict import Verdict
 
 
 class Slam(SlamResults, Stateful):
@@ -187,9 +188,10 @@ class Slam(SlamResults, Stateful):
     def _processed(self, view: FrameView) -> FrameResult:
         """``process`` for a prepared frame; the result shares memory with the state of the system."""
         with view.timer("check"):
-            rejection = self.stream.rejection(view.observation) or self.motion.missing
-        if rejection:
-            return self._reject(view, rejection)
+            arrival = self.stream.judge(view.observation)
+            arrival = self.motion.verdict if arrival.accepted else arrival
+        if not arrival.accepted:
+            return self._reject(view, arrival)
         view = self._resumed(view)
         if self.stream.repeats in ("frame", "depth") and self._last is not None:
             return self._repeat(view, self._last)
@@ -209,11 +211,12 @@ class Slam(SlamResults, Stateful):
         last = self.predictor.ego_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
         registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
-        reason = self.relocalizer.reason or verdict.reason
-        relocalized = self._relocalize(view, prediction) if reason else None
-        estimate = relocalized or estimate
-        if reason and not relocalized:
-            return replace(self._lose(view, estimate, reason), checks=verdict.figures)
+        verdict = self.relocalizer.verdict + verdict
+        relocalized = None if verdict.accepted else self._relocalize(view, prediction)
+        if relocalized is not None:
+            estimate, verdict = relocalized.estimate, relocalized.verdict
+        if not verdict.accepted:
+            return replace(self._lose(view, estimate, verdict.reason), verdict=verdict)
         view = registered if relocalized is None else self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
@@ -226,7 +229,7 @@ class Slam(SlamResults, Stateful):
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
             corrected=corrected, find_movers=self.objects.update(view, estimate), uncertain=uncertain,
-            calibrated=calibrated, checks=verdict.figures,
+            calibrated=calibrated, verdict=verdict,
         )  # fmt: skip
 
     def _rectified(self, view: FrameView) -> FrameView:
@@ -238,9 +241,9 @@ class Slam(SlamResults, Stateful):
             known = None if view.known_dynamic is None else view.known_dynamic.reshape(-1)[observation.sources]
             return replace(FrameView.of(observation, self.config, self.detector), timer=view.timer, known_dynamic=known)
 
-    def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
+    def _reject(self, view: FrameView, verdict: Verdict) -> FrameResult:
         nothing = np.zeros_like(view.observation.readings)
-        return self._result(view, None, nothing, reason=rejection.reason, rejected=rejection.kind)
+        return self._result(view, None, nothing, reason=verdict.reason, rejected=verdict.failed[0].name)
 
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the frame before, or its depth.
@@ -275,8 +278,9 @@ class Slam(SlamResults, Stateful):
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
         self.bootstrap.textureless = view.textureless
-        if reason := self.bootstrap.rejection_reason(view, mask):
-            return self._result(view, None, mask, reason=reason)
+        verdict = self.bootstrap.verdict(view, mask)
+        if not verdict.accepted:
+            return self._result(view, None, mask, reason=verdict.reason, verdict=verdict)
         self.motion.restart(view.timestamp, estimate.T_world_camera)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
@@ -290,28 +294,28 @@ class Slam(SlamResults, Stateful):
         restarted = T_world_camera is not None
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True, corrected=restarted)
 
-    def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
+    def _relocalize(self, view: FrameView, prediction: PosePrediction) -> Relocalization | None:
         """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
         self.monitor.lose()
         view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
-            lambda tracking: not self.monitor.misfit_reason(tracking),
+            self.monitor.misfit,
         )
         if found is None:
             return None
         self.atlas.switch_to(found.submap)
         self.bootstrap.abandon()
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
-        return found.estimate
+        return found
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         mostly_dynamic = self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
         self.relocalizer.lost(view.timestamp, mostly_dynamic=mostly_dynamic)
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
-        if self.relocalizer.wants_new_submap(view):
+        if self.relocalizer.start_verdict(view).accepted:
             return self._start_submap(replace(view, blind=False))
         return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
 

@@ -20,6 +20,7 @@ from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 
 if TYPE_CHECKING:
     from dudmap.core.objects.object_tracker import Mover
+    from dudmap.core.verdict import Verdict
     from dudmap.errors import FrameError
 
 STRIDE = 4
@@ -36,7 +37,7 @@ class RunRecord:
         rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
         lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read or had another size.
-        checks: Metrics per registered frame (``core/tracking/checks.py``).
+        checks: Figure and limit of all checks per registered frame (``core/tracking/checks.py``).
         repeated: Number of frames that repeat the previous frame, its depth or its colour, by the repeated part.
         rejected: Number of frames rejected for a fault of the stream, by kind. Frames with a readable image of the
             correct size are lost as well.
@@ -112,9 +113,8 @@ class RunRecord:
             self._reject(result.rejected)
         if result.repeats:
             self.repeated[result.repeats] = self.repeated.get(result.repeats, 0) + 1
-        if result.checks:
-            known = {name: float(f"{figure:.4g}") for name, figure in result.checks.items() if np.isfinite(figure)}
-            self.checks.append(frame | known)
+        if result.verdict.outcomes:
+            self.checks.append(frame | _columns(result.verdict))
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.labels is not None:
@@ -154,7 +154,7 @@ class RunRecord:
         _write_table(path, self.rows, "0")
 
     def save_checks(self, path: Path) -> None:
-        """Write a CSV file with one row per registered frame and one column per metric; unknown ones are empty."""
+        """Write a CSV file with one row per registered frame; unknown figures and limits are empty."""
         _write_table(path, self.checks, "")
 
     def save_movers(self, path: Path) -> None:
@@ -225,6 +225,19 @@ def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())
+
+
+def _columns(verdict: "Verdict") -> dict[str, Any]:
+    """Figure and limit of each check by column, the failed checks, and the evidence that overruled others."""
+    figures = dict[str, float]()
+    for one in verdict.outcomes:
+        figures |= {one.name: one.figure, f"{one.name}_{'min' if one.at_least else 'max'}": one.limit}
+    overruled = (f"{one.name}: {one.overruled_by}" for one in verdict.outcomes if one.overruled_by)
+    return {
+        **{name: float(f"{value:.7g}") if np.isfinite(value) else "" for name, value in figures.items()},
+        "failed": "; ".join(one.name for one in verdict.failed),
+        "overruled": "; ".join(overruled),
+    }
 
 
 def _row(mover: "Mover") -> dict[str, Any]:

@@ -2,14 +2,16 @@
 
 import statistics
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.frames.observation import Observation
 from dudmap.core.state import Remembered, Stateful
+from dudmap.core.verdict import ACCEPTED, Outcome, Verdict
 
 INTERVALS = 30
 """Number of recent intervals between stamps; their median is the usual interval."""
@@ -36,14 +38,6 @@ Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 """Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""
 Repeats = Literal["", "frame", "depth", "color"]
 """The part of a frame that equals the previous frame bit for bit."""
-
-
-class Rejection(NamedTuple):
-    """Reason why a frame is not used: the key of its counter (``duplicate``, ``order``, ``burst``, ``clock`` or
-    ``unit``), and a sentence."""
-
-    kind: str
-    reason: str
 
 
 class StreamCheck(Stateful):
@@ -85,30 +79,34 @@ class StreamCheck(Stateful):
             return observation
         return replace(observation, timestamp=observation.timestamp + self.clock_offset)
 
-    def rejection(self, observation: Observation) -> Rejection | None:
-        """Reason why a frame cannot be used, None if it can. Each frame must be checked once, in order of arrival.
+    def judge(self, observation: Observation) -> Verdict:
+        """Whether a frame can be used. Each frame must be checked once, in order of arrival.
+
+        The checks are ``clock``, ``duplicate``, ``order``, ``burst`` and ``unit``.
 
         A frame that proves a clock reset is accepted and changes ``clock_offset``; the caller then calls ``restamped``.
         """
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
         self.repeats = "" if before is None else repeated(before, self._before)
-        return self._wrong_stamp(observation.timestamp) or self._changed_unit(observation)
+        verdict = self._stamp_verdict(observation.timestamp)
+        return verdict + Verdict((self._unit_outcome(observation),)) if verdict.accepted else verdict
 
     # -- stamps --------------------------------------------------------------------------------------------------------
 
-    def _wrong_stamp(self, raw: float) -> Rejection | None:
+    def _stamp_verdict(self, raw: float) -> Verdict:
         if not np.isfinite(raw):
-            return Rejection("clock", f"the frame has the stamp {raw}; expected seconds")
+            return Verdict((Outcome("clock", raw, np.nan, f"the frame has the stamp {raw}; expected seconds"),))
         arrived, self._arrived = self._arrived, raw
         interval = None if arrived is None else raw - arrived
         stamp = raw + self.clock_offset
-        rejection = self._contradiction(stamp)
-        if rejection is not None:
+        verdict = Verdict.of(self._stamp_outcomes(stamp))
+        if not verdict.accepted:
             agree = not self._contradicting or 0 <= raw - self._contradicting[-1] <= FURTHEST_STEP
             self._contradicting = [*self._contradicting, raw] if agree else [raw]
-            if len(self._contradicting) < AGREEING or rejection.kind in ("duplicate", "burst"):
-                return rejection
-            if rejection.kind == "order":
+            [failure] = verdict.failed
+            if len(self._contradicting) < AGREEING or failure.name in ("duplicate", "burst"):
+                return verdict
+            if failure.name == "order":
                 assert self._last_stamp is not None
                 self.clock_offset += self._last_stamp + self._usual_interval - stamp
                 stamp = raw + self.clock_offset
@@ -116,23 +114,21 @@ class StreamCheck(Stateful):
         if interval is not None and 0 < interval <= FURTHEST_STEP:
             self._intervals.append(interval)
         self._last_stamp = stamp
-        return None
+        return ACCEPTED
 
-    def _contradiction(self, stamp: float) -> Rejection | None:
-        """Reason why a stamp cannot follow the last used one."""
+    def _stamp_outcomes(self, stamp: float) -> Iterator[Outcome]:
+        """Whether a stamp can follow the last used one, seconds."""
         if self._last_stamp is None:
-            return None
-        step = stamp - self._last_stamp
-        if step == 0:
-            return Rejection("duplicate", f"a frame with the stamp {stamp:.6f} s has arrived before")
-        if step < 0:
-            return Rejection("order", f"the frame was taken {-step:.3f} s before the last one that was used")
-        if len(self._intervals) >= AGREEING and step < BURST_SHARE * self._usual_interval:
-            usual = 1000 * self._usual_interval
-            return Rejection("burst", f"the frame is {1000 * step:.1f} ms after the last; expected {usual:.0f} ms")
-        if step > FURTHEST_STEP:
-            return Rejection("clock", f"the frame is {step:.0f} s after the last; later frames must confirm this step")
-        return None
+            return
+        step, usual = stamp - self._last_stamp, self._usual_interval
+        known = f"a frame with the stamp {stamp:.6f} s has arrived before"
+        yield Outcome.of("duplicate", step == 0, 0, known)
+        yield Outcome.of("order", -step, 0, "the frame was taken {figure:.3f} s before the last one that was used")
+        if len(self._intervals) >= AGREEING:
+            early = f"the frame is {1000 * step:.1f} ms after the last; expected {1000 * usual:.0f} ms"
+            yield Outcome.of("burst", step, BURST_SHARE * usual, early, at_least=True)
+        late = "the frame is {figure:.0f} s after the last; later frames must confirm this step"
+        yield Outcome.of("clock", step, FURTHEST_STEP, late)
 
     @property
     def _usual_interval(self) -> float:
@@ -140,7 +136,7 @@ class StreamCheck(Stateful):
 
     # -- images --------------------------------------------------------------------------------------------------------
 
-    def _changed_unit(self, observation: Observation) -> Rejection | None:
+    def _unit_outcome(self, observation: Observation) -> Outcome:
         depth, stamp = observation.depth[::STRIDE, ::STRIDE].copy(), observation.timestamp
         compared = self._compared
         if np.count_nonzero(depth) >= MIN_PIXELS:
@@ -150,10 +146,11 @@ class StreamCheck(Stateful):
             self._unit += np.log(factor)
         elif compared is not None and np.count_nonzero(depth) >= MIN_PIXELS:
             self._unit = 0.0  # after a pause the unit is unknown
-        if abs(self._unit) < np.log(SMALLEST_FACTOR):
+        change, smallest = abs(self._unit), float(np.log(SMALLEST_FACTOR))
+        if change < smallest:
             self._unit = 0.0
-            return None
-        return Rejection("unit", f"the depth unit changed: all depths changed by the factor {np.exp(self._unit):.3g}")
+        reason = f"the depth unit changed: all depths changed by the factor {np.exp(self._unit):.3g}"
+        return Outcome.of("unit", change, smallest, reason)
 
 
 def repeated(before: Images, after: Images) -> Repeats:

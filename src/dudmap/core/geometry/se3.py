@@ -240,12 +240,16 @@ def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Mat
     return interpolate(Ts[after - 1], Ts[after], (timestamp - start) / (end - start))
 
 
+def difference(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance (m) and angle (deg) between two poses (4, 4)."""
+    apart = T_a[:3, 3] - T_b[:3, 3]
+    return math.sqrt(apart @ apart), math.degrees(rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]))
+
+
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
     """Whether two poses (4, 4) differ by less than a distance (m) and an angle (deg)."""
-    apart = T_a[:3, 3] - T_b[:3, 3]
-    if math.sqrt(apart @ apart) >= distance:
-        return False
-    return math.degrees(rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])) < angle_deg
+    apart, turned = difference(T_a, T_b)
+    return apart < distance and turned < angle_deg
 
 
 LARGEST_SKEW = 0.02

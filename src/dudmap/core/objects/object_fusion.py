@@ -270,8 +270,8 @@ class ObjectFusion(Stateful):
         T_object_camera = result.T_world_camera
         track.last_seen = now
         track.registrations += 1
-        if not result.converged:
-            track.misfits.append(result.reason)
+        if not result.accepted:
+            track.misfits.append(result.verdict.reason)
             track.velocity = np.concatenate([mover.velocity, np.zeros(3)])
             track.T_world_object = predictions[1]
             return

@@ -152,7 +152,7 @@ class LoopCloser(Stateful):
             # the feature pose is less accurate than the registration
             if in_current and agree(place.T_world_camera, T, 1.5 * distance, 1.5 * NO_DRIFT_DEG):
                 return self._confirm_no_drift(place, query)
-            if in_current and not self.verifier.is_plausible(place, T):
+            if in_current and not self.verifier.plausibility(place, T).accepted:
                 continue
             T_found = self.verifier.register(place, query, monitor)
             if T_found is None:

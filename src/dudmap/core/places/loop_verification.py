@@ -22,6 +22,7 @@ from dudmap.core.places.place_recognition import PlaceMatch
 from dudmap.core.tracking.frame_view import static_weights
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
+from dudmap.core.verdict import Outcome, Verdict
 
 LOCAL_FRAMES = 8
 """Number of stored frames in the local map of a place, the nearest ones to the recognised pose."""
@@ -65,7 +66,7 @@ class LoopVerifier:
         self.atlas = atlas
         self.tracker = tracker
 
-    def is_plausible(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> bool:
+    def plausibility(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> Verdict:
         """Whether the path since the last visit of a place of the current submap explains the implied drift.
 
         ``T_world_camera``: tracked pose (4, 4) of the frame.
@@ -75,7 +76,10 @@ class LoopVerifier:
         path = step_lengths(np.reshape(since[::3], (-1, 4, 4)), unit).sum()  # every third pose: less jitter
         limit = DRIFT_ALLOWANCE + DRIFT_SHARE * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
-        return bool(np.linalg.norm(drift[:3, 3]) < limit * unit) and se3.rotation_angle(drift) < limit
+        distance, angle = float(np.linalg.norm(drift[:3, 3])), se3.rotation_angle(drift)
+        far = "the path explains a drift of {limit:.2f}, not of {figure:.2f} "
+        moved = Outcome.of("drift_m", distance, limit * unit, far + "m")
+        return Verdict((moved, Outcome.of("drift_rad", angle, limit, far + "rad")))
 
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose (4, 4) of a frame in a local map of frames stored up to the time of the place, or in its saved map.
@@ -87,8 +91,8 @@ class LoopVerifier:
             return None
         exposure = query.tracking.exposure
         found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
-        confirmed = place.is_confirmed(found, self.atlas.unit) and not monitor.misfit_reason(found)
-        return found.T_world_camera if confirmed else None
+        verdict = place.verdict(found, self.atlas.unit) + monitor.misfit(found)
+        return found.T_world_camera if verdict.accepted else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
         """Whether a correction improves the fit of the newest frame to the map of the time of a place.

@@ -17,10 +17,11 @@ from dudmap.core.backends.threads import submit
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.alignment import rigid_ransac
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.geometry.se3 import agree
+from dudmap.core.geometry.se3 import agree, difference
 from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import Outcome, Verdict
 
 MAX_FEATURES, IMAGE_WIDTH = 400, 320
 """Largest number of features of a frame, and width of the image in which they are detected, pixels."""
@@ -113,17 +114,20 @@ class PlaceMatch:
     T_world_camera: NDArray[np.float64]
     num_inliers: int
 
-    def is_confirmed(self, found: TrackingResult, unit: float, static_share: float = 1.0) -> bool:
+    def verdict(self, found: TrackingResult, unit: float, static_share: float = 1.0) -> Verdict:
         """Whether a registration of the frame confirms the pose from features.
 
         ``unit``: reference depth, metres. ``static_share``: static share of its measurements.
         """
-        return (
-            found.converged
-            and len(found.unobservable) == 0
-            and static_share * found.inlier_share >= MIN_ON_MAP
-            and agree(found.T_world_camera, self.T_world_camera, MAX_CORRECTION * unit, MAX_CORRECTION_DEG)
-        )
+        distance, angle_deg = difference(found.T_world_camera, self.T_world_camera)
+        seen = "only {figure:.0%} of the measurements are static and on the map"
+        off = "the registration corrects the pose of the features by {figure:.2g} "
+        return found.verdict + Verdict((
+            Outcome.of("unobservable", len(found.unobservable), 0, "{figure:.0f} directions of motion are unobserved"),
+            Outcome.of("on_map", static_share * found.inlier_share, MIN_ON_MAP, seen, at_least=True),
+            Outcome.of("correction_m", distance, MAX_CORRECTION * unit, off + "m"),
+            Outcome.of("correction_deg", angle_deg, MAX_CORRECTION_DEG, off + "deg"),
+        ))  # fmt: skip
 
 
 class KeyframeDatabase(Stateful):

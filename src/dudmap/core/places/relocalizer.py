@@ -1,7 +1,7 @@
 """Relocalization: the pose of a lost frame from recognised keyframes, and the decision to start a new submap."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from dudmap.core.places.place_recognition import MIN_INLIERS
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import Outcome, Verdict
 
 MIN_READINGS = 0.2
 """Smallest share of valid depth pixels in the first frame of a submap."""
@@ -32,6 +33,7 @@ class Relocalization:
 
     estimate: PoseEstimate
     submap: int
+    verdict: Verdict
 
 
 class Relocalizer(Stateful):
@@ -66,9 +68,10 @@ class Relocalizer(Stateful):
         self._place_unknown = True
 
     @property
-    def reason(self) -> str:
-        """Reason to trust no registration from a predicted pose, empty if there is none."""
-        return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
+    def verdict(self) -> Verdict:
+        """Whether to trust a registration from a predicted pose."""
+        reason = "the camera has not been recognised in the saved map yet"
+        return Verdict((Outcome("place_unknown", 1, 0, reason),) if self._place_unknown else ())
 
     def lost(self, timestamp: float, *, mostly_dynamic: bool = False) -> None:
         """Record a lost frame (timestamp in seconds); ``mostly_dynamic``: most of the view moved in the last tracked
@@ -82,12 +85,12 @@ class Relocalizer(Stateful):
         self._recent.clear()
 
     def recover(
-        self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
+        self, view: FrameView, register: Register, judge: Callable[[TrackingResult], Verdict]
     ) -> Relocalization | None:
         """Pose of a lost frame, verified by registration against the map; None if no candidate passes.
 
         Candidates in the current submap are tried first: the pose by the last tracked frame, then poses by decreasing
-        number of feature matches. The result is the first pose that its registration confirms and ``accept`` accepts.
+        number of feature matches. The result is the first pose that its registration confirms and ``judge`` accepts.
         The view's timer records feature matching as stage ``recognise``.
         """
         if not (self.config.relocalization.enabled and view.observation.has_color):
@@ -107,8 +110,9 @@ class Relocalizer(Stateful):
             estimate = register(volume, T_features)
             tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
-            if candidate.is_confirmed(tracking, self.atlas.unit, static_share) and accept(tracking):
-                return Relocalization(estimate, submap)
+            verdict = candidate.verdict(tracking, self.atlas.unit, static_share) + judge(tracking)
+            if verdict.accepted:
+                return Relocalization(estimate, submap, verdict)
         return None
 
     @property
@@ -116,7 +120,7 @@ class Relocalizer(Stateful):
         """Whether a map may be discarded for a new, empty one."""
         return self.config.submaps.enabled and self.atlas.history is not None
 
-    def wants_new_submap(self, view: FrameView) -> bool:
+    def start_verdict(self, view: FrameView) -> Verdict:
         """Whether to start a new, empty submap with this lost frame.
 
         All of these conditions must hold:
@@ -126,26 +130,30 @@ class Relocalizer(Stateful):
         * The image motion is camera motion (``_shows_static_world``). The last lost image reveals fast people, and an
           image LONGEST_BASELINE older reveals slow people.
         """
-        observation = view.observation
-        if not self.may_start_submaps or self._lost_since is None:
-            return False
+        return Verdict.of(self._start_outcomes(view))
+
+    def _start_outcomes(self, view: FrameView) -> Iterator[Outcome]:
+        observation, since = view.observation, self._lost_since
+        possible = self.may_start_submaps and since is not None
+        yield Outcome.of("may_start", possible, 1, "no other map may be started", at_least=True)
+        assert since is not None
         while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
             self._recent.popleft()
         recent = [(pyramid, segmentation) for _, pyramid, segmentation in self._recent]
         if self._compares_images:
             self._recent.append((view.timestamp, view.pyramid, view.segmentation()))
-        if observation.timestamp - self._lost_since < self.config.submaps.patience:
-            return False
-        if np.count_nonzero(observation.depth) < MIN_READINGS * observation.depth.size:
-            return False
+        lost, patience = observation.timestamp - since, self.config.submaps.patience
+        yield Outcome.of("lost_s", lost, patience, "the camera is lost for {figure:.1f} s", at_least=True)
+        share, sparse = np.count_nonzero(observation.depth) / observation.depth.size, "only {figure:.0%} of the depth"
+        yield Outcome.of("depth_share", share, MIN_READINGS, sparse, at_least=True)
         timestamp, count = self._counted
         if timestamp != observation.timestamp and observation.has_color:  # relocalization is off
             count = len(self.atlas.keyframes.extract(observation))
-        if observation.has_color and count < MIN_INLIERS:
-            return False
-        if len(recent) < 2:
-            return self._shows_static_world(recent[0] if recent else None, view)
-        return self._shows_static_world(recent[-1], view) and self._shows_static_world(recent[0], view)
+        if observation.has_color:
+            yield Outcome.of("features", count, MIN_INLIERS, "only {figure:.0f} features", at_least=True)
+        for before in [recent[-1], recent[0]] if len(recent) > 1 else recent or [None]:
+            static = self._shows_static_world(before, view)
+            yield Outcome.of("static_world", static, 1, "the motion may not be the camera's", at_least=True)
 
     @property
     def _compares_images(self) -> bool:

@@ -1,6 +1,6 @@
 """All checks of a registered frame: one table of metric, limit and reason.
 
-All metrics are computed for every frame and reported (``FrameResult.checks``). The first failed check rejects the
+All metrics are computed for every frame and reported (``FrameResult.verdict``). The first failed check rejects the
 frame.
 
 Relative checks compare a frame with the frames before. They find registrations in a wrong minimum, which fit much worse
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.core.verdict import Outcome, Verdict
 
 MIN_READINGS = 100
 """Smallest number of static measurements on the map: well above the six unknowns of a registration."""
@@ -116,6 +117,7 @@ class Check:
         at_least: The limit is a lower bound instead of an upper bound.
         overruled_by: Evidence that overrules the check: the ``last frame``, seen from the pose, has the same depth and
             image; or the ``corners`` of the last image support the pose.
+        name: Name of the check; empty for the name of the metric.
     """
 
     figure: str
@@ -123,6 +125,12 @@ class Check:
     reason: str
     at_least: bool = False
     overruled_by: str = ""
+    name: str = ""
+
+    def outcome(self, figures: Mapping[str, float], limits: Limits) -> Outcome:
+        """Outcome of the check before it is overruled."""
+        figure, limit = figures[self.figure], self.limit(limits)
+        return Outcome.of(self.name or self.figure, figure, limit, self.reason, at_least=self.at_least)
 
 
 REGISTRATION = (
@@ -153,6 +161,7 @@ RELATIVE = (
         lambda limits: max(STRICTNESS[limits.mode][0] * limits.residual_mm, limits.sigma_mm),
         "measurements lie {figure:.1f} mm off the map, at most {limit:.1f} mm were to be expected",
         overruled_by="last frame",
+        name="usual_residual_mm",
     ),
     Check(
         "overlap",
@@ -160,6 +169,7 @@ RELATIVE = (
         "only {figure:.0%} of the static measurements fall on the map, at least {limit:.0%} were to be expected",
         at_least=True,
         overruled_by="last frame",
+        name="usual_overlap",
     ),
     # two walls of a room have the same shape, but different texture
     Check(
@@ -208,13 +218,13 @@ CHECKS = (
 """All checks of a frame, in order of application."""
 
 
-def first_failure(
+def judged(
     checks: Sequence[Check],
     figures: Mapping[str, float],
     limits: Limits,
     evidence: Mapping[str, Callable[[], bool]] | None = None,
-) -> str:
-    """Reason of the first check that fails and is not overruled; empty if there is none.
+) -> Verdict:
+    """Outcomes of all checks. After the first failed one, no evidence is evaluated.
 
     Args:
         checks: The checks.
@@ -222,9 +232,13 @@ def first_failure(
         limits: Quantities that determine the limits.
         evidence: Functions that decide on overruling, by name; None for no evidence.
     """
+    outcomes, failed = list[Outcome](), evidence is None
     for check in checks:
-        figure, limit = figures[check.figure], check.limit(limits)
-        fails = figure < limit if check.at_least else figure > limit
-        if fails and not (evidence and check.overruled_by and evidence[check.overruled_by]()):
-            return check.reason.format(figure=figure, limit=limit)
-    return ""
+        outcome = check.outcome(figures, limits)
+        if outcome.reason and not failed:
+            assert evidence is not None
+            if check.overruled_by and evidence[check.overruled_by]():
+                outcome = outcome._replace(overruled_by=check.overruled_by)
+            failed = not outcome.passed
+        outcomes.append(outcome)
+    return Verdict(tuple(outcomes))

@@ -18,6 +18,7 @@ from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced,
 from dudmap.core.state import CACHE
 from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import ACCEPTED
 
 
 class StageTimer:
@@ -188,7 +189,7 @@ class PoseEstimate:
         """Estimate of the first frame of a map. Its colours times ``gain`` are the colours of the map. It defines the
         world frame unless its pose (4, 4) is given."""
         T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera
-        return cls(TrackingResult(T_world_camera, (gain, 0.0), True, "", 1.0, 0.0, 1.0, 0))
+        return cls(TrackingResult(T_world_camera, (gain, 0.0), ACCEPTED, 1.0, 0.0, 1.0, 0))
 
     @property
     def T_world_camera(self) -> NDArray[np.float64]:

@@ -20,8 +20,9 @@ from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, SAME_POSE, PosePrediction
-from dudmap.core.tracking.quality_monitor import QualityMonitor, Verdict
+from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
+from dudmap.core.verdict import Verdict
 
 NO_CHANCE = 3
 """Significance of an improvement: excess of improved over worsened measurements, in standard deviations of chance."""
@@ -78,7 +79,7 @@ class FrontEnd(Stateful):
         """
         estimate = self.register(volume, view, prediction)
         verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
-        if not verdict.reason or view.blind:
+        if verdict.accepted or view.blind:
             return view, estimate, verdict
         if self._brightness is not None and self._is_relit(view):
             other_view = replace(view, blind=True)
@@ -90,7 +91,7 @@ class FrontEnd(Stateful):
         else:
             return view, estimate, verdict
         judged = self.monitor.judge(last, other_view, other, prediction.image_pose)
-        accepted = not judged.reason and other.is_observed
+        accepted = judged.accepted and other.is_observed
         return (other_view, other, judged) if accepted else (view, estimate, verdict)
 
     def _is_relit(self, view: FrameView) -> bool:
@@ -131,7 +132,7 @@ class FrontEnd(Stateful):
             return estimate
         other = self.register_from(volume, view, replace(prediction, moving=moving), T_image)
         misfit, other_misfit = (sum(self.monitor.relative_misfit(e.tracking)) for e in (estimate, other))
-        better = other.tracking.converged and (not tracking.converged or other_misfit < CLEARLY_BETTER * misfit)
+        better = other.tracking.accepted and (not tracking.accepted or other_misfit < CLEARLY_BETTER * misfit)
         return other if better else estimate
 
     @staticmethod

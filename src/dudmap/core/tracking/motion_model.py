@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from dudmap.config import TrackerConfig
 from dudmap.core.frames.observation import Level
-from dudmap.core.frames.stream_check import Rejection
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
+from dudmap.core.verdict import Outcome, Verdict
 from dudmap.errors import ConfigError
 
 GivenRole = Literal["estimated", "given", "refined"]
@@ -75,10 +75,10 @@ class MotionModel(Stateful):
         self._T_given = None if T_world_camera is None else se3.checked_pose(T_world_camera)
 
     @property
-    def missing(self) -> Rejection | None:
-        """Reason to reject the next frame, or None."""
+    def verdict(self) -> Verdict:
+        """Whether the next frame has the pose that it needs."""
         lacks = self.poses == "given" and self._T_given is None
-        return Rejection("pose", "no pose is given for the frame") if lacks else None
+        return Verdict((Outcome.of("pose", lacks, 0, "no pose is given for the frame"),))
 
     @property
     def is_given(self) -> bool:

@@ -6,7 +6,7 @@ does not reveal this, because walls and desks resemble each other; their texture
 
 import statistics
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -29,11 +29,12 @@ from dudmap.core.tracking.checks import (
     RELATIVE,
     RULES,
     Limits,
-    first_failure,
+    judged,
 )
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.core.verdict import Outcome, Verdict
 
 CLEARLY_LESS = 0.5
 """Another motion explains two images clearly better if its misregistration is below this share. Noise and blur add half
@@ -180,19 +181,6 @@ class RegistrationHistory:
     colors: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Outcome of the checks of a frame.
-
-    Attributes:
-        reason: Reason of the rejection; empty for an accepted frame.
-        figures: All metrics by name, NaN if unknown.
-    """
-
-    reason: str
-    figures: dict[str, float] = field(default_factory=dict)
-
-
 class QualityMonitor(Stateful):
     """Decides whether the registration of a frame can be trusted.
 
@@ -236,7 +224,7 @@ class QualityMonitor(Stateful):
     def judge(
         self, last: TrackedImage | None, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose
     ) -> Verdict:
-        """Metrics of a registered frame, and the reason of the first failed check of ``CHECKS``.
+        """Outcomes of ``CHECKS`` for a registered frame. A given pose is never rejected: its outcomes have no limits.
 
         Args:
             last: The last tracked frame; None if unknown.
@@ -266,13 +254,13 @@ class QualityMonitor(Stateful):
             }
             mode = "recovering" if self.recovering else "mostly dynamic" if mostly_dynamic else "tracking"
             if self.motion.is_given:
-                return Verdict("", figures)
+                return Verdict(tuple(Outcome(name, figure) for name, figure in figures.items()))
             limits = self.limits(mode, mostly_dynamic=mostly_dynamic, blind=view.blind)
-            return Verdict(first_failure(CHECKS, figures, limits, evidence), figures)
+            return judged(CHECKS, figures, limits, evidence)
 
-    def misfit_reason(self, tracking: TrackingResult) -> str:
-        """Reason why the registration of a frame at a recognised place is much worse than usual, empty if it is not."""
-        return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
+    def misfit(self, tracking: TrackingResult) -> Verdict:
+        """Whether the registration of a frame at a recognised place is much worse than usual."""
+        return judged(RELATIVE, tracking.figures, self.limits("recognized"))
 
     def limits(self, mode: str, *, mostly_dynamic: bool = False, blind: bool = False) -> Limits:
         """Configuration and medians of earlier registrations, from which limits follow; NaN before there are enough."""
@@ -291,7 +279,7 @@ class QualityMonitor(Stateful):
     def is_unusual(self, tracking: TrackingResult) -> bool:
         """Whether a registration failed or fits badly enough to be repeated from another initial pose."""
         residual, color = self.relative_misfit(tracking)
-        return not tracking.converged or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR_RESIDUAL
+        return not tracking.accepted or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR_RESIDUAL
 
     def accept(self, tracking: TrackingResult) -> None:
         """Remember a registration that passed all checks."""

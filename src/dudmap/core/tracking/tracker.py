@@ -19,8 +19,9 @@ from dudmap.core.backends.parameters import (
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.tracking.checks import REGISTRATION, RULES, Limits, RegistrationRules, first_failure
+from dudmap.core.tracking.checks import REGISTRATION, RULES, Limits, RegistrationRules, judged
 from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, GradientAgreement, Observability, gradient_noise
+from dudmap.core.verdict import ACCEPTED, Verdict
 
 FINEST_DAMPING = 1e-4
 """Largest initial damping of the finest level, relative to the diagonal of J^T J. It is well below the eigenvalues of
@@ -49,8 +50,7 @@ class TrackingResult:
     Attributes:
         T_world_camera: (4, 4).
         exposure: Gain and offset from the frame's intensities to the map's.
-        converged: Whether all checks passed.
-        reason: The failed check, empty if none.
+        verdict: Outcomes of the checks of the registration by itself.
         inlier_share: Share of the static measurements on the map.
         residual: Root mean square of the distance residuals scaled by sigma(1 m) / sigma(z), metres at 1 m depth.
         condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is
@@ -66,8 +66,7 @@ class TrackingResult:
 
     T_world_camera: NDArray[np.float64]
     exposure: tuple[float, float]
-    converged: bool
-    reason: str
+    verdict: Verdict
     inlier_share: float
     residual: float
     condition: float
@@ -76,6 +75,11 @@ class TrackingResult:
     settled: bool = True
     unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
     readings: float = np.inf
+
+    @property
+    def accepted(self) -> bool:
+        """Whether all checks of the registration by itself passed."""
+        return self.verdict.accepted
 
     @property
     def figures(self) -> dict[str, float]:
@@ -334,7 +338,7 @@ class Tracker:
         )
 
     def _judge(self, found: Minimum, T_world_camera: NDArray[np.float64]) -> TrackingResult:
-        """Result of a registration that ended at a pose (4, 4), with the first failed check.
+        """Result of a registration that ended at a pose (4, 4), with the outcomes of its checks.
 
         Intensities are judged after the best gain and offset, even if the registration does not apply them.
         """
@@ -354,8 +358,7 @@ class Tracker:
             difference = difference[difference > 0]
         color_residual = float(median(difference)) if len(difference) else 0.0
         result = TrackingResult(
-            T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
+            T_world_camera, found.exposure, ACCEPTED, share, residual, condition, found.iterations,
             color_residual, found.settled, found.seen.unobservable, system.weight,
         )  # fmt: skip
-        reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules))
-        return replace(result, converged=False, reason=reason) if reason else result
+        return replace(result, verdict=judged(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules)))
