@@ -108,7 +108,6 @@ def _take(number: int, frame: FrameType | None) -> None:
 
 
 def _leave_terminal() -> None:
-    """Write nothing more to a terminal that is closed."""
     if _Request.terminals:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for handle in _Request.terminals:
@@ -117,7 +116,6 @@ def _leave_terminal() -> None:
 
 
 def _interrupt_children() -> None:
-    """Interrupt the processes of this one, which a terminal would interrupt by itself."""
     import multiprocessing
 
     for child in multiprocessing.active_children():

@@ -170,10 +170,7 @@ def _show_warning(message: Warning | str, *_: object) -> None:
 
 
 def _share_one_heap() -> None:
-    """Make all threads allocate from one heap (glibc).
-
-    Otherwise only the allocating thread could reuse the memory of an image that another thread frees.
-    """
+    """Make all threads allocate from one heap (glibc): otherwise only the allocating thread reuses freed images."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         mallopt(M_ARENA_MAX, 1)

@@ -287,7 +287,6 @@ def _plot_ending(plots: bool, plot_format: str | None) -> str:
 
 
 def _plot_trajectories(target: Path, ending: str, scores: "list[Score]") -> list[Path]:
-    """Write the plots of estimates that have a reference, and of the residuals of a single run."""
     from dudmap.evaluation import plots
 
     written: list[Path] = []
@@ -323,7 +322,6 @@ def _write_json(file: Path, figures: Figures) -> None:
 
 
 def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, shown: dict[str, str]) -> None:
-    """Print the metrics, with the texts in ``shown`` where given, and hints below the table."""
     if as_json:
         say(json.dumps(figures, allow_nan=False))
         return
@@ -343,7 +341,7 @@ def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, 
 
 
 def _shown(key: str, value: object) -> tuple[str, str]:
-    """Displayed name and value of a metric: errors of a trajectory in millimetres and degrees."""
+    """Name and value; errors of a trajectory in millimetres and degrees."""
     match = re.fullmatch(r"((?:ate|rpe|drift|rotation)_\w+?)_(m|deg)(?:_per_(m|s))?", key)
     if not isinstance(value, float) or match is None:
         digits = 16 if key == "time_offset_s" else 6

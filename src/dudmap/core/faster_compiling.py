@@ -42,8 +42,7 @@ class _Uncollected(event.Listener):
 
 
 def _optimize_callers() -> None:
-    """Optimise an always inlined function (``Scalar``) only as far as inlining needs, because its callers optimise the
-    rest. Optimising it before takes a tenth of the total compilation time."""
+    """Optimise an always inlined function only as far as inlining needs: its callers optimise the rest."""
     optimize = CPUCodeLibrary._optimize_final_module
 
     def optimize_less(self: CPUCodeLibrary) -> None:
@@ -60,8 +59,8 @@ def _optimize_callers() -> None:
 
 
 def _compare_flags_at_once() -> None:
-    """Compare compilation flags by their set values first, and hash them by their type. There are a hundred thousand
-    comparisons, and Numba's hash uses the names of the flags, which are always equal."""
+    """Compare compilation flags by their set values, and hash them by type; there are a hundred thousand
+    comparisons."""
     compare = TargetConfig.__eq__
     TargetConfig.__hash__ = lambda self: hash(type(self))
     TargetConfig.__eq__ = lambda self, other: (

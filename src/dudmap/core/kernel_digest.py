@@ -46,7 +46,6 @@ def layout(type_: Any) -> str:  # noqa: ANN401 - a type of Numba, or several
 
 @cache
 def _read(kernel: Any) -> tuple[str, tuple[Any, ...]]:  # noqa: ANN401
-    """Text of one function without its callees, and the callees."""
     function, called = inspect.unwrap(kernel), list[Any]()
     code = function.__code__
     read = {name: function.__globals__[name] for name in _names(code) if name in function.__globals__}
@@ -74,7 +73,6 @@ def _code(code: CodeType, doc: str | None = None) -> str:
 
 
 def _name(function: Any) -> str:  # noqa: ANN401
-    """Full name of a function with its options, in a reproducible order."""
     options = sorted((key, _text(value)) for key, value in getattr(function, "targetoptions", {}).items())
     module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", function)  # NumPy 1 has none
     return f"{module}.{name} {options}"

@@ -134,7 +134,7 @@ class _Read(NamedTuple):
 
 
 def _poses(path: Path, name: str | None, option: str) -> tuple[PoseFile, str]:
-    """Poses of a file, skipping rows without a pose, and their format; Bonn's marker poses become camera poses."""
+    """Poses of a file without invalid rows, and their format; Bonn's marker poses become camera poses."""
     file = read_poses(path, "tum" if name == BONN else name, optional=True, option=option)
     if name != BONN:
         return file, file.format.name
@@ -158,7 +158,7 @@ def _read_reference(path: Path, name: str | None) -> _Read:
 
 
 def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> Loaded:
-    """Trajectory of poses with their own times, or with the times of ``load_trajectories``."""
+    """Trajectory of poses with their own times, or those of ``load_trajectories``."""
     file, count = read.file, len(read.file.Ts_world_camera)
     if file.timestamps is not None:
         return Loaded(_trajectory(path, file.timestamps, file), read.format)
@@ -184,7 +184,6 @@ def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> L
 
 
 def _times(path: Path) -> NDArray[np.float64]:
-    """Times (N,) in seconds of the rows of a file, or of the frames of a recording."""
     if is_recording(path):
         return open_sequence(path).timestamps
     stamps = [parse_stamp(path, number, fields[0]) for number, fields in read_rows(path, "timestamp")]
@@ -244,7 +243,6 @@ def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | No
 
 
 def _truth_in(recording: Path) -> Trajectory | None:
-    """True trajectory of a folder; None if it holds none."""
     if (recording / "groundtruth.txt").is_file():
         return load_reference(recording / "groundtruth.txt")
     return open_sequence(recording).ground_truth if recording.is_dir() and is_recording(recording) else None

@@ -134,13 +134,11 @@ def _compared_reference(scores: list[Score]) -> tuple[Trajectory, float]:
 
 
 def _widest_axes(positions: NDArray) -> tuple[int, int]:
-    """The two axes along which positions (N, 3) extend most, in their order."""
     first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
     return first, second
 
 
 def _aligned(score: Score) -> NDArray[np.float64]:
-    """Positions (N, 3) of an estimate in the world of the reference."""
     return (score.absolute.T_reference_estimate @ score.found.Ts_world_camera)[:, :3, 3]
 
 
@@ -227,7 +225,6 @@ def plot_masks(path: Path, result: MaskResult) -> None:
 
 
 def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Figure, list[Axes]]":
-    """Figure with axes in a row, or below each other with a common horizontal axis."""
     names = [str(number) for number in range(count)]
     figure, axes = _figure_of(
         [[name] for name in names] if rows else [names], (width, 6.5 if rows else 5.5), sharex=rows
@@ -238,7 +235,6 @@ def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Fig
 
 
 def _figure_of(mosaic: Any, size: tuple[float, float], **options: Any) -> "tuple[Figure, dict[str, Axes]]":  # noqa: ANN401
-    """Figure with axes by name; mosaic and options as in ``Figure.subplot_mosaic``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -251,7 +247,6 @@ def _figure_of(mosaic: Any, size: tuple[float, float], **options: Any) -> "tuple
 
 
 def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, color: str, label: str) -> None:
-    """Plot a line with gaps at missing frames."""
     breaks = gaps(stamps)
     axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=color, linewidth=1.2, label=label)
 

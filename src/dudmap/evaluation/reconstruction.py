@@ -152,7 +152,6 @@ def _check_positive(name: str, value: float) -> None:
 
 
 def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
-    """Surface of a mesh; a given ``Surface`` is returned unchanged, so that its search tree is built once."""
     return mesh if isinstance(mesh, Surface) else Surface(mesh, name, points=points)
 
 

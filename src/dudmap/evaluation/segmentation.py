@@ -142,7 +142,7 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
 
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of the true masks, with the depth timestamps if there is an associations.txt."""
+    """Timestamps and files of the true masks; depth timestamps if there is an associations.txt."""
     if not (folder / "mask.txt").is_file():
         return _estimated_masks(folder)
     masks = read_list(folder / "mask.txt")
@@ -168,7 +168,6 @@ def _numbered_masks(folder: Path, run: Path) -> list[tuple[float, Path]]:
 
 
 def _estimated_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of the masks in a folder and in its subfolder masks/."""
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}; expected a run folder or a folder of masks")
     masks = [*stamped_masks(folder / "masks"), *stamped_masks(folder)]
@@ -180,5 +179,4 @@ def _estimated_masks(folder: Path) -> list[tuple[float, Path]]:
 
 
 def _ratio(part: Numbers, whole: Numbers) -> Numbers:
-    """Elementwise ``part / whole``; NaN where ``whole`` is zero."""
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=np.asarray(whole) > 0)

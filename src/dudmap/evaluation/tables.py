@@ -58,7 +58,6 @@ def latex(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
 
 
 def _in_latex(text: str) -> str:
-    """Text with the special characters of LaTeX escaped."""
     marks = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     return "".join(marks.get(letter, f"\\{letter}" if letter in "&%$#_{}" else letter) for letter in text)
 

@@ -145,7 +145,7 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
 
 
 def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_difference: float) -> str:
-    """Sentence on too few poses that match in time, with the option that the times suggest."""
+    """Sentence on too few poses that match in time, with the option to try."""
     shortest = min(len(estimate), len(reference))
     if shortest < FEWEST_PAIRS:
         mend = f"give a trajectory of at least {FEWEST_PAIRS} poses"
@@ -258,7 +258,7 @@ def body_rotation(
 def _motions(
     estimate: Trajectory, reference: Trajectory, delta: float, unit: Unit, max_difference: float
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """Times of the first pose (N,), and motions (N, 4, 4) of estimate and reference between the pairs of ``rpe``."""
+    """Times of the first pose (N,), and motions (N, 4, 4) of both between the pairs of ``rpe``."""
     if unit not in get_args(Unit) or not (np.isfinite(delta) and delta > 0):
         raise ConfigError(f"delta is {delta} {unit}; expected a positive number of {' or '.join(get_args(Unit))}")
     stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
@@ -317,7 +317,6 @@ def covered_time(timestamps: Numbers) -> float:
 
 
 def _figures(errors: PoseErrors, trans: str, rot: str) -> dict[str, float]:
-    """Statistics of translations and rotations, by the name patterns ``trans`` and ``rot``."""
     return {name.format(key): getattr(statistics, key)
             for name, statistics in ((trans, errors.trans), (rot, errors.rot_deg)) for key in STATISTICS}  # fmt: skip
 
@@ -356,8 +355,7 @@ def accuracy(
 def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
     """Rigid motion of the estimate onto the reference from the positions, or from the orientations if necessary.
 
-    The square roots of the singular values of the cross-covariance measure the extent of both sets of positions along
-    their common principal directions, metres. The rotation is determined only if the second one is not zero.
+    The square roots of the singular values of the cross-covariance are extents, metres. The second must not be zero.
     """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
     T, spread = umeyama(targets, positions)
@@ -370,7 +368,7 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
 
 
 def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices i, and for each the j > i with the position nearest to position i plus delta; positions increase."""
+    """Indices i, and j > i with the position nearest to position i plus delta; positions increase."""
     wanted = position + delta
     after = np.clip(np.searchsorted(position, wanted), 1, len(position) - 1)
     before = after - 1

@@ -114,10 +114,8 @@ def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
 def _compared(
     volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """Points (n,) of a surface that a map confirms, points that it denies, and its colours (m, 3) at confirmed points.
-
-    Points behind the surface of the map are neither, because a map need not hold both sides of a thin plate.
-    """
+    """Points (n,) of a surface that a map confirms, those it denies, and its colours (m, 3). Points behind the
+    surface are neither: a map need not hold both sides of a plate."""
     points = transformed(T, surface.points)
     samples = sample_map(volume, points)
     known = samples.state == OBSERVED
@@ -133,8 +131,7 @@ def _color_agreement(
     colors_b: NDArray[np.float64],
     areas: NDArray[np.float64],
 ) -> tuple[float, float, float]:
-    """Correlation of the intensities of points (n, 3), share of their cells with agreeing mean colours, and the area of
-    points in the other cells."""
+    """Correlation of intensities of points (n, 3), share of cells with agreeing colours, area of the others."""
     known = (colors_a.max(axis=1) > 0) & (colors_b.max(axis=1) > 0)
     if np.count_nonzero(known) < MIN_COLORED:
         return 0.0, 0.0, 0.0

@@ -274,7 +274,6 @@ class _Meeting:
         return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
 
     def _pairs(self, T: Array, gate: float) -> "_Pairs":
-        """Match points within a gate (m) under a motion (4, 4), in both directions."""
         rows = []
         for own, other, tree, T_own in zip(self.sources, self.others, self.trees, (T, se3.inverse(T)), strict=True):
             points, normals = transformed(T_own, own.points), own.normals @ T_own[:3, :3].T
@@ -361,10 +360,8 @@ class _Pairs:
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
-    """Gains (n,) from intensities (n,) under one light to intensities under another.
-
-    Their logarithm is linear in the normals (n, 3), as for distant light (Basri and Jacobs 2003).
-    """
+    """Gains (n,) from intensities (n,) under one light to another; log-linear in the normals (n, 3) (Basri and
+    Jacobs 2003)."""
     A, y = np.hstack([np.ones((len(mine), 1)), normals]), np.log((theirs + 8) / (mine + 8))
     x, damping = np.array([np.median(y), 0, 0, 0]), DAMPING * len(y) * np.diag([0, 1.0, 1, 1])
     for _ in range(3):
@@ -374,10 +371,8 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
 
 
 def _alike(mine: Array, theirs: Array, patches: NDArray[np.intp]) -> bool:
-    """Whether two surfaces under one light have the colours of one thing.
-
-    Colours (n, 3) are averaged over patches (n,), because fine texture is lost at a distance.
-    """
+    """Whether two surfaces have the colours of one thing, averaged over patches (n,): fine texture is lost at a
+    distance."""
     patches, counts = np.unique(patches, return_inverse=True, return_counts=True)[1:]
     mine, theirs = (
         np.stack([np.bincount(patches, x) for x in colors.T], axis=1) / counts[:, None] for colors in (mine, theirs)

@@ -157,10 +157,8 @@ class ChangeWatch(RunObserver):
     def _looked_at(
         self, points: NDArray[np.float64], depth: NDArray[np.float32], T: NDArray[np.float64]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows of the points (n, 3) that a depth image from a pose (4, 4) looks through, and of points on its surface.
-
-        A point is looked through if the pixel and its neighbours see a surface behind it.
-        """
+        """Rows of the points (n, 3) that a depth image looks through (the pixel and its neighbours see a surface
+        behind), and on its surface."""
         assert self._slam is not None
         camera, local = self._slam.camera, transformed(se3.inverse(T), points)
         ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)

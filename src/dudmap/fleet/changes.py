@@ -118,7 +118,7 @@ def _moved(
     size: float,
     up: Array,
 ) -> list[Change]:
-    """Match pairs of pieces that are one thing, the best explained first; remove their parts from ``pieces``."""
+    """Match pairs of pieces that are one thing, best first; remove them from ``pieces``."""
     offered = [
         [(p, Body.of(one, p), is_certain(p, one, size)) for p in side] for side, one in zip(pieces, found, strict=True)
     ]
@@ -168,7 +168,7 @@ def vertical(visit: Visit) -> Array:
 
 
 def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
-    """Shares of a piece that a motion (4, 4) brings onto the other visit's surface, and into its free space."""
+    """Shares of a piece that a motion (4, 4) brings onto the other surface, and into free space."""
     points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
     on, samples = tree.query(points)[0] < limit, there.sample(points)
     return float(on.mean()), float((~on & samples.is_free(limit)).mean())

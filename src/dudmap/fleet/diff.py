@@ -115,7 +115,7 @@ def compared(before: str | Path, after: str | Path, min_size: float) -> Comparis
 
 
 def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """Metrics of the alignment and the pose (4, 4) of the second map in the world of the first."""
+    """Metrics of the alignment; pose (4, 4) of the second map in the first."""
     if same:
         return {"reason": None}, np.eye(4)
     pair = compare_maps(maps[0], maps[1], changed=True)

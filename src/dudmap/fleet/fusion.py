@@ -118,10 +118,8 @@ def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:
 
 
 def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
-    """Inner nodes of the octree above cells as (height, name, names of the children), children first.
-
-    Nodes with a single child are skipped.
-    """
+    """Inner nodes of the octree as (height, name, names of the children), children first; single children are
+    skipped."""
     out: list[tuple[int, str, list[str]]] = []
 
     def node(part: list[int]) -> tuple[int, str]:

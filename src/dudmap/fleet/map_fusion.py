@@ -170,7 +170,7 @@ def _samples(
 
 
 def _least_emptiness(volume: TsdfVolume, rows: NDArray[np.float32], states: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Smallest count of emptiness (n,) of blocks whose points (n, k) all lie in blocks without voxels; else 0."""
+    """Smallest count of emptiness (n,) of blocks if all points (n, k) lie in empty blocks; else 0."""
     empty = np.all(states == EMPTY, axis=1)
     least = np.rint(rows[..., WEIGHT].min(axis=1) / volume.config.carve_rate)
     return np.where(empty, least, 0).astype(np.int64)

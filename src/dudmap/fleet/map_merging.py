@@ -82,7 +82,7 @@ def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
 
 
 def _average(votes: list[tuple]) -> NDArray[np.float64]:
-    """Weighted mean of relative poses, averaged at the camera positions to avoid a lever arm."""
+    """Weighted mean of relative poses at the camera positions, to avoid a lever arm."""
     weights = np.array([vote[3] for vote in votes], float)
     Ts, cameras = np.stack([vote[1] for vote in votes]), np.stack([vote[2] for vote in votes])
     T = np.eye(4)
@@ -164,7 +164,7 @@ def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
 
 
 def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
-    """Relative poses at which enough keyframes of b are recognised in a; the reverse direction may find others."""
+    """Relative poses at which enough keyframes of b are recognised in a."""
     found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 

@@ -208,7 +208,7 @@ def _write_world(
 
 
 def _check_out(out: Path) -> None:
-    """Remove the world that a folder holds; a ``DudmapError`` if it holds anything else, or cannot be written."""
+    """Remove the world that a folder holds; a ``DudmapError`` if it holds anything else."""
     try:
         if out.exists() and any(out.iterdir()):
             if not (out / WORLD_FILE).is_file():
@@ -225,7 +225,7 @@ def _check_out(out: Path) -> None:
 
 
 def _load_kernels(like: MapHeader) -> None:
-    """Compile the kernels before the workers start, because two processes must not write one cache at a time."""
+    """Compile kernels before the workers start: two processes must not write one cache."""
     words = np.full((1, VOXELS), MAX_COUNT << 8, np.int32)
     block = FusedRange(morton.encode(np.zeros((1, 3), np.int64)), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
     volume = block.volume(like.volume())

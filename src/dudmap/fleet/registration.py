@@ -160,7 +160,6 @@ def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], worke
 
 
 def _sample(job: tuple[Path, int]) -> NDArray[np.float32]:
-    """Evenly spaced features (n, 128) of a run, about as many as given."""
     path, count = job
     features = np.concatenate(
         [keyframe.features.descriptors for keyframe in keyframes_of(path)] or [np.zeros((0, 128))]
@@ -234,7 +233,7 @@ def _is_at(graph: RunGraph, pair: tuple[int, int], T: NDArray[np.float64]) -> bo
 def _brought_together(
     graph: RunGraph, blocks: Sequence[NDArray[np.float64]], found: Pairs, guesses: Guesses
 ) -> list[tuple[int, int]]:
-    """Pairs of joined runs that overlap and were not compared at their poses, the largest overlaps of each run."""
+    """Joined runs that overlap and were not compared at their poses, largest overlaps first."""
     shares = np.zeros((len(blocks), len(blocks)), np.float32)
     for part in graph.components:
         shares[np.ix_(part, part)] = predicted_overlap([transformed(graph.Ts[run], blocks[run]) for run in part], CELL)

@@ -248,7 +248,6 @@ def _closes(cycle: Cycle) -> bool:
 
 
 def _chained(start: int, joins: Sequence[Join]) -> dict[int, NDArray[np.float64]]:
-    """Poses of all runs that are connected with ``start`` in its world, along the fewest joins."""
     neighbours, out, queue = _neighbours(joins), {start: np.eye(4)}, deque([start])
     while queue:
         node = queue.popleft()

@@ -127,10 +127,8 @@ def _rows(
     *,
     of_a: bool,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Fields of ``_Rows`` of one surface in the other map, with points (n, 3) in the world of a.
-
-    Points of b move by ``v + omega x p`` in map a; map b moves so against the points of a.
-    """
+    """Fields of ``_Rows`` of one surface in the other map, points (n, 3) in the world of a. Points of b move by ``v
+    + omega x p`` in map a; map b moves so against points of a."""
     samples, (gain, offset) = sample_map(other, transformed(T_other_a, points)), exposure
     near = (samples.state == OBSERVED) & (np.abs(samples.sdf) < IN_BAND * other.truncation)
     lit = near & (samples.intensity > 0) & (surface.intensity > 0)
@@ -146,7 +144,7 @@ def _rows(
 
 
 def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 6) of values with gradients (n, 3) at points (n, 3) that move with a left twist (v, omega)."""
+    """Derivatives (n, 6) by a left twist (v, omega) of values with gradients (n, 3) at points (n, 3)."""
     return np.hstack([gradients, np.cross(points, gradients)])
 
 
@@ -158,7 +156,7 @@ def _normal_equations(
 
 
 def _stiffness(H: NDArray[np.float64], center: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """Smallest over largest eigenvalue of a normal matrix, about the centre of the points, angles scaled by extent."""
+    """Smallest over largest eigenvalue of a normal matrix about the centre of the points, angles scaled by extent."""
     extent = max(float(np.sqrt(np.mean(np.sum(np.square(points - center), axis=1)))), 1e-6)
     shift = np.eye(6)
     shift[:3, 3:] = se3.hat(center)  # converts a rotation about the centre to one about the origin and a translation

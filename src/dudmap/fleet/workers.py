@@ -194,7 +194,6 @@ def _prepare() -> None:
 
 
 def _measured(function: Callable[[Job], Result], job: Job) -> tuple[Result, int, float | None, float]:
-    """Result of a job, id and peak memory of the process, and processor time of the job."""
     start = time.process_time()
     result = function(job)
     return result, os.getpid(), peak_rss_mb(), time.process_time() - start

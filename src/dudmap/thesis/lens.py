@@ -73,6 +73,5 @@ class Lens:
 
     @staticmethod
     def _pixels(camera: Camera, X: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Pixel coordinates u and v (H, W) of normalised coordinates."""
         u, v = np.moveaxis((X * camera.focal + camera.centre).astype(np.float32), -1, 0)
         return u, v

@@ -193,13 +193,11 @@ class Registration:
 
 
 def _used(found: Residuals, labels: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Pixels (h, w) with a distance that are not dynamic."""
     known = np.isfinite(found.psi)
     return known if labels is None else known & ~labels
 
 
 def _resized(labels: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Labels at the size of a level: dynamic if any of the pixels is."""
     height, width = level.depth.shape
     share = cv2.resize(labels.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(share) > 0

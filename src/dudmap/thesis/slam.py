@@ -135,7 +135,6 @@ class ThesisSlam:
         return Observation(frame.timestamp, self.camera, D, intensity(rgb), rgb)
 
     def _levels(self, image: Observation) -> list[Level]:
-        """Images of the coarse-to-fine registration, finest first."""
         first = 1 if self.config.subsample == "quarter" else 0
         halvings = range(first, first + self.config.levels)
         return [Level(self.camera.scaled(n), *image.halved(n)) for n in halvings]
@@ -148,7 +147,6 @@ class ThesisSlam:
         level: Level,
         psi: NDArray[np.float32] | None = None,
     ) -> FrameResult:
-        """Fuse the static pixels of a frame at its pose (algorithm 1)."""
         static = ~full_size(dynamic, level.depth, image.depth)
         frame = Frame(image.timestamp, image.depth, image.rgb)
         self._timed("integrate", lambda: self.volume.integrate(frame, T, static))
@@ -164,7 +162,7 @@ class ThesisSlam:
         *,
         fused: bool,
     ) -> FrameResult:
-        """The result of a frame, whose mask has the geometry of the recorded image."""
+        """Result of a frame; the mask has the geometry of the recorded image."""
         self._poses.append((image.timestamp, T))
         mask = full_size(dynamic, level.depth, image.depth)
         return FrameResult(
@@ -176,7 +174,6 @@ class ThesisSlam:
         )  # fmt: skip
 
     def _timed(self, stage: str, function: Callable[[], Result]) -> Result:
-        """Result of a function, whose milliseconds are noted."""
         start = time.perf_counter()
         out = function()
         self._timings[stage] = 1000 * (time.perf_counter() - start)
@@ -184,5 +181,4 @@ class ThesisSlam:
 
 
 def _points(level: Level, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (h, w, 3) of an image in the world, metres."""
     return level.camera.backproject(level.depth).astype(np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -225,7 +225,7 @@ def calibrate_sequence(
 
 
 def _quick(config: Config, halvings: int) -> Config:
-    """Parameters for the excerpt: larger voxels, and no output that is only reported."""
+    """Parameters for the excerpt: larger voxels, no reports."""
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
@@ -236,7 +236,6 @@ def _quick(config: Config, halvings: int) -> Config:
 
 
 def _halved(mask: "NDArray[np.bool_]", halvings: int) -> "NDArray[np.bool_]":
-    """Mask of an image halved by 2x2 blocks; a block is masked if any of its pixels is."""
     for _ in range(halvings):
         height, width = (size // 2 for size in mask.shape)
         mask = np.asarray(mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2).any(axis=(1, 3)), np.bool_)
@@ -287,7 +286,6 @@ def _around_keyframes(timestamps: "NDArray[np.float64]", numbers: range) -> list
 
 
 def _enlarged(found: Calibration, camera: Camera, halvings: int) -> Calibration:
-    """Scale the calibration of halved colour images to the size of ``camera``."""
     factor, sigma = 1 << halvings, found.sigma.copy()
     sigma[mask_of(("center_x", "center_y"))] *= factor
     whole = found.camera.resized(found.camera.width * factor, found.camera.height * factor)

@@ -92,7 +92,7 @@ def given_poses(name: str, sequence: "Sequence", convention: str | None = None, 
 
 
 def _at(poses: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
-    """Pose (4, 4) at a time, interpolated between near poses; None if there are none."""
+    """Pose (4, 4) interpolated between near poses, or None."""
     stamps = poses.timestamps
     after = int(np.searchsorted(stamps, timestamp))
     for number in (after - 1, after):
@@ -135,10 +135,8 @@ def _natural(path: Path) -> tuple[int, str]:
 
 
 def _matrices(path: Path) -> NDArray[np.float64] | None:
-    """Poses (N, 4, 4) of a file of four numbers a line, four lines a pose; None for any other file.
-
-    Lines of three numbers between the poses are skipped (Open3D's .log).
-    """
+    """Poses (N, 4, 4) of four rows of four numbers each; rows of three numbers between poses are skipped (Open3D's
+    .log). None for other files."""
     with damaged(DatasetError, path):
         lines = [line.split() for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
         rows = [line for line in lines if len(line) != 3]

@@ -105,7 +105,7 @@ def focal_error(sequence: "Sequence") -> float | None:
 
 
 def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Matched points (N, 3) of two frames that fit one affine motion, each in its camera."""
+    """Matched points (N, 3) of two frames, each in its camera, that fit one affine motion."""
     sift, points = SiftExtractor(POINTS), []
     seen = [sift.extract(reduced_grey(frame.rgb, frame.rgb.shape[1] // 2)) for frame in frames]
     pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0)
@@ -163,7 +163,7 @@ def _turn_warnings(frames: "list[Frame]") -> list[str]:
 
 
 def _agreement(edges: NDArray[np.float32], steps: NDArray[np.float32]) -> tuple[float, float, float]:
-    """Mean correlation of edge images (N, h, w), and standard deviation and maximum of shifted correlations.
+    """Mean correlation of edge images (N, h, w), standard deviation and maximum of shifted correlations.
 
     All frames are shifted alike, because frames of one view count once.
     """
@@ -200,7 +200,7 @@ def color_magnification(sequence: "Sequence") -> float | None:
 
 def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] | None:
     """Best magnification in ``agreement`` (frames, magnifications, shifts), and its gain over registered images in
-    standard errors; None if registered images are as good."""
+    standard errors, or None."""
     mean = agreement.mean(axis=0)
     best, shift = (int(n) for n in np.unravel_index(np.argmax(mean), mean.shape))
     near = np.unravel_index(np.argmax(np.where(REGISTERED[:, None], mean, -1)), mean.shape)
@@ -219,7 +219,7 @@ def unregistered(magnification: float) -> str:
 
 
 def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
-    """Edge correlations (magnifications, shifts) of depth and colours for each magnification of the colours."""
+    """Edge correlations (magnifications, shifts) of depth and magnified colours."""
     edges, steps = _edges(frame)
     steps, out = _flattened(steps, np.ones_like(steps)), []
     size, border = steps.shape[::-1], (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
@@ -242,7 +242,6 @@ def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -
 
 
 def _flattened(image: NDArray[np.float32], seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Image minus the mean of its neighbourhood, 0 outside of ``seen``."""
     size = NEIGHBOURHOOD, NEIGHBOURHOOD
     share = np.maximum(cv2.blur(seen, size), np.float32(1e-3))
     return np.asarray((image - cv2.blur(image * seen, size) / share) * seen, np.float32)
@@ -265,7 +264,7 @@ def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[
 
 
 def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
-    """Warn if the depth images show one plane at rest while the colour images change."""
+    """Warn of depth of one plane at rest while the colours change."""
     planes = _planes(frames)
     exposed = [gray / (gray.mean() + np.float32(1e-3)) for gray in grays]
     changes = [np.abs(b - a).mean() for a, b in pairwise(exposed) if a.shape == b.shape]
@@ -282,10 +281,8 @@ def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> 
 
 
 def _planes(frames: "list[Frame]") -> tuple[NDArray[np.float64], float] | None:
-    """Distances (N, 5) of the plane of every depth image at centre and corners, metres, and the noise about it.
-
-    None if an image is no plane. The inverse depth of a plane is linear in row and column.
-    """
+    """Distances (N, 5) of the plane of every depth image at centre and corners, and the noise about it, metres. None
+    if an image is no plane. The inverse depth of a plane is linear in row and column."""
     distances, sigmas = [], []
     places = np.array([[0, 0, 1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, 1]], np.float64)
     for frame in frames:

@@ -211,7 +211,6 @@ def inspect(
 
 
 def _unit_is_open(sequence: "Sequence") -> bool:
-    """Whether another depth unit can be given, and no remark of the recording states the unit."""
     rotated = getattr(sequence, "rotated", Rotated.NO)
     return "depth_unit" in getattr(sequence, "options", ("depth_unit",)) and rotated is Rotated.NO
 

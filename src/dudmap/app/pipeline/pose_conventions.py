@@ -142,7 +142,6 @@ def check_convention(poses: Trajectory, sequence: "Sequence", name: str, read_as
 
 
 def _pairs(poses: Trajectory) -> list[tuple[int, int]]:
-    """Numbers of pairs of poses with a clear motion between them, evenly over time."""
     pairs = []
     for first in np.unique(np.linspace(0, len(poses) - 2, 4 * PAIRS).astype(int)) if len(poses) > 1 else []:
         for last in range(first + 1, min(first + FURTHEST, len(poses))):
@@ -154,7 +153,7 @@ def _pairs(poses: Trajectory) -> list[tuple[int, int]]:
 
 
 def _agreeing(depth: NDArray, other: NDArray, T_camera_other: NDArray[np.float64], camera: "Camera") -> float:
-    """Share of the measurements in another image (H, W) that a depth image (H, W) confirms, by their relative pose."""
+    """Share of the measurements in another image (H, W) that a depth image (H, W) confirms at their relative pose."""
     v, u = np.mgrid[0 : camera.height : STRIDE, 0 : camera.width : STRIDE].reshape(2, -1)
     z = other[v, u].astype(np.float64)
     u, v, z = u[z > 0], v[z > 0], z[z > 0]

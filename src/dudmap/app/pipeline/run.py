@@ -346,7 +346,7 @@ class Job:
             yield state, store
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
-        """Write the run folder; delete the stored state of a run that was not stopped."""
+        """Write the run folder; delete the stored state unless the run was stopped."""
         self.display.working("writing")
         slam, record = state.slam, state.record
         if stopped and state.number:  # the first pass is complete, the second is not
@@ -371,7 +371,7 @@ class Job:
         return report
 
     def _fuse_held(self, state: RunState) -> None:
-        """Fuse the frames that a young map holds back, because no other frame comes, and report them."""
+        """Fuse and report the frames that a young map holds back."""
         held, stamps = state.slam.finish(), [float(row["timestamp"]) for row in state.record.rows]
         state.record.fused_at_end += held
         if held:

@@ -245,7 +245,6 @@ class RunStore:
             remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
 
     def _write(self, snapshot: Snapshot, meta: dict[str, Any], files: list[Path]) -> float:
-        """Write a checkpoint; return the processor seconds."""
         start = time.thread_time()
         for path in [*files, *{path.parent for path in files}] if os.name == "posix" else files:
             if path.exists():

@@ -180,10 +180,8 @@ class StateDatabase:
             self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
 
     def _described(self, array: NDArray | list[Any], constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Type, shape and chunk keys of an array, and the content of chunks that may be new.
-
-        A list of plain values is stored as lines of JSON.
-        """
+        """Type, shape and chunk keys of an array, and chunks that may be new; a list of plain values is stored as
+        lines of JSON."""
         if isinstance(array, list):
             array = np.frombuffer("".join(json.dumps(record) + "\n" for record in array).encode(), np.uint8)
         transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
@@ -324,7 +322,7 @@ class StateReader:
         return StateError(f"the state of the run in {self.path} is damaged: {what}")
 
     def _is_too_long(self) -> bool:
-        """Whether a statement must end; SQLite calls it, so that Python handles ctrl-C."""
+        """Whether a statement must end; SQLite calls it so that Python handles ctrl-C."""
         self._left -= 1
         return self._left <= 0
 
@@ -340,7 +338,6 @@ def _own_tables() -> list[tuple[str, ...]]:
 
 
 def _check_size(path: Path) -> None:
-    """Refuse a file that is much larger than its content on the disk."""
     status = path.stat()
     stored = 512 * getattr(status, "st_blocks", status.st_size)
     if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):

@@ -122,7 +122,7 @@ class LiveView(RunObserver):
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
 
     def _take(self) -> _News | None:
-        """Wait for news and take all; None once the run is over and everything is shown."""
+        """Wait for news; None once all is shown."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._has_news())
             if not self._has_news():

@@ -98,14 +98,12 @@ def metrics_table(metrics: dict[str, Any]) -> Table:
 
 
 def _value(metrics: dict[str, Any], key: str) -> Any:  # noqa: ANN401 - of any type that JSON has
-    """Value at a key; None if there is none."""
     head, _, rest = key.partition(".")
     value = metrics.get(head)
     return value if not rest else _value(value, rest) if isinstance(value, dict) else None
 
 
 def _text(value: object, named: Named) -> str:
-    """Value with its unit."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return named.form.format(named.factor * value)
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

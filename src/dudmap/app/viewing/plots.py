@@ -39,7 +39,7 @@ def plots(run: RunFiles) -> dict[str, str]:
 
 
 def _from_above(run: RunFiles) -> str:
-    """Estimated and true trajectory on the ground, the first view pointing upwards; lost parts are dashed."""
+    """Trajectories on the ground, the first view pointing upwards; lost parts are dashed."""
     across, frames = _ground_axes(run), run.figures()
     places = [np.full(3, np.nan) if frame.T_world_camera is None else frame.T_world_camera[:3, 3] for frame in frames]
     path = np.array(places) @ across.T
@@ -136,7 +136,7 @@ def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
 
 @contextmanager
 def _drawing(name: str, height: float = 2.8) -> "Iterator[tuple[Figure, list[str]]]":
-    """Figure to draw into, and a list that holds its SVG text afterwards; equal data give equal text."""
+    """Figure, and a list that holds its SVG text afterwards; equal data give equal text."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

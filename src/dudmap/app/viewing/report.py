@@ -108,7 +108,7 @@ class Thumbnails(RunObserver):
         return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
 
     def _thin(self) -> None:
-        """If there are too many, remove every second frame, and keep half as many in future."""
+        """If there are too many, remove every second frame and keep half as many in future."""
         if len(self._kept) <= 2 * NUMBER:
             return
         with OwnFolder(self._out) as folder:
@@ -267,7 +267,6 @@ def _cards(metrics: dict[str, Any]) -> Html:
 
 
 def _strip(run: RunFiles) -> Html:
-    """Columns of colour image and mask; depth and residuals are embedded for the frame at the slider."""
     if not run.thumbnails:
         return Html("<p>This run kept no images (it was made with --no-report).</p>")
     start = float(next(iter(run.thumbnails)))
@@ -318,7 +317,6 @@ def _losses(metrics: dict[str, Any]) -> Html:
 
 
 def _stages(run: RunFiles) -> Html:
-    """Mean time per frame as one bar, whose parts are the stages; the shortest ones are added up."""
     if not run.stages:
         return Html("")
     times = {stage: float(run.column(stage).mean()) for stage in run.stages}
@@ -344,12 +342,10 @@ def _stages(run: RunFiles) -> Html:
 
 
 def _words(name: str) -> str:
-    """Name of a stage for people."""
     return printable(name)[:30].replace("_", " ")
 
 
 def _table(metrics: dict[str, Any]) -> Html:
-    """The metrics in groups, and all of them as they are in metrics.json."""
     row = "<tr><td>{name}</td><td>{value}</td></tr>"
     groups = joined(
         html(

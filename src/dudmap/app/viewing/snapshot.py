@@ -224,7 +224,6 @@ def _far(frames: list[Frame]) -> float:
 
 
 def _row(pictures: Iterable[tuple[str, NDArray]], width: int, columns: int) -> NDArray[np.uint8]:
-    """Pictures (h, w, 3) of one width with titles above, in a white row of ``columns`` columns."""
     scaled = [(title, cv2.resize(np.asarray(image, np.uint8), (width, width * image.shape[0] // image.shape[1])))
               for title, image in pictures]  # fmt: skip
     row = np.full((TITLE + max(len(image) for _, image in scaled), columns * width, 3), 255, np.uint8)

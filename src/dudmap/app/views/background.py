@@ -122,7 +122,7 @@ class BackgroundRenderer:
         distances: NDArray[np.float32],
         T_world_color: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Colours (n, 3) of pixels in other frames, in the map's exposure, and which were found (n,)."""
+        """Colours (n, 3) of pixels in other frames, in the map's exposure; and which were found (n,)."""
         from scipy.ndimage import map_coordinates
 
         points = self.color_lens.points(rows, columns, distances.astype(np.float64))
@@ -156,14 +156,13 @@ class BackgroundRenderer:
 
 
 def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose neighbours are all seen, because map colours fade into black at borders."""
+    """Pixels (h, w) whose neighbours are all seen: map colours fade into black at borders."""
     import cv2
 
     return cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Values (n,) of the pixels nearest to (n, 2) column and row; 0 outside of the image (H, W)."""
     u, v = np.rint(uv).astype(np.intp).T
     inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
     return np.where(inside, image[np.where(inside, v, 0), np.where(inside, u, 0)], np.float32(0))

@@ -114,7 +114,7 @@ class Cleaner:
             self._renderer.add(frame, moving, T_world_camera, T_world_color)
 
     def _moving(self, index: int, frame: Frame, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Replaced pixels (H, W) of a frame: its mask, nearby pixels in front of the map, and a margin."""
+        """Replaced pixels (H, W): the mask, nearby pixels in front of the map, and a margin."""
         mask, width = read_mask(self._masks[index]), self.sequence.camera.width
         if mask.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")

@@ -130,11 +130,10 @@ def orbit(
 def _framing(
     points: NDArray[np.float64], back: NDArray[np.float64], up: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.float64], float]:
-    """Pose (4, 4) of a camera that looks against ``back`` and just sees all points (n, 3), and its distance along
-    ``back``.
+    """Pose (4, 4) of a camera that looks against ``back`` and just sees all points (n, 3), and its distance.
 
-    A camera at (cx, cy, cz) sees a point (x, y, z), in camera axes, if |x - cx| <= r (z - cz), and likewise for y. r is
-    the tangent of half the field of view.
+    A camera at (cx, cy, cz) sees (x, y, z), in camera axes, if |x - cx| <= r (z - cz), r the tangent of half the view;
+    likewise for y.
     """
     forward = -back / np.linalg.norm(back)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
@@ -227,7 +226,6 @@ def _farthest(run: RunContent, trajectory: Trajectory) -> float:
 
 
 def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour (H, W, 3) and depth (H, W) in metres of the map; shading if the map has no colours."""
     seen = run.volume.raycast(T, camera)
     color, known = seen.color, seen.depth > 0
     if known.any() and np.median(color[known].reshape(-1, 3), axis=0).tolist() == [GREY] * 3:

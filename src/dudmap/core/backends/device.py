@@ -95,7 +95,7 @@ def _resolved(device: str) -> str:
 
 
 def _first_that_starts() -> str:
-    """The first GPU, or with a warning the CPU if the GPU does not work."""
+    """The first GPU, or the CPU with a warning."""
     name = f"cuda:{supported_gpus()[0]}"
     if failure := start_failure(name):
         warnings.warn(f"{name} cannot be used ({failure}); the CPU is used", DeviceWarning, stacklevel=5)
@@ -139,7 +139,6 @@ def start_failure(device: str) -> str:
 
 
 def _driver() -> ctypes.CDLL | None:
-    """Library of the NVIDIA driver; None without a driver."""
     try:
         return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -184,7 +183,7 @@ def _need_warp(device: str) -> None:
 
 @cache
 def _load_warp() -> None:
-    """Start Warp without its greeting, and without its warning if there is no driver."""
+    """Start Warp without its greeting and its warning about drivers."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING
@@ -194,7 +193,6 @@ def _load_warp() -> None:
 
 @contextmanager
 def _silent_stderr(silent: bool) -> "Iterator[None]":
-    """Discard output of a library to the standard error, if ``silent``."""
     if not silent:
         yield
         return

@@ -341,9 +341,7 @@ class FusedBlocks(NamedTuple):
 class ImageStack(Protocol):
     """Images of one size by number: an array (n, h, w), or images on a device, downloaded when they are read."""
 
-    def __getitem__(self, number: int, /) -> NDArray[np.float32]:
-        """Image (h, w)."""
-        ...
+    def __getitem__(self, number: int, /) -> NDArray[np.float32]: ...
 
 
 class NormalEquations(NamedTuple):

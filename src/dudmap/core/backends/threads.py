@@ -23,11 +23,8 @@ from dudmap.core.kernel_cache import store
 
 
 def _import_numba() -> None:
-    """Import the parts of Numba that its first kernel needs, without SciPy's linear algebra.
-
-    Numba imports SciPy only to detect a BLAS for vector products, which no kernel uses. The import takes as long as
-    loading all kernels of the first frames.
-    """
+    """Import the parts of Numba that its first kernel needs, without SciPy's linear algebra, which takes as long as
+    loading all kernels."""
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # pyright: ignore[reportArgumentType] - so that its import fails
@@ -123,11 +120,9 @@ def _num_cores() -> int:
 
 @cache
 def _tasks() -> SimpleQueue[Callable[[], object] | None]:
-    """Task queue of the other threads, one thread for each core but one. An executor would take ten times as long to
-    wake one.
+    """Task queue of the other threads, one for each core but one. An executor takes ten times as long to wake one.
 
-    The threads end before the interpreter does. Otherwise a thread in compiled code would be terminated, which aborts
-    the process with a C++ error.
+    The threads end before the interpreter does: a thread in compiled code would abort the process.
     """
     tasks: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
 

@@ -297,7 +297,6 @@ class Adjustment:
     def _linearize(
         self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
     ) -> _System:
-        """Normal equations at an image size; for a ``known`` calibration of the poses alone."""
         begin, tracked = SHARED if known else 0, pairs.Ts_camera_world
         parts = self._linearize_pairs(pairs, fit, level, scales, begin)
         places, size = pairs.places[:, begin:] - begin, NUM_PARAMETERS - begin + POSE * len(tracked)
@@ -339,10 +338,10 @@ def _without_light(
     residuals: NDArray[np.float32],
     begin: int,
 ) -> _PairSystems:
-    """Normal equations of all pairs in the parameters and the poses of both frames, without gain and offset.
+    """Normal equations of all pairs without gain and offset.
 
     ``H``, ``b``: (P, 21, 21), (P, 21) of ``linearize_pair``. ``light``: (P, 2) gains and offsets. ``Ts``: (P, 4, 4)
-    relative poses of the first to the second camera. ``begin``: first unknown; the parameters before it are known.
+    second camera from first. ``begin``: first unknown; the parameters before it are known.
     """
     known, of_light, own = slice(begin, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), SHARED - begin
     prior = CORRELATED * LIGHT_SIGMA**-2

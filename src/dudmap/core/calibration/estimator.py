@@ -110,7 +110,6 @@ class _Trial:
 
 
 def _halves(keyframes: Sequence[ColorKeyframe], count: int) -> list[list[Pair]]:
-    """Up to ``count`` pairs, each within one half of the time."""
     middle = len(keyframes) // 2
     return [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
 
@@ -174,11 +173,8 @@ class CalibrationEstimator:
         )
 
     def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
-        """Depth readout in seconds, its standard deviation, the evidence for a new readout, and the relative decrease
-        of the cost.
-
-        The given readout is returned unless another one is proven.
-        """
+        """Depth readout (s; the given one unless another is proven), its standard deviation, evidence, and relative
+        decrease of the cost."""
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -233,8 +229,7 @@ class CalibrationEstimator:
         return Estimate(found, evidence, gain, len(pairs))
 
     def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
-        """Vignetting (the given value unless another is proven), its standard deviation with the difference of both
-        halves, and the evidence."""
+        """Vignetting (the given value unless another is proven), its standard deviation, and the evidence."""
         given = self.given.vignetting
         halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
         found = [half.fitted()[0] for half in halves]
@@ -246,8 +241,7 @@ class CalibrationEstimator:
         return vignetting if is_proven else given, sigma, evidence
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
-        """Factor (at least 1) for standard deviations: rms difference of the parameters of both halves, in standard
-        deviations."""
+        """Factor >= 1 for standard deviations: rms difference of both halves in standard deviations."""
         everything, finest = np.ones(NUM_PARAMETERS, dtype=bool), self.adjustment.levels[-1:]
         with ThreadPoolExecutor(self.workers) as pool:
             solved = pool.map(lambda n: self.adjustment.solve(halves[n], starts[n], everything, finest), (0, 1))
@@ -257,7 +251,7 @@ class CalibrationEstimator:
         return max(1.0, np.sqrt(squares / NUM_PARAMETERS))
 
     def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
-        """Proven groups, added one by one and finally jointly, and the evidence of all groups."""
+        """Proven groups, added one by one and finally jointly, and all evidence."""
         trial, evidence = start, dict[str, float]()
         while rest := [name for name, members in GROUPS.items() if not trial.free[mask_of(members)].all()]:
             trials = {name: self._trial(halves, trial, [name]) for name in rest}
@@ -281,8 +275,8 @@ class CalibrationEstimator:
     ) -> tuple["_Trial", dict[str, float]]:
         """Groups that explain the pairs only jointly, and the evidence of each given the others.
 
-        With a wrong focal length no delay improves the cost, and vice versa. All groups are freed; groups without
-        evidence are then fixed again one by one.
+        With a wrong focal length no delay improves the cost, and vice versa. All groups are freed, then fixed one by
+        one.
         """
         trial, names = self._trial(halves, before, names), list(names)
         while len(names) > 1 and all(trial.proves(before, name) for name in names):
@@ -297,7 +291,6 @@ class CalibrationEstimator:
         return before, {}
 
     def _trial(self, halves: list[PairSet], before: "_Trial", names: Sequence[str]) -> "_Trial":
-        """Fits with the named groups free in addition to the free parameters of ``before``."""
         free = before.free | mask_of([member for name in names for member in GROUPS[name]])
         return self._freed(halves, before.fits, free)
 

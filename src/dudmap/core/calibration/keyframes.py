@@ -135,8 +135,7 @@ def keyframe(
 def _seen_moving(
     moving: NDArray[np.bool_], distance: float, camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of a colour image that show the ``moving`` depth pixels at ``distance`` metres, dilated by
-    ``BESIDE``."""
+    """Pixels (h, w) of a colour image that show the ``moving`` depth pixels at ``distance`` metres, dilated."""
     import cv2
 
     plane = T_color_depth[:3, :3] + np.outer(T_color_depth[:3, 3], (0, 0, 1 / distance))

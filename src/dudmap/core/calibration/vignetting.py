@@ -83,13 +83,11 @@ class Brightness:
         return np.bincount(self.pair, -np.log(weights), len(self.numbers)) / count
 
     def _centred(self, values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (n,) minus the weighted mean of their pair, which is the difference of its exposures."""
         total = np.maximum(np.bincount(self.pair, weights, len(self.numbers)), 1e-12)
         return values - (np.bincount(self.pair, weights * values, len(self.numbers)) / total)[self.pair]
 
 
 def _weights(residual: Values) -> Values:
-    """Weights (n,) of residuals by Cauchy's robust function."""
     return 1 / (1 + (residual / SCALE) ** 2)
 
 
@@ -108,7 +106,6 @@ def _seen(brightness: NDArray[np.float32], camera: Camera, points: Values) -> tu
 
 
 def _sampled(image: NDArray[np.float32], pixels: Values) -> Values:
-    """Bilinear samples of an image at pixels (n, 2), NaN outside."""
     import cv2
 
     u, v = np.nan_to_num(pixels, nan=-1e3).astype(np.float32).T.copy()

@@ -102,7 +102,6 @@ def register_color(
 
 
 def _is_in_place(projection: ColorProjection, camera: Camera) -> bool:
-    """Whether the registration moves no pixel and changes only its brightness."""
     still = projection.offset == 0 and projection.readout == 0 and not projection.distortion.any()
     same = still and np.array_equal(projection.intrinsics, camera.intrinsics)
     return bool(same and np.array_equal(projection.place, np.eye(3, 4, dtype=np.float32)))
@@ -110,7 +109,6 @@ def _is_in_place(projection: ColorProjection, camera: Camera) -> bool:
 
 @lru_cache(maxsize=8)
 def _inverse_vignetting(height: int, width: int, channels: int = 1, *, vignetting: float) -> NDArray[np.float32]:
-    """Gains (height, width[, channels]) that compensate vignetting, see ``color_places``."""
     v, u = np.mgrid[:height, :width]
     middle = (height - 1) / 2, (width - 1) / 2
     loss = vignetting * ((v - middle[0]) ** 2 + (u - middle[1]) ** 2) / (middle[0] ** 2 + middle[1] ** 2)

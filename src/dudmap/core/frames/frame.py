@@ -45,7 +45,6 @@ class Frame:
     color_timestamp: float | None = None
 
     def __repr__(self) -> str:
-        """Sizes without the images."""
         color = "no colour" if self.color is None else f"colour {self.color.shape}"
         return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
 

@@ -70,7 +70,6 @@ class IgnoredRegion:
 
 
 def _nearest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Index of the nearest unmasked pixel, for each masked pixel of an image (h, w)."""
     import cv2
 
     _, labels = cv2.distanceTransformWithLabels(
@@ -99,7 +98,6 @@ def _within(places: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.boo
 
 
 def _shown(mask: NDArray[np.bool_], places: list[NDArray[np.int64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (h, w) of the colour image that show masked pixels of the depth image."""
     import cv2
 
     out = np.zeros(shape, np.uint8)
@@ -111,7 +109,6 @@ def _shown(mask: NDArray[np.bool_], places: list[NDArray[np.int64]], shape: tupl
 
 
 def _showing(mask: NDArray[np.bool_], places: list[NDArray[np.int64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (H, W) of the depth image that masked pixels of the colour image show."""
     out = np.zeros(shape, bool)
     for found in places:
         within = _within(found, mask.shape)

@@ -266,10 +266,8 @@ def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> i
 
 
 def _corners(level: Level) -> NDArray[np.int64]:
-    """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
-
-    A corner lies on the foreground in its window.
-    """
+    """Strongest corners (n, 2) int, pixels u, v, one per cell, on the foreground of their window (Shi and Tomasi
+    1994)."""
     import cv2
 
     image = level.grey

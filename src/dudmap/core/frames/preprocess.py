@@ -112,7 +112,7 @@ class Preprocessor:
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
     ) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) registered to the depth, as far as possible without the camera's motion."""
+        """Colours (H, W, 3) registered to the depth, without the camera's motion."""
         if calibration.is_instant(offset):
             projection = color_projection(calibration, np.zeros(6), offset)
             return register_color(recorded, depth, self.camera, projection)
@@ -179,10 +179,8 @@ class Preprocessor:
     def _undistorted(
         self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Both images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel.
-
-        Colour of a separate camera is unchanged, because its registration includes the distortion.
-        """
+        """Images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel. A separate
+        colour camera is unchanged."""
         import cv2
 
         assert self._maps is not None
@@ -195,8 +193,7 @@ class Preprocessor:
 
 
 def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray[np.bool_] | None:
-    """Pixels (H, W) of the depth image that the colour camera does not see at a ``typical`` depth (m); None if it
-    sees all."""
+    """Pixels (H, W) that the colour camera does not see at a ``typical`` depth (m), or None."""
     import cv2
 
     points = camera.backproject(np.full(camera.shape, typical, np.float32)).reshape(-1, 3).astype(np.float64)
@@ -208,10 +205,8 @@ def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray
 
 
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
-    """Map pairs of cv2.remap from the undistorted image into the distorted one: nearest pixel, and interpolated.
-
-    They differ because the fixed-point map of the interpolation rounds down without its fractions, half a pixel off.
-    """
+    """Maps of cv2.remap from undistorted to distorted: nearest pixel, and interpolated, which rounds down half a
+    pixel off without its fractions."""
     import cv2
 
     coefficients = np.array(camera.distortion, dtype=np.float64)
@@ -223,7 +218,7 @@ def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArra
 
 
 def _distortion(camera: Camera) -> tuple[NDArray, NDArray]:
-    """Map pair of cv2.remap from the distorted image into the undistorted one, to the nearest pixel."""
+    """Map of cv2.remap from the distorted image into the undistorted one, nearest pixel."""
     import cv2
 
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)

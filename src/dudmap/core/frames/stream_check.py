@@ -190,6 +190,5 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
 
 
 def _equal(a: NDArray, b: NDArray) -> bool:
-    """Whether two images are equal; the middle row alone reveals most differences."""
     middle = a.shape[0] // 2
     return a.shape == b.shape and a[middle].tobytes() == b[middle].tobytes() and np.array_equal(a, b)

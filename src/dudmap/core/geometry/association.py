@@ -54,7 +54,6 @@ def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[in
 
 
 def _lines(path: Path, columns: str, *, short: bool = False) -> Iterator[tuple[int, str]]:
-    """Numbers and text of the lines of a list, without comments and header."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -116,7 +115,7 @@ def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
 
 
 def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> int:
-    """Index of the second time in a row of two times and two files, whose names may contain blanks."""
+    """Index of the second time in a row of two times and two names, which may contain blanks."""
     if len(fields) == 4:
         return 2
     places = [place for place in range(2, len(fields) - 1) if re.fullmatch(r"[-+.\deE]+", fields[place].group())]
@@ -127,7 +126,6 @@ def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]
 
 
 def _name(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> str:
-    """Name of a file in a row: the first field, or all fields if the name contains blanks."""
     if not fields:
         raise DatasetError(f"{path}, line {number}: expected the name of a file after its time, found {line!r}")
     name = fields[0].group()

@@ -99,9 +99,7 @@ class OtherView:
     def _splatted(
         self, rows: NDArray[np.intp], columns: NDArray[np.intp], z: NDArray[np.float32], T: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Nearest depths (h, w) of pixels (n,) with depths (n,); each pixel covers its own width in the second
-        camera.
-        """
+        """Nearest depths (h, w) of pixels (n,); each covers its own width in the second camera."""
         points = self.depth_lens.points(rows, columns, z.astype(np.float64))
         uv, depths = self.color_lens.project(points @ T[:3, :3].T + T[:3, 3])
         order = np.argsort(-depths)  # the nearest is written last

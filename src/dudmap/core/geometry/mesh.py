@@ -40,7 +40,6 @@ class Mesh:
             object.__setattr__(self, name, copied(getattr(self, name), f"{name} of a mesh", dtype=None))
 
     def __repr__(self) -> str:
-        """Sizes without the arrays."""
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles)"
 
     def area(self) -> float:
@@ -77,7 +76,7 @@ class Mesh:
 
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":
-        """Read a file that ``save`` wrote, None for any other: trimesh takes 2 s for a million triangles."""
+        """Read a file that ``save`` wrote, else None; trimesh takes 2 s for a million triangles."""
         layout = ply_layout(path)
         if layout is None:
             return None
@@ -108,7 +107,7 @@ class Mesh:
 
     @classmethod
     def _load_foreign(cls, path: Path) -> "Mesh":
-        """Read a file of another program, without materials, because they refer to further files."""
+        """Read another program's file without materials, which refer to further files."""
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 

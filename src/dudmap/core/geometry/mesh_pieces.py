@@ -64,10 +64,7 @@ def load_simplified(path: str | Path, max_triangles: int) -> Mesh:
 
 
 def _read_pieces(path: Path) -> Iterator[tuple[Mesh, int]]:
-    """Parts of a mesh file with at most ``FACES_AT_ONCE`` faces, and the number of all faces.
-
-    A part contains the range of vertices that its faces use.
-    """
+    """Parts of at most ``FACES_AT_ONCE`` faces with their range of vertices, and the number of all faces."""
     try:
         layout = ply_layout(path)
     except OSError as error:

@@ -147,7 +147,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
 
 
 def _named_order(line: str) -> str:
-    """Last letters of the names of columns two to eight of a header line; empty for any other line."""
+    """Last letters of the names of columns two to eight of a header; empty for other lines."""
     names = re.sub(r"\[.*?\]|\(.*?\)", "", line.lower()).strip("#, ")
     columns = [name.strip() for name in names.split(",")] if "," in names else names.split()
     letters = "".join(name[-1:] for name in columns[1:8])
@@ -155,7 +155,6 @@ def _named_order(line: str) -> str:
 
 
 def _matrix(path: Path, number: int, fields: list[str]) -> NDArray[np.float64]:
-    """Pose of a row of 12 or 16 numbers."""
     row = np.array(_numbers(" ".join(fields)))
     T = np.eye(4)
     if row.size in (12, 16):
@@ -170,12 +169,10 @@ def _matrix(path: Path, number: int, fields: list[str]) -> NDArray[np.float64]:
 
 
 def _numbers(line: str) -> list[float]:
-    """Numbers of a row; none if a field is not a finite number."""
     return _finite(line.replace(",", " ").split())
 
 
 def _finite(fields: list[str]) -> list[float]:
-    """Numbers of fields; none if one is not a finite number."""
     try:
         numbers = list(map(float, fields))
     except ValueError:

@@ -49,7 +49,6 @@ class Trajectory:
         return len(self.timestamps)
 
     def __repr__(self) -> str:
-        """The extent without the poses."""
         times = f", {self.timestamps[0]:.6f} to {self.timestamps[-1]:.6f} s" if len(self) else ""
         return f"Trajectory({len(self)} poses{times})"
 

@@ -62,11 +62,10 @@ class AdaptiveVolume(TsdfVolume):
 
     @property
     def _coarser(self) -> list[VoxelBlocks]:
-        """The parents of each level."""
         return self.all_blocks.parents
 
     def _parameters_of(self, n: int) -> FusionParameters:
-        """Fusion parameters of a level, 0 = coarsest. All levels store distances in the steps of the coarsest one."""
+        """Parameters of a level, 0 = coarsest; all levels store distances in its steps."""
         if n == 0:
             return self.parameters
         finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
@@ -97,8 +96,7 @@ class AdaptiveVolume(TsdfVolume):
     def _average_finer(
         self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
-        """Fuse an image into candidate blocks of a finer level and drop the empty ones; returns the slots (m,) of
-        all of them."""
+        """Fuse an image into candidate blocks of a finer level, drop the empty ones; returns the slots (m,)."""
         if len(candidates) == 0:
             return candidates
         level, number = self.levels[n], self._frame_number
@@ -115,17 +113,14 @@ class AdaptiveVolume(TsdfVolume):
         return slots
 
     def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
-        """Mark blocks of a level (0 = coarsest) and the coarser blocks around them as changed in this frame."""
+        """Mark blocks of a level (0 = coarsest) and the coarser blocks around them as changed."""
         for level in self.levels[:n][::-1]:
             level.blocks.written[slots] = self._frame_number
             slots = level.parents[slots]
         self.blocks.written[slots] = self._frame_number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
-        """See ``PagedMap``.
-
-        Blocks that the other map does not refine take interpolated colours of its coarser level.
-        """
+        """See ``PagedMap``; blocks without finer ones in the other map take its interpolated colours."""
         assert isinstance(other, AdaptiveVolume)
         if level == 0:
             super()._take_level_colors(level, slots, other, number)

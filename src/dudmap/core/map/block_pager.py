@@ -140,7 +140,7 @@ class BlockPager(Stateful):
     def _make_room(
         self, tree: BlockTree, first: NDArray[np.integer], last: NDArray[np.integer], number: int, coming: list[Region]
     ) -> None:
-        """Move the regions farthest from the box to the store until the blocks, with the incoming ones, fit."""
+        """Store the regions farthest from the box until the blocks, with the incoming ones, fit."""
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(tree)
         needed = tree.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
@@ -175,10 +175,8 @@ class BlockPager(Stateful):
         leaving: NDArray[np.bool_],
         frame_number: int,
     ) -> bool:
-        """Write the leaving regions (r, 3) and return whether all writes succeeded; after a failure none has left.
-
-        ``region_of`` (n,) is the region of each entry. The caller removes the entries.
-        """
+        """Write the leaving regions (r, 3); returns success, after a failure none has left. ``region_of`` (n,) is
+        the region of each entry, which the caller removes."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))

@@ -57,7 +57,6 @@ class VolumeMirror:
         target.written[slots] = self.volume._frame_number
 
     def _copy(self, level: int, source: VoxelBlocks, target: VoxelBlocks, limit: int | None) -> NDArray[np.int64]:
-        """Copy the voxels written since their last copy; returns their slots (n,)."""
         if len(self._copied[level]) < len(source.geometry):
             for name in ("geometry", "colors", "written"):
                 setattr(target, name, grown(getattr(target, name), GROWTH * len(source.geometry), 0))
@@ -138,7 +137,6 @@ class IncrementalMesh:
         return joined(list(self.chunks.values()))
 
     def _extract(self, stale: NDArray[np.int32]) -> list[Mesh]:
-        """Mesh of each of these chunks (n, 3)."""
         reach = np.arange(-1, EDGE + 1, dtype=np.int32)
         offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
         inner = np.all((offsets >= 0) & (offsets < EDGE), axis=1)
@@ -156,7 +154,6 @@ class IncrementalMesh:
 
 
 def _corners(low: int, high: int) -> NDArray[np.int32]:
-    """Corners (8, 3) of a cube."""
     return np.array([[i, j, k] for i in (low, high) for j in (low, high) for k in (low, high)], dtype=np.int32)
 
 

@@ -84,10 +84,6 @@ def _of_level(blocks: VoxelBlocks, content: BlockRecords) -> VoxelBlocks:
 
 
 def _take_over(coarse: BlockRecords, fine: BlockRecords, rows: NDArray[np.intp], octants: NDArray[np.intp]) -> None:
-    """Give coarse voxels the values of the finer voxels at the same points.
-
-    The fine blocks lie in ``octants`` (n,) of the coarse blocks ``rows`` (n,).
-    """
     for octant, (x, y, z) in enumerate(4 * OCTANTS):
         own = octants == octant
         place = rows[own], slice(x, x + 4), slice(y, y + 4), slice(z, z + 4)
@@ -97,10 +93,7 @@ def _take_over(coarse: BlockRecords, fine: BlockRecords, rows: NDArray[np.intp],
 
 
 def _filled(fine: VoxelBlocks, coarse: VoxelBlocks) -> VoxelBlocks:
-    """Blocks of a level and their neighbours, filled from the coarser level.
-
-    Filled are unobserved voxels and the sides towards missing blocks.
-    """
+    """Blocks of a level and their neighbours; unobserved voxels and open sides are filled from the coarser level."""
     count = fine.num_slots
     coords = fine.slot_coords[:count]
     observed = (fine.geometry[:count] != 0).reshape(SHAPE)

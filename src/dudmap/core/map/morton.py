@@ -31,14 +31,12 @@ def decode(codes: NDArray[np.int64], bits: int = BITS) -> NDArray[np.int32]:
 
 
 def _spread(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Insert two zeros between the bits of 21-bit numbers."""
     for shift, mask in _MASKS:
         values = (values | (values << shift)) & mask
     return values
 
 
 def _gathered(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Inverse of ``_spread``; the bits between are ignored."""
     values = values & _MASKS[-1][1]
     for (shift, _), (_, mask) in zip(reversed(_MASKS), [*reversed(_MASKS[:-1]), (0, 0x1FFFFF)], strict=True):
         values = (values | (values >> shift)) & mask

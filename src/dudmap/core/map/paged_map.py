@@ -80,15 +80,11 @@ class PagedMap(Stateful):
         return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
-        """Empty blocks.
-
-        Under a memory limit they reserve address space for all blocks that fit, so that growing copies nothing.
-        """
+        """Empty blocks; under a memory limit they reserve address space, so that growing copies nothing."""
         blocks, limit = VoxelBlocks(), None if self.pager is None else self.pager.max_blocks
         return VoxelBlocks(limit.limit // blocks.slot_bytes) if isinstance(limit, MemoryLimit) else blocks
 
     def _empty(self) -> None:
-        """Reset blocks and window to empty."""
         self.levels = []
         self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
 
@@ -110,10 +106,7 @@ class PagedMap(Stateful):
             self.pager.focus(self.all_blocks, low, high, self._frame_number)
 
     def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
-        """First block (3,) of each region.
-
-        Until the next iteration the region and all blocks that touch it are in memory.
-        """
+        """First block (3,) of each region; until the next one the region and its neighbours are in memory."""
         for region in regions_of(self.all_blocks, self.pager):
             first = np.array(region, dtype=np.int32) * REGION
             self._bring(first, first + REGION)

@@ -104,9 +104,9 @@ def prolonged(
 
 
 def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers (n,) that distribute the examinations of blocks over the frames.
+    """Numbers (n,) that distribute the examinations of blocks over the frames: remainders by ``PERIOD`` along each
+    axis.
 
-    They depend on the block coordinates alone, so that paging changes no result. Along each axis they cycle through all
-    remainders by ``PERIOD``.
+    They depend on the coordinates alone, so that paging changes no result.
     """
     return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])

@@ -189,7 +189,6 @@ class TsdfVolume(PagedMap):
         self._fuse(self._view(replace(frame, color=rgb), used, T), count)
 
     def _view(self, frame: Frame, used: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> DepthView:
-        """A frame at a pose (4, 4) in the form of the back end; only the pixels ``used`` (H, W) are fused."""
         T_camera_local = se3.inverse(T_world_camera)
         T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (self.window.local_origin * self.block_size)
         constant = self.config.weighting == "constant"
@@ -200,11 +199,8 @@ class TsdfVolume(PagedMap):
         )  # fmt: skip
 
     def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
-        """Fuse an image inside the window, ``count`` times.
-
-        Returns:
-            (n,) int32 slots that it was averaged into; empty ones have been released. And the prepared image.
-        """
+        """Fuse an image inside the window, ``count`` times; returns the slots (n,) int32 that are not empty, and the
+        prepared image."""
         blocks, window, number, free_after = self.blocks, self.window, self._frame_number, self.config.free_after
         touched = self.backend.touch(self.grid, view, window.stamps, free_after, number, self.parameters)
         if len(touched.cells):
@@ -260,7 +256,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def _local_grid(self) -> VoxelGrid:
-        """The blocks with coordinates relative to the window's local origin, where 32-bit arithmetic is precise."""
+        """Blocks relative to the window's origin, precise in 32 bits."""
         grid, origin = self.grid, self.window.local_origin
         if not origin.any():
             return grid

@@ -338,11 +338,7 @@ class VoxelBlocks(Stateful):
 
 
 def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
-    """Check types, shapes and ranges of the arrays of a map file, because kernels do not check them.
-
-    Raises:
-        ValueError: The arrays do not describe a map.
-    """
+    """Check the arrays of a map file, because kernels do not; raises a ``ValueError``."""
     n, m = len(coords), len(entries)
     wanted = {
         "coords": (coords, np.int32, (n, 3)), "free_count": (free_count, np.uint8, (n,)),

@@ -73,7 +73,6 @@ class MovingObjects(Stateful):
         return partial(self._movers, frame)
 
     def _movers(self, frame: "_Frame") -> tuple[Mover, ...]:
-        """The moving objects of a frame, computed after all earlier frames."""
         assert self.tracker is not None
         with self._finding:
             while frame.movers is None:

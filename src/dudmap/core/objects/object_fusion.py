@@ -130,7 +130,7 @@ def crop_object(
 
 
 def _padded_range(indices: NDArray[np.int64], shortest: int, size: int) -> slice:
-    """Range within 0 to ``size`` around sorted indices, padded by 1 at each end and at least ``shortest`` long."""
+    """Range within 0 to ``size`` around sorted indices, padded by 1, at least ``shortest`` long."""
     start, stop = int(indices[0]) - 1, int(indices[-1]) + 2
     missing = max(0, shortest - (stop - start))
     start, stop = start - missing // 2, stop + (missing + 1) // 2
@@ -211,7 +211,7 @@ class ObjectFusion(Stateful):
         return [self._with_velocity(mover, now) for mover in movers]
 
     def _with_velocity(self, mover: Mover, now: float) -> Mover:
-        """Object with the velocity of its map's centre: the slope of a line through the recent positions."""
+        """Object with the velocity of its map's centre: slope of the recent positions."""
         track = self._tracks.get(mover.id)
         if track is None or len(track.Ts_camera_object) < YOUNG_FRAMES:
             return mover
@@ -224,7 +224,7 @@ class ObjectFusion(Stateful):
         return replace(mover, velocity=times @ positions / np.sum(times**2))
 
     def _close(self, id: int) -> None:
-        """End the tracking of an object permanently; its mesh is kept if it is rigid."""
+        """End the tracking of an object; its mesh is kept if it is rigid."""
         result, Ts = self._tracks.pop(id).result()
         self._closed.add(id)
         if result.rigid and sum(other.rigid for other, _ in self._results) >= MAX_MESHES:
@@ -293,8 +293,7 @@ class ObjectFusion(Stateful):
     def _align(self, volume: ObjectVolume, view: ObjectView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
         """Pose T_object_camera by registration from the guess with the lowest cost.
 
-        A measurement off the map at that guess shows a new side of the object and gets weight 0. Its cost, as in camera
-        registration, would pull the object back to the known side.
+        A measurement off the map at that guess shows a new side and gets weight 0: its cost would pull the object back.
         """
         volume.look_at(guesses[0])
         systems = [self.tracker.linearize(volume, view.levels[0], T, view.weights[0]) for T in guesses]
@@ -328,7 +327,7 @@ class ObjectFusion(Stateful):
     def _seen_through_share(
         self, track: ObjectTrack, observation: Observation, T_object_camera: NDArray[np.float64]
     ) -> float:
-        """Share of the object's unoccluded fused surface that lies in front of the depth measurements."""
+        """Share of the object's unoccluded fused surface in front of the measurements."""
         T, camera = se3.inverse(T_object_camera), observation.camera
         points = track.points @ T[:3, :3].T + T[:3, 3]
         pixels, z = np.rint(camera.project(points)), points[:, 2]
@@ -345,7 +344,7 @@ class ObjectFusion(Stateful):
         return float(np.count_nonzero(seen_through) / max(np.count_nonzero(seen_through | seen), 1))
 
     def _off_surface_share(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64]) -> float:
-        """Share of the object's measurements within the truncation band of its map that lie off its surface."""
+        """Share of the object's measurements in the truncation band that lie off its surface."""
         level = view.levels[-1]
         sample = track.volume.sample(level.depth, level.intensity, level.camera, T_object_camera)
         known = view.mask & np.isfinite(sample.distance)
@@ -357,7 +356,6 @@ class ObjectFusion(Stateful):
 def _predicted(
     T_world_object: NDArray[np.float64], velocity: NDArray[np.float64], duration: float
 ) -> NDArray[np.float64]:
-    """Pose after ``duration`` seconds at a velocity (6,) of the origin and of the rotation, world axes."""
     T = T_world_object.copy()
     T[:3, 3] += velocity[:3] * duration
     T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), velocity[3:] * duration]))[:3, :3] @ T[:3, :3]

@@ -130,7 +130,6 @@ class ObjectTrack:
 
 
 def _main_components(mesh: Mesh) -> Mesh:
-    """Mesh without small components, which are measurements next to the object."""
     component = component_of_vertices(mesh)
     counts = np.bincount(component)
     return with_faces(mesh, (counts >= MIN_COMPONENT * counts.max())[component[mesh.faces[:, 0]]])

@@ -163,7 +163,7 @@ class ObjectTracker(Stateful):
     def _predicted_ids(
         self, timestamp: float, camera: Camera, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Object predicted in each 2x2 pixels at constant velocity: ((h + 1) // 2, (w + 1) // 2), 0 = none."""
+        """Object predicted at constant velocity in each 2x2 pixels: ((h + 1) // 2, (w + 1) // 2), 0 = none."""
         h, w = (camera.height + 1) // 2, (camera.width + 1) // 2
         out = np.zeros((h, w), dtype=np.int32)
         last = self._last
@@ -220,7 +220,7 @@ class ObjectTracker(Stateful):
         return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)
 
     def _candidates(self, region: Region, groups: list[list[Region]]) -> list[list[Region]]:
-        """Objects that may include a region: objects with the same prediction, or much larger ones."""
+        """Objects that may include a region: same prediction, or much larger."""
         same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
         track = next((track for track in self._tracks if track.id == region.predicted_id), None)
         if track and self._is_established(track, region.area):
@@ -231,7 +231,6 @@ class ObjectTracker(Stateful):
         return any(region.is_near(part, MERGE_DISTANCE * self.reference_depth) for part in group)
 
     def _is_established(self, track: _Track, area: float) -> bool:
-        """Whether an object has been seen for some time and ``area`` (m^2) is a substantial part of it."""
         known = track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
         return known and area >= 0.3 * track.area
 
@@ -245,8 +244,7 @@ class ObjectTracker(Stateful):
     ) -> list[_Track]:
         """Track of each object, greedily by increasing cost: distance from the prediction - max_jump * shared pixels.
 
-        A pair is considered if it shares more than 0.3 of the pixels, lies closer than ``max_jump`` or has overlapping
-        boxes. An object without a track begins a new one.
+        Candidates share more than 0.3 of the pixels, lie closer than ``max_jump`` or have overlapping boxes.
         """
         candidates, max_jump = [], MAX_JUMP * self.reference_depth
         if self._tracks:
@@ -274,7 +272,7 @@ class ObjectTracker(Stateful):
         return [tracks[i] for i in range(len(objects))]
 
     def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
-        """Velocity of an object: median of the estimates from displacements and from the slopes of its positions."""
+        """Velocity: median of estimates from displacements and from slopes of positions."""
         recent = [m for m in track.measurements if measurement.time - m.time < VELOCITY_WINDOW]
         track.measurements = [*recent, measurement]
         estimates = []

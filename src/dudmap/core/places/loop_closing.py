@@ -122,7 +122,6 @@ class LoopCloser(Stateful):
         self._next_search = self._frame + self.config.loops.gap
 
     def _features(self, query: LoopQuery) -> PlacedFeatures:
-        """Features of a frame, taken from the newest keyframe if the frame is that keyframe."""
         keyframes, T = self.atlas.keyframes.keyframes, query.tracking.T_world_camera
         newest = keyframes[-1] if keyframes else None
         # a keyframe of a saved map may have the same time, but not the same pose
@@ -182,7 +181,6 @@ class LoopCloser(Stateful):
         return None
 
     def _confirm_no_drift(self, place: PlaceMatch, query: LoopQuery) -> None:
-        """Store the absence of drift as a constraint for later corrections."""
         self._failures = 0
         T = query.tracking.T_world_camera
         edge = self.corrector.measured_edge(place.keyframe, T, T)

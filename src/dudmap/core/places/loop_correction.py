@@ -100,8 +100,8 @@ class LoopCorrector(Stateful):
     def _misfit(
         self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]
     ) -> tuple[float, float]:
-        """Mean distance (m) and mean intensity difference (0..1) of the ``chosen`` stored frames to a map; infinite
-        without overlap."""
+        """Mean distance (m) and mean intensity difference (0..1) of stored frames to a map; infinite without
+        overlap."""
         import cv2
 
         history = self.atlas.history
@@ -139,8 +139,8 @@ def _passes(
     """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, of the old and the new
     pass.
 
-    ``a`` and ``b`` are the ends of a loop. The old pass ends at the farthest point of the path from ``b``. Both passes
-    have about as many poses.
+    The old pass of the loop ``a`` to ``b`` ends at the farthest point of the path from ``b``. Both passes have about as
+    many poses.
     """
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b], unit))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
@@ -151,8 +151,7 @@ def _passes(
 
 
 def _odometry_edges(Ts: NDArray[np.float64], unit: float) -> list[Edge]:
-    """Tracked motions between consecutive stored frames (n, 4, 4); their standard deviations (m, rad) grow with their
-    length."""
+    """Motions between consecutive stored frames (n, 4, 4); standard deviations (m, rad) grow with their length."""
     motions = se3.inverse(Ts[:-1]) @ Ts[1:]
     sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions, unit)).tolist()
     return [Edge(i, i + 1, T, sigma * unit, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]

@@ -142,7 +142,7 @@ class LoopVerifier:
 
 
 def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
-    """Mean truncated distance of the static depth measurements of a frame at a pose (4, 4) to a map, metres."""
+    """Mean truncated distance, metres, of the static measurements of a frame at a pose to a map."""
     level = query.levels[-1]
     weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
     volume.look_at(T_world_camera)

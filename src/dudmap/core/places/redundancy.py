@@ -103,7 +103,7 @@ class RedundantViews(Stateful):
     def _known_share(
         self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share (h, w) of the information on the surface at each measurement that the map has; 0 off its surface."""
+        """Share (h, w) of the surface information at each measurement that the map has; 0 off its surface."""
         volume.look_at(T_world_camera)
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)
@@ -111,13 +111,10 @@ class RedundantViews(Stateful):
         return np.where(on_surface, volume.known_share(level.depth, level.camera, T_world_camera), np.float32(0))
 
     def _is_behind(self, place: _Place, level: Level, volume: TsdfVolume) -> NDArray[np.bool_]:
-        """Measurements (h, w) behind the last fused surface of their pixel, beyond the depth tolerance of one
-        surface."""
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)
         return (place.depth > 0) & (level.depth - place.depth > depth_tolerance(sigma, level))
 
     def _is_near(self, place: _Place, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether the camera is still at the place; always if ``max_translation`` is 0."""
         config = self.config.similarity
         if config.max_translation == 0:
             return True

@@ -162,14 +162,11 @@ class Relocalizer(Stateful):
     def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
         """Whether the motion between an earlier lost image and this one is certainly the camera's.
 
-        Two images do not determine which of two motions is the camera's. A near crowd may fill most of the pixels; the
-        far static world may fill most of the surface. A map starts only if one motion explains both at least AGREED of
-        the surface and most of the pixels.
-
+        Two images do not determine which of two motions is the camera's: a near crowd may fill most pixels, the far
+        world most surface. A map starts only if one motion explains AGREED of the surface and most of the pixels.
         Exceptions:
 
-        * Without a common motion, as in images without texture: True unless most of the view moved when the camera was
-          lost.
+        * Without a common motion (no texture): True unless most of the view moved when the camera was lost.
         * Images are not compared (``dynamics.start_seconds`` = 0): True.
         """
         if not self._compares_images:

@@ -131,11 +131,7 @@ def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistor
 
 
 def _check_arrays(data: "Mapping[str, NDArray]") -> None:
-    """Check the arrays of a keyframe file.
-
-    Raises:
-        ValueError: A type, shape or value does not fit keyframes.
-    """
+    """Check the arrays of a keyframe file; raises a ``ValueError``."""
     n, total = len(data["counts"]), len(data["points"])
     wanted = {
         "counts": ("iu", (n,)), "timestamps": ("f", (n,)), "Ts_world_camera": ("f", (n, 4, 4)),
@@ -155,7 +151,6 @@ def _check_arrays(data: "Mapping[str, NDArray]") -> None:
 
 
 def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:
-    """Rows of all parts (n, width), concatenated."""
     return np.concatenate([np.empty((0, width), dtype), *(part.astype(dtype) for part in parts)])
 
 

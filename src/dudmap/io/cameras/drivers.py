@@ -215,7 +215,6 @@ class OrbbecCamera(_PolledCamera):
 
 
 def _rational_lens(own: Any, lens: Any) -> Lens:  # noqa: ANN401
-    """Lens of an Orbbec's factory intrinsics: eight coefficients of the rational model."""
     camera = Camera(own.fx, own.fy, own.cx, own.cy, own.width, own.height)
     coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
     return Lens.of(camera, RATIONAL, coefficients)

@@ -129,7 +129,7 @@ class Recorder:
                 self._error = error
 
     def _write(self, frame: "Frame") -> None:
-        """Write images and camera_info of a frame; with the first one the place of the colour camera."""
+        """Write images and camera_info; first also the place of the colour camera."""
         writer, types, calibration = self._writer, self._writer.types, self._calibration
         recorded = max(round(frame.timestamp * 1e9), self._last + 1)
         depth_frame, depth_space = (COLOR_FRAME, ALIGNED) if calibration is None else (DEPTH_FRAME, DEPTH)
@@ -150,7 +150,6 @@ class Recorder:
             writer.write(f"{space}/image_raw", recorded, ros.image(types, stamp, pixels, encoding, name))
 
     def _depth(self, depth: NDArray[np.float32]) -> tuple[NDArray[Any], str]:
-        """16-bit millimetres if they are exact, else metres as floats."""
         if self._camera.depth_scale == 1000:
             millimetres = np.rint(depth * np.float32(1000))
             if millimetres.max(initial=0) <= np.iinfo(np.uint16).max:

@@ -112,7 +112,7 @@ def z_up(floor: Floor) -> NDArray[np.float64]:
 
 
 def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """View direction (0, 0, 1) of the first camera without its part along ``up``, or its x axis if nothing is left."""
+    """View direction (0, 0, 1) without its part along ``up``, or the x axis if nothing is left."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:
         forward = np.array([1.0, 0.0, 0.0]) - up[0] * up

@@ -92,7 +92,7 @@ class SpaceGrid:
         return grid
 
     def _centres(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Numbers (n,) in C order and centres (n, 3), metres, axes of the grid, of all cells, ``CHUNK`` at once."""
+        """Numbers (n,) in C order and centres (n, 3), metres, of all cells, ``CHUNK`` at once."""
         for start in range(0, self.occupancy.size, CHUNK):
             cells = np.arange(start, min(start + CHUNK, self.occupancy.size))
             numbers = np.stack(np.unravel_index(cells, self.occupancy.shape), axis=1)

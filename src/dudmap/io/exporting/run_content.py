@@ -172,7 +172,6 @@ class RunContent:
 
 
 def _index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
-    """Index of a frame's time in increasing times (N,), None if there is none."""
     nearest = int(np.argmin(np.abs(stamps - timestamp)))
     return nearest if abs(float(stamps[nearest]) - timestamp) <= NEAR else None
 

@@ -175,7 +175,7 @@ def _floor(mesh: Mesh, near: NDArray[np.float64], limit: float | None = None) ->
 
 
 def _unevenness(mesh: Mesh, floor: Floor) -> float:
-    """Angle, degrees, between the deviation of the floor's vertices from its plane and its shorter extent."""
+    """Angle, degrees, between the deviation of the floor from its plane and its shorter extent."""
     facing = (mesh.normals @ floor.up > LEVEL) & (np.abs(mesh.vertices @ floor.up - floor.height) < 0.05)
     points = mesh.vertices[facing].astype(np.float64)
     if len(points) < 10:
@@ -185,7 +185,6 @@ def _unevenness(mesh: Mesh, floor: Floor) -> float:
 
 
 def _against(measured: MeasuredUp | None, direction: NDArray[np.float64], name: str) -> str:
-    """Sentence on a direction that contradicts measured gravity; empty otherwise."""
     if measured is None or (angle := _angle(measured.direction, direction)) <= CONTRADICTS:
         return ""
     return f"up: {name} is {angle:.0f} degrees off the gravity of {measured.source}"

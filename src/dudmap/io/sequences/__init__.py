@@ -67,9 +67,8 @@ class Sequence(Protocol):
 class Recording(ABC):
     """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame on access.
 
-    A format sets times, cameras and their sources in its constructor, and reads a frame in ``_frame``. Constructors
-    also take the options of the format. They raise a ``DatasetError`` for a damaged recording or another kind, and
-    a ``MissingExtraError`` if a package is missing.
+    A format sets times, cameras and sources in its constructor, which raises a ``DatasetError`` for a damaged recording
+    and a ``MissingExtraError`` without its package. ``_frame`` reads a frame.
 
     Args:
         path: The folder or file.
@@ -77,24 +76,24 @@ class Recording(ABC):
 
     Attributes:
         format: Name of the format, for people.
-        options: Names of the options of ``open_sequence`` that the format has.
+        options: Options of ``open_sequence`` that the format has.
         sources: Origin of ``intrinsics``, ``depth unit`` and ``times``: a file, a data set's name, an option, or an
             assumption.
         remarks: Sentences on omitted data and on assumptions.
         timed: Whether the times were read or their rate was given; False for assumed times.
-        has_color: Whether there are colour images; without, the ``color`` of all frames is None.
-        gravity: Measured directions against gravity, None without; reading them may raise a ``DatasetError``.
+        has_color: False if the ``color`` of all frames is None.
+        gravity: Measured directions against gravity, or None; reading them may raise a ``DatasetError``.
         opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
 
     format = ""
     options: tuple[str, ...] = ()
     truth = ""
-    """Conversion of the published poses into the ground truth, unless they are camera poses in dudmap's axes."""
+    """Conversion of the published poses, unless they are camera poses in dudmap's axes."""
     suffix = ""
-    """Suffix of the files, for formats of single files."""
+    """Suffix of single files."""
     layout: tuple[str, ...] = ()
-    """Patterns of files and folders that every folder of the format contains."""
+    """Patterns of files and folders in every folder of the format."""
     timed = True
     has_color = True
     camera: Camera
@@ -112,7 +111,7 @@ class Recording(ABC):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether an existing folder or file has this format, judged by names and first bytes only."""
+        """Whether an existing path has this format, by names and first bytes only."""
         if cls.suffix:
             return path.suffix.lower() == cls.suffix and path.is_file()
         return path.is_dir() and all(any(path.glob(pattern)) for pattern in cls.layout)
@@ -121,7 +120,6 @@ class Recording(ABC):
         return len(self.timestamps)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames in the order of time."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
@@ -146,10 +144,9 @@ class Recording(ABC):
 
     @abstractmethod
     def _frame(self, index: int, name: str) -> Frame:
-        """A frame; ``name`` is used in messages."""
+        """Read a frame; ``name`` is used in messages."""
 
     def _set_cameras(self, own: Camera, color: Calibration, source: str, given: Camera | str | None) -> None:
-        """Set the cameras of the file; ``given`` may replace the depth camera."""
         known = intrinsics.given(given) if given else None
         self.camera = known.camera(own.width, own.height, own.depth_scale) if known else own
         one_size = (color.camera.width, color.camera.height) == (own.width, own.height)
@@ -185,12 +182,12 @@ READERS = (
     "bag:RealSenseRecording",
     "bag:RosBag",
 )
-"""Module and class of the reader of every format, in the order of the attempts: specific layouts first."""
+"""Module and class of every reader in the order of the attempts: specific layouts first."""
 NUMBERED = READERS.index("numbered:NumberedSequence")
 MOST_NAMES = 5
 """Most recordings named in a message."""
 DEPTH_OF_SEARCH = 3
-"""Levels of folders below the given one that are searched for a recording."""
+"""Levels of folders that are searched for a recording."""
 
 
 @cache
@@ -201,7 +198,7 @@ def readers() -> tuple[type[Recording], ...]:
 
 
 def reader_of(path: Path) -> type[Recording] | None:
-    """The first reader that recognises an existing folder or file, None if there is none."""
+    """First reader that recognises an existing path, or None."""
     return next((reader for reader in readers() if reader.recognises(path)), None)
 
 
@@ -241,14 +238,14 @@ def open_sequence(
 ) -> Recording:
     """Open a recording with the first reader of ``readers()`` that recognises it.
 
-    A folder that is no recording itself may contain one. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is
-    unpacked into a cache first; ``archive.zip/folder`` names one of several recordings in it.
+    A folder may contain the recording. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is unpacked into a
+    cache first; ``archive.zip/folder`` names one of several recordings in it.
 
     Args:
         path: Folder, file or archive.
         camera: Intrinsics that replace the recording's: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
             Defaults: the size of the images, and the format's usual depth scale.
-        fps: Frames per second of a recording with frame numbers instead of times; default 30.
+        fps: Frames per second of a recording without times; default 30.
         depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces the unit of camera and
             recording.
         options: Of one format, e.g. ``topics`` of bags; None means not given.
@@ -290,7 +287,7 @@ def _option(name: str) -> str:
 
 
 def _find(path: Path) -> tuple[Path, type[Recording]]:
-    """Recording at a path, in it, or in the archive at it, and its reader."""
+    """Recording at a path, in it, or in the archive at it."""
     from dudmap.io.sequences.archive import split, unpack
 
     reader = reader_of(path) if path.exists() else None
@@ -319,7 +316,7 @@ def _find(path: Path) -> tuple[Path, type[Recording]]:
 
 
 def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording] | None]]":
-    """Recordings below a folder with their readers, and archives with None; none inside of other recordings."""
+    """Recordings below a folder, and archives with None; none inside of others."""
     from dudmap.io.sequences.archive import is_archive
 
     found: list[tuple[Path, type[Recording] | None]] = []
@@ -335,7 +332,7 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
 
 
 def _places_by_content(path: Path) -> list[Path]:
-    """The folder or subfolders whose content is depth and colour images, else depth alone."""
+    """Folders whose content is depth and colour images, else depth alone."""
     from dudmap.io.sequences.image_series import alone, by_content, unknown
 
     def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:

@@ -24,9 +24,9 @@ SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", "
 LARGEST_BYTES = 256 * 2**30
 """Largest unpacked size. The largest known recording (a CoRBS scene) has less than 30 GB."""
 LARGEST_COUNT = 1_000_000
-"""Largest number of members, 4.6 hours of colour and depth files at 30 frames a second."""
+"""Largest number of members: 4.6 hours of colour and depth files at 30 Hz."""
 LARGEST_HEADER = 2**20
-"""Largest header of a tar member with its extensions, bytes: a long name and its times have 10 kB."""
+"""Largest header of a tar member, bytes: a long name and its times have 10 kB."""
 LARGEST_DICTIONARY = 2**27
 """Largest memory for unpacking xz, bytes; the preset 9 needs 65 MB."""
 CHUNK = 2**20
@@ -120,7 +120,7 @@ def stem(path: Path) -> str:
 
 
 def _unpack_into(path: Path, folder: Path, packed: int) -> None:
-    """Write all files of an archive into a new folder; limit the bytes that are actually unpacked."""
+    """Write all files of an archive into a new folder; limit the unpacked bytes."""
     folder.mkdir(parents=True)
     limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
     written = 0
@@ -150,7 +150,7 @@ def _unpack_into(path: Path, folder: Path, packed: int) -> None:
 
 
 def _inside(path: Path, member: str, kind: str) -> PurePosixPath:
-    """Relative path of a member that is a plain file or folder and does not lead out of the archive."""
+    """Relative path of a plain file or folder that does not lead out of the archive."""
     if kind not in ("file", "folder"):
         raise DatasetError(f"{path} holds {member}, a {kind}; an archive of a recording has files only")
     name = member.replace("\\", "/")
@@ -180,7 +180,7 @@ def _tar_members(path: Path) -> "Generator[Member]":
 
 
 def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile":
-    """Open the content of a file, which may be compressed, by its first bytes."""
+    """Open a file that may be compressed."""
     start = file.read(6)
     file.seek(0)
     if start.startswith(b"\x1f\x8b"):

@@ -21,7 +21,7 @@ from dudmap.io.sequences.bag_file import MessageStream
 from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 BEFORE = 1_000_000_000
-"""Time by which a pass starts earlier than wanted, nanoseconds, because a seek may be inexact."""
+"""Seeks begin this much earlier, nanoseconds, because they may be inexact."""
 DEPTH_MODES = {
     (320, 288): (512, 96, 90), (640, 576): (1024, 192, 180), (512, 512): (512, 0, 0), (1024, 1024): (1024, 0, 0),
 }  # fmt: skip
@@ -32,7 +32,7 @@ RAW_COLORS = {"nv12": "COLOR_YUV2RGB_NV12", "yuyv422": "COLOR_YUV2RGB_YUY2", "bg
 
 
 class _Track(NamedTuple):
-    """Track of a video: its stream, the width and height of its images, and times (N,) in nanoseconds."""
+    """Stream, width and height of its images, and times (N,) in nanoseconds."""
 
     stream: Any
     size: tuple[int, int]
@@ -43,8 +43,8 @@ class AzureKinectRecording(Recording):
     """Recording in a ``.mkv`` file with the tracks COLOR and DEPTH and the attachment calibration.json.
 
     Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
-    and seen from its own camera. Both lenses are removed when a frame is read. Opening reads the file once, because
-    times stand between the images.
+    and seen from its own camera. Frames are freed of both lenses. Opening reads the whole file, because times stand
+    between the images.
     """
 
     format = "Azure Kinect .mkv"
@@ -149,10 +149,7 @@ def _nanoseconds(packet: Any) -> int:  # noqa: ANN401
 
 
 def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float], cut: tuple[float, float]) -> Lens:
-    """Lens of a camera in calibration.json, whose numbers are shares of the sensor image's width and height.
-
-    ``size`` is the size of the images and ``whole`` of the sensor image, in which they begin at ``cut``.
-    """
+    """Lens of calibration.json, in shares of the sensor image ``whole``; images of ``size`` begin at ``cut``."""
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":
         raise DatasetError(

@@ -38,21 +38,20 @@ MAGIC = {".bag": b"#ROSBAG V2.0", ".active": b"#ROSBAG V2.0", ".db3": b"SQLite f
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
-"""First /tf messages that list the frames: some seconds of a robot that publishes at 100 Hz."""
+"""Number of first /tf messages that list the frames: seconds at 100 Hz."""
 
 
 class RosBag(Recording):
     """Recording in a ROS bag, opened through its index: images and poses are read when they are used.
 
-    The time of a frame is the stamp in the header of its depth message. In compressed bags it is the time of recording
-    minus the median delay of the first messages. If the stamps do not increase, it is the time of recording. Colour is
-    associated one to one, nearest first, at most 20 ms apart. If two messages of a topic have the same time of
-    recording, one is skipped.
-
-    Intrinsics come from the camera_info topics of the images. Depth and colour are registered if their frame of
-    reference and intrinsics are equal. Otherwise ``calibration`` holds the colour camera and its motion to depth from
-    /tf_static. Lenses with more than five coefficients (rational, fisheye) are rectified when an image is read. The
-    ground truth is the trajectory of the depth camera in the frame ``world`` of /tf, if there is one.
+    * Times are stamps of the depth messages. In compressed bags they are times of recording minus the median delay of
+      the first messages; if stamps do not increase, times of recording.
+    * Colour is associated one to one, nearest first, at most 20 ms apart. Of messages with the same time one is
+      skipped.
+    * Intrinsics come from camera_info. Depth and colour are registered if their frame of reference and intrinsics are
+      equal. Otherwise ``calibration`` holds the colour camera and its motion to depth from /tf_static. Lenses with more
+      than five coefficients (rational, fisheye) are rectified when an image is read.
+    * The ground truth is the trajectory of the depth camera in the frame ``world`` of /tf.
 
     Args:
         path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
@@ -127,18 +126,17 @@ class RosBag(Recording):
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True poses of the depth camera, None if /tf has no world frame; read from the bag at the first use."""
+        """True poses of the depth camera, None without a world frame; read at the first use."""
         with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()
 
     @cached_property
     def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Gravity measured by the IMU, None without one; read from the bag at the first use."""
+        """Gravity measured by the IMU, None without one; read at the first use."""
         with foreign(DatasetError, f"the accelerations in {self.path}"):
             return gravity_of(self._bag, self._rotation_of)
 
     def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
-        """Rotation (3, 3) of vectors in the frame of an IMU into the depth camera, None if it is unknown."""
         T = self._transforms.between(self._depth_frame, imu)
         if T is None:
             return np.eye(3) if is_realsense_optical(imu, self._depth_frame) else None
@@ -157,7 +155,6 @@ class RosBag(Recording):
         return found
 
     def _associated(self, depth: MessageTimes, color: MessageTimes) -> list[tuple[int, int]]:
-        """Numbers of the colour and depth messages of each frame, in the order of their stamps."""
         colors, color_order = np.unique(color.stamps, return_index=True)
         depths, depth_order = np.unique(depth.stamps, return_index=True)
         pairs = [(int(color_order[i]), int(depth_order[j])) for i, j in associate(colors, depths)]
@@ -232,14 +229,13 @@ class RosBag(Recording):
         return None if calibration.is_registered(depth.camera) else calibration
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
-        """Motion of points of the depth camera into the colour camera, None if the bag does not contain it."""
         return self._transforms.between(color_frame, self._depth_frame)
 
     def _units(self) -> float:
         return MILLIMETRES
 
     def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
-        """Lens of a camera_info for images of a width and height; a rectified one comes from the projection matrix."""
+        """Lens of a camera_info; a rectified one comes from the projection matrix."""
         info = self._bag.first(connection)
         if info is None:
             return None
@@ -263,7 +259,6 @@ class RosBag(Recording):
 
     @cached_property
     def _transforms(self) -> TransformTree:
-        """Frames of /tf_static and of the first messages of /tf."""
         return self._tree(FIRST_TRANSFORMS)
 
     def _tree(self, count: int | None) -> TransformTree:
@@ -293,8 +288,8 @@ HEAD = 1 << 18
 class RealSenseRecording(RosBag):
     """Recording of a RealSense camera; depth is registered by the factory calibration in the file.
 
-    Frame times are the camera's: from the metadata of every frame (``.db3``, whose headers hold recording times) or
-    from the headers (``.bag``). The depth unit is the camera's option of that name.
+    Frame times come from the metadata of every frame (``.db3``) or from the headers (``.bag``). The depth unit is the
+    camera's option of that name.
     """
 
     format = "RealSense recording"
@@ -324,11 +319,10 @@ class RealSenseRecording(RosBag):
         return MessageTimes(recorded, np.array([stamps[int(time)] for time in recorded]), True)
 
     def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
-        """Identity, because the file gives accelerations in the axes of the depth camera."""
+        """Identity: accelerations are in the axes of the depth camera."""
         return np.eye(3)
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
-        """Motion through the common reference frame of both streams."""
         motions = [self._motion(connection) for connection in (self._topics.color, self._topics.depth)]
         if motions[0] is None or motions[1] is None:
             return None
@@ -349,7 +343,6 @@ class RealSenseRecording(RosBag):
         return MILLIMETRES
 
     def _motion(self, image: "Connection") -> NDArray[np.float64] | None:
-        """Motion (4, 4) of points of the reference into a stream, from its topic ``tf/...``."""
         found = self._beside(image, "tf/", "")
         return None if found is None else _motion(self._bag.first(found))
 
@@ -365,7 +358,6 @@ class RealSenseRecording(RosBag):
 
 
 def _motion(message: Any) -> NDArray[np.float64]:  # noqa: ANN401 - the type is made from the bag
-    """Motion of a geometry_msgs/Transform, or of text with the rotation column by column."""
     if not hasattr(message, "data"):
         return motion_of(message)
     T = np.eye(4)

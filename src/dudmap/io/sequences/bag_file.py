@@ -1,8 +1,7 @@
 """Read a bag with the package rosbags: topics, message times from the index, and single messages.
 
-rosbags trusts its input. This module limits decompression and accepts SQLite files with plain tables only. It decodes
-messages by the published ROS definitions, because rosbags would turn definitions in a bag into Python code. Topics of
-other types are listed and not read.
+rosbags trusts its input. This module limits decompression, accepts SQLite files with plain tables only, and decodes
+messages by the published ROS definitions: rosbags would turn definitions in a bag into Python code.
 """
 
 import os
@@ -29,13 +28,13 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 LARGEST_METADATA = 2**19
-"""Largest metadata.yaml, bytes. With 100 topics it has 60 kB; its parser takes 20 seconds per megabyte."""
+"""Largest metadata.yaml, bytes. With 100 topics it has 60 kB; parsing takes 20 seconds per megabyte."""
 SAMPLES = 30
-"""First messages that estimate the recording delay, if stamps cannot be read cheaply."""
+"""First messages that estimate the recording delay."""
 CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
-"""Encapsulation, seconds and nanoseconds at the start of a ROS 2 message with a header, by byte order."""
+"""Encapsulation, seconds and nanoseconds at the start of a ROS 2 message, by byte order."""
 ROS1_STAMP = struct.Struct("<4xII")
-"""Sequence number, seconds and nanoseconds at the start of a ROS 1 message with a header."""
+"""Sequence number, seconds and nanoseconds at the start of a ROS 1 message."""
 HEAD = 12
 """Bytes of either header start."""
 MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
@@ -52,8 +51,7 @@ class MessageTimes(NamedTuple):
     Attributes:
         recorded: (N,) int64 strictly increasing times of recording, nanoseconds; they identify a message.
         stamps: (N,) float64 times in the headers of the messages, seconds.
-        exact: Whether ``stamps`` come from the headers; else they are recording times minus the median delay of the
-            first messages.
+        exact: Whether ``stamps`` come from the headers; else they are recording times minus a median delay.
     """
 
     recorded: NDArray[np.int64]
@@ -117,9 +115,8 @@ class BagFile:
     def times(self, connection: "Connection") -> MessageTimes:
         """Times of the messages of a topic whose type has a header, without reading its images.
 
-        They come from the index of the bag, and stamps from the first bytes of each message. Stamps of compressed bags
-        are estimated, because reading them would decompress everything. Only an MCAP file without chunks is read
-        through once.
+        They come from the index, and stamps from the first bytes of each message. Stamps of compressed bags are
+        estimated. Only an MCAP file without chunks is read through once.
         """
         rows = list(self._ros1_entries(connection) if self._ros1 else self._ros2_entries(connection))
         recorded, first = np.unique(np.array([time for time, _ in rows], dtype=np.int64), return_index=True)
@@ -153,7 +150,7 @@ class BagFile:
         return seconds + 1e-9 * nanoseconds
 
     def _ros1_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
-        """Time of recording and first bytes of every message; None for compressed bytes."""
+        """Time of recording and first bytes of every message; None for compressed ones."""
         from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_uint32
 
         with _open(self._reader.path) as file:
@@ -169,7 +166,6 @@ class BagFile:
                 yield entry.time, file.read(HEAD)
 
     def _ros2_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
-        """Time of recording and first bytes of every message in all files of a ROS 2 bag."""
         storage = self._reader.storage
         packed = storage.metadata.compression_mode == "message"
         for part in getattr(storage, "storages", [storage]):  # a folder with metadata.yaml has one or several files
@@ -225,10 +221,7 @@ def _open(path: Any) -> IO[bytes]:  # noqa: ANN401 - a path, or a file that stan
 
 
 def _check(path: Path) -> None:
-    """Check that a bag has plain files only, and that an SQLite file has plain tables only.
-
-    A view in place of a table would be a program that runs when the bag is read.
-    """
+    """Accept plain files and plain SQLite tables only: a view would be a program that runs when the bag is read."""
     if path.is_dir():
         read_text(path / "metadata.yaml", LARGEST_METADATA)
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -243,7 +236,6 @@ def _check(path: Path) -> None:
 
 
 def _sqlite_uri(path: Path) -> str:
-    """SQLite address of a file for reading, with special characters quoted."""
     return f"file:{quote(str(path))}?mode=ro&immutable=1"
 
 
@@ -263,10 +255,8 @@ def limit_rosbags() -> None:
 
 @contextmanager
 def without_definitions() -> Generator[None]:
-    """Make rosbags ignore message definitions in MCAP files during the block; other users of rosbags keep them.
-
-    It would refuse a file for one definition in an unknown language.
-    """
+    """Make rosbags ignore message definitions in MCAP files during the block: it would refuse one in an unknown
+    language."""
     from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
     from rosbags.rosbag2 import storage_mcap
 
@@ -291,7 +281,7 @@ def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
 
 
 class _BoundedZstd:
-    """Replaces the module zstd in the reader of bags whose messages or files are compressed one by one."""
+    """Replaces the module zstd in readers of bags with compressed messages or files."""
 
     def __init__(self, zstd: Any, decompress: Callable[[bytes], bytes]) -> None:  # noqa: ANN401
         self._zstd, self.decompress = zstd, decompress
@@ -318,14 +308,13 @@ class _BoundedFile:
 
 
 JUMP = 2_000_000_000
-"""Smallest distance ahead, nanoseconds, at which a message is searched; nearer ones are reached by streaming, which
-costs less than a new stream."""
+"""Distance, nanoseconds, from which a new stream costs less than streaming."""
 
 
 class MessageStream:
     """Access to messages by topic and time of recording in nanoseconds.
 
-    Requests in order are served by one pass over the file. Messages of other topics are kept until the pass is beyond
+    Requests in order are served by one pass over the file, which keeps messages of other topics until it is beyond
     them. A jump opens a new pass at the wanted time.
 
     Args:

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 IMU = "sensor_msgs/msg/Imu"
 FIRST = 4000
-"""Number of first messages of a topic that are read: 10 s at 400 Hz, the highest rate of common depth cameras."""
+"""First messages of a topic that are read: 10 s at 400 Hz, the highest usual rate."""
 STANDARD = 9.80665
 """Standard acceleration of gravity, m/s^2 (ISO 80000-3)."""
 SCALE = 0.1
-"""Largest relative deviation of the median acceleration from gravity: far more than an IMU's scale error, and far less
-than a wrong unit gives."""
+"""Largest relative deviation of the median acceleration from gravity: more than an IMU's scale error, less than a
+wrong unit gives."""
 STILL = 0.02
-"""Largest relative deviation of an acceleration from the median for an IMU in steady motion."""
+"""Largest relative deviation of an acceleration from the median of a steady IMU."""
 
 
 def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64] | None]") -> Gravity | None:
@@ -64,10 +64,7 @@ def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64]
 
 
 def is_realsense_optical(imu: str, depth: str) -> bool:
-    """Whether two frames, ``imu`` and ``depth``, belong to one RealSense camera.
-
-    Its driver gives accelerations in the axes of the depth camera and names all frames after the camera.
-    """
+    """Whether two frames belong to one RealSense camera, whose accelerations are in the axes of its depth camera."""
     found = re.fullmatch(r"/?(.*)(?:imu|accel|gyro)_optical_frame", imu)
     return found is not None and depth.lstrip("/").startswith(found[1]) and depth.endswith("_optical_frame")
 

@@ -1,7 +1,6 @@
 """Interpret the messages of a bag: topics by type and name, the frame tree of /tf, and images.
 
-Missing or ambiguous topics raise a ``DatasetError`` that lists the topics of the bag. Unknown encodings, and damaged or
-short data, raise a ``FrameError``.
+Missing or ambiguous topics raise a ``DatasetError``; unknown encodings and damaged data a ``FrameError``.
 """
 
 import re
@@ -33,10 +32,8 @@ REGISTERED_NAME = re.compile(r"aligned|depth_registered|depth_to_(rgb|color)|hw_
 
 
 class Topics(NamedTuple):
-    """Connections of both images and of their camera_info, if any; and the world frame of /tf.
-
-    Without colour both images are the depth image.
-    """
+    """Connections of both images and of their camera_info, and the world frame; without colour both images are
+    depth."""
 
     color: "Connection"
     depth: "Connection"
@@ -68,10 +65,7 @@ def chosen_topics(text: str | None) -> dict[str, str]:
 def find_topics(
     connections: "Sequence[Connection]", chosen: dict[str, str], bag: str, first: "Callable[[Connection], Any]"
 ) -> Topics:
-    """Chosen topics; other topics are recognised by their names, else by their encodings.
-
-    ``first`` gives the first message of a topic.
-    """
+    """Chosen topics, else recognised by names, else by encodings; ``first`` gives the first message of a topic."""
     filled = [connection for connection in connections if connection.msgcount > 0]
     images = [connection for connection in filled if connection.msgtype in IMAGES]
     depths = [_named(images, chosen["depth"], bag)] if "depth" in chosen else [c for c in images if _is_depth(c)]
@@ -112,7 +106,7 @@ def base(topic: str) -> str:
 def _best(
     pairs: "list[tuple[Connection, Connection]]", images: "Sequence[Connection]", bag: str
 ) -> "tuple[Connection, Connection]":
-    """The pair of one camera; registered is preferred to unregistered, rectified to raw, and raw data to compressed."""
+    """Pair of one camera: registered before unregistered, rectified before raw, raw data before compressed."""
 
     def score(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair
@@ -186,7 +180,7 @@ LARGEST_GAP = 0.2
 class TransformTree:
     """Motions between named frames: each frame has one parent, and motions by time; a static frame has one motion.
 
-    Names are compared without the leading slash, which tf wrote and tf2 does not.
+    Names are compared without the leading slash of tf.
     """
 
     def __init__(self) -> None:
@@ -203,10 +197,7 @@ class TransformTree:
             self._motions[child] = motions
 
     def between(self, target: str, source: str) -> NDArray[np.float64] | None:
-        """Motion (4, 4) of points of ``source`` into ``target`` along static frames, None if there is none.
-
-        A frame that /tf repeats without change is static.
-        """
+        """Motion (4, 4) of points of ``source`` into ``target`` along frames that do not move, or None."""
         up, down = self._path(source), self._path(target)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
@@ -221,10 +212,7 @@ class TransformTree:
         return world.lstrip("/") in self._path(frame)[1:]
 
     def trajectory(self, world: str, frame: str, stamps: NDArray[np.float64]) -> Trajectory | None:
-        """Poses of ``frame`` in ``world`` at the times (N,) that all motions between the two cover.
-
-        Motions are interpolated on the screw between their neighbours in time.
-        """
+        """Poses of ``frame`` in ``world`` at the times (N,) that all motions cover, interpolated on screws."""
         path = self._path(frame)
         if world.lstrip("/") not in path:
             return None
@@ -251,7 +239,6 @@ class TransformTree:
         return path
 
     def _fixed(self, children: list[str]) -> NDArray[np.float64] | None:
-        """Motion of points of the first frame into the parent of the last one; None if it changes."""
         T = np.eye(4)
         for child in children:
             link, *others = self._motions[child].values()
@@ -262,7 +249,7 @@ class TransformTree:
 
 
 def _at(times: NDArray[np.float64], Ts: NDArray[np.float64], stamp: float) -> NDArray[np.float64] | None:
-    """Motion at a time, None outside the series and in its gaps; a single motion holds always."""
+    """Motion at a time, None outside the series and in its gaps."""
     if len(times) == 1:
         return Ts[0]
     k = int(np.searchsorted(times, stamp, side="right"))
@@ -288,11 +275,11 @@ COLOR_ENCODINGS = {
     "bayer_rggb8": (1, "COLOR_BayerRGGB2RGB"), "bayer_bggr8": (1, "COLOR_BayerBGGR2RGB"),
     "bayer_gbrg8": (1, "COLOR_BayerGBRG2RGB"), "bayer_grbg8": (1, "COLOR_BayerGRBG2RGB"),
 }  # fmt: skip
-"""Encoding (sensor_msgs/image_encodings) to the number of channels and the conversion to RGB of OpenCV."""
+"""Encoding (sensor_msgs/image_encodings) to number of channels and OpenCV's conversion to RGB."""
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-"""Encoding to type: 16-bit values in millimetres, or metres as floats (ROS REP 118)."""
+"""Encoding to type: 16-bit millimetres, or float metres (ROS REP 118)."""
 COMPRESSED_DEPTH_HEADER = struct.Struct("<i2f")
-"""Format number and two quantisation parameters before the PNG (ROS package compressed_depth_image_transport)."""
+"""Format number and two quantisation parameters before the PNG (compressed_depth_image_transport)."""
 
 
 def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - the type is made from the bag
@@ -326,7 +313,6 @@ def depth_of(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]
 
 
 def _pixels(message: Any, kind: np.dtype, channels: int, name: str) -> NDArray[Any]:  # noqa: ANN401
-    """Pixels (H, W[, C]) of an Image whose rows may be padded to ``step`` bytes."""
     used = message.width * channels * kind.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if message.step < used or len(data) < message.step * message.height:
@@ -339,10 +325,7 @@ def _pixels(message: Any, kind: np.dtype, channels: int, name: str) -> NDArray[A
 
 
 def _compressed_depth(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth of a PNG or RVL image, with or without the header of compressed_depth_image_transport.
-
-    Floats are stored as 16-bit values q of inverse depth, z = a / (q - b), with the parameters a and b in the header.
-    """
+    """Depth of a PNG or RVL image; floats are 16-bit inverse depths q, z = a / (q - b), with a and b in the header."""
     data = bytes(message.data)
     if data.startswith(images.PNG):
         return images.decode_depth(data, depth_scale, name)

@@ -1,7 +1,7 @@
 """Cameras in the content of a file of any name: text, JSON, YAML, NumPy arrays.
 
-A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1. Or it is focal lengths with a principal point under any
-usual name. The caller tests whether the numbers fit the images.
+A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths with a principal point under any usual
+name. The caller tests whether the numbers fit the images.
 """
 
 import re
@@ -26,32 +26,31 @@ ALIASES = {
     "width": ("width", "image_width", "img_width", "w"), "height": ("height", "image_height", "img_height", "h"),
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
 }  # fmt: skip
-"""dudmap's keys and their names in other programs, in lower case with underscores."""
+"""dudmap's keys and their names in other programs."""
 PAIRS = {
     ("fx", "fy"): ("focal_length", "focal"), ("cx", "cy"): ("principal_point", "optical_center"),
     ("width", "height"): ("resolution", "image_size", "img_size", "size"),
 }  # fmt: skip
-"""Pairs of keys whose numbers form one list, and the names of the list."""
+"""Pairs of keys whose numbers form one list, and its names."""
 LENSES = (
     "coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "dist_coeff",
     "dist", "d",
 )  # fmt: skip
 """Names of the coefficients of a lens."""
 ROWS = re.compile(r"intrin|calib|cam|param|^k$|^data$|^$")
-"""Names of a list ``fx fy cx cy`` that continues with a size or with coefficients of a lens."""
+"""Names of a list ``fx fy cx cy`` that continues with a size or a lens."""
 KNOWN = sorted((name for names in ALIASES.values() for name in names), key=len, reverse=True)
 KEYED = re.compile(rf"(?:(.+)_)?({'|'.join(KNOWN)})(?:_(.+))?")
-"""Name of one number, with words before and after it that name its camera: ``fx_depth``, ``Camera.fx``."""
+"""Name of one number, with words that name its camera: ``fx_depth``, ``Camera.fx``."""
 LENS = ("k1", "k2", "p1", "p2", "k3")
 COLMAP = {"pinhole": 6, "opencv": 10}
 """Models of COLMAP's cameras.txt and their count of numbers: width height fx fy cx cy [k1 k2 p1 p2]."""
 SKEW = 0.01
-"""Largest ignored skew of a matrix, as a share of fx. It shifts the edge of an image by 1 % of its height."""
+"""Largest ignored skew, share of fx: it shifts the edge of an image by 1 % of its height."""
 LEAST = 8.0
-"""Smallest focal length and principal point of a camera, pixels, as for images of 16 pixels. Other groups of four
-numbers, such as quaternions, are smaller."""
+"""Smallest focal length and principal point, pixels, as for images of 16 pixels; quaternions are smaller."""
 LEAST_SCALE = 100.0
-"""Smallest scale of depth, units per metre (a centimetre). Smaller numbers named scale mean something else."""
+"""Smallest scale of depth, units per metre (a centimetre)."""
 LARGEST_CONTENT = LARGEST_TOML
 """Largest file of intrinsics, bytes."""
 NO_NAMES = ("px", "pixel", "pixels")
@@ -75,7 +74,6 @@ def cameras_in(file: Path) -> list[tuple[str, Values]]:
 
 
 def _tree(file: Path) -> Any:  # noqa: ANN401 - dictionaries and lists
-    """Content of a file as dictionaries, lists and numbers; None for unsupported formats."""
     suffix = file.suffix.lower()
     try:
         if suffix == ".npy":
@@ -95,7 +93,7 @@ def _tree(file: Path) -> Any:  # noqa: ANN401 - dictionaries and lists
 
 
 def _tokens(text: str) -> Any:  # noqa: ANN401
-    """Names in a text and the numbers after each, or only its numbers; a repeated name begins another camera."""
+    """Names in a text and the numbers after each; a repeated name begins another camera."""
     numbers: list[float] = []
     parts: list[dict[str, Any]] = [{}]
     words: list[str] = []
@@ -197,7 +195,6 @@ def _may_be(key: str, below: Any) -> bool:  # noqa: ANN401
 
 
 def _row(value: list[Any], name: str) -> Values | None:
-    """Camera of a list: a matrix, or the numbers fx fy cx cy, then width and height or coefficients."""
     if (K := _matrix(value)) is not None:
         return values_of({"K": K.ravel().tolist()})
     if not all(map(_is_number, value)) or len(value) not in (4, 6, 7, 8, 9):
@@ -214,8 +211,7 @@ def _by_place(numbers: list[Any]) -> Values:
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Matrix K (3, 3), rows fx s cx, 0 fy cy, 0 0 1; None for other values. They are 9, 12 or 16 numbers by rows or
-    columns."""
+    """Matrix K (3, 3) of 9, 12 or 16 numbers by rows or columns; None for other values."""
     flat = _flat(value)
     if flat is None or len(flat) not in (9, 12, 16):
         return None
@@ -234,7 +230,6 @@ def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
 
 
 def _flat(value: Any) -> list[float] | None:  # noqa: ANN401
-    """Numbers of a list, of a list of rows, or of the ``data`` of OpenCV's matrix; None for other values."""
     if isinstance(value, dict):
         value = value.get("data")
     if not isinstance(value, list):

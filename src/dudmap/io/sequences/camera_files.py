@@ -87,7 +87,6 @@ class UnclearFilesError(DatasetError):
 
 
 def _of_file(file: Path) -> Intrinsics:
-    """Intrinsics of a text file: in the form of ``from_file``, else the only camera in it."""
     from dudmap.io.sequences.camera_content import cameras_in
 
     try:
@@ -240,7 +239,6 @@ def depth_scale(tree: Any) -> float | None:  # noqa: ANN401
 
 
 def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Value of the first existing name; the data of a matrix in OpenCV's form."""
     value = next((tree[name] for name in names if name in tree), None)
     return value.get("data") if isinstance(value, dict) else value
 
@@ -250,7 +248,6 @@ def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON
 
 
 def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Numbers (count,) of a list or of a list of rows; None for other values."""
     if not isinstance(value, list):
         return None
     flat = [number for row in value for number in (row if isinstance(row, list) else [row])]

@@ -123,7 +123,7 @@ def _is_small(file: Path) -> bool:
 
 
 def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) -> Found | None:
-    """Camera for the kind of images that it fits, depth if it fits both; None if it fits none."""
+    """Camera for the kind of images that it fits, depth if it fits both, or None."""
     if re.search(OTHER_WORDS, name):
         return None
     kinds = {"depth": depth, "color": color}
@@ -150,7 +150,7 @@ def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) ->
 
 
 def _is_multiple(given: Size, size: Size) -> bool:
-    """Whether the larger of two sizes of one shape is 1.5, 2, 2.5, 3, ... times the smaller one."""
+    """Whether the larger size is 1.5, 2, 2.5, 3, ... times the smaller one."""
     if not all(given) or abs(given[0] * size[1] / (given[1] * size[0]) - 1) > SAME_SHAPE:
         return False
     factor = max(given[0] / size[0], size[0] / given[0])
@@ -209,7 +209,7 @@ def _distinct(cameras: list[Found]) -> list[Found]:
 
 
 def _is_same(one: Values, other: Values) -> bool:
-    """Whether numbers agree; coefficients of a lens that only one of them has do not count."""
+    """Whether numbers agree; a lens that only one has does not count."""
     near = all(abs(one[key] - other[key]) <= SAME for key in ("fx", "fy", "cx", "cy"))
     return near and all(one[key] == other[key] for key in one.keys() & other.keys() & {"k1", "k2", "p1", "p2", "k3"})
 

@@ -48,7 +48,6 @@ def decode(data: bytes, name: str) -> NDArray[np.float32]:
 
 
 def _header(data: bytes) -> tuple[dict[str, bytes], int]:
-    """Attributes by name, and the place of the table of blocks behind them."""
     fields, at = {}, 8
     while data[at]:
         end = data.index(b"\0", at)
@@ -60,7 +59,6 @@ def _header(data: bytes) -> tuple[dict[str, bytes], int]:
 
 
 def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
-    """Names and types of the channels in file order; channels with fewer pixels than the image raise an error."""
     at = 0
     while listed[at]:
         end = listed.index(b"\0", at)
@@ -72,7 +70,7 @@ def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _inflated(block: bytes, size: int) -> bytes:
-    """Bytes of a block: stored as they are, or deflated differences of two halves if that is smaller."""
+    """Bytes stored as they are, or deflated differences of two halves."""
     if len(block) == size:
         return block
     packed = np.frombuffer(zlib.decompressobj().decompress(block, size + 1), np.uint8)

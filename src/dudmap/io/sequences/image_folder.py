@@ -77,7 +77,7 @@ class ImageFolder(Recording):
         self._take_truth()
 
     def _look_for_rotation(self, *, given: bool) -> None:
-        """Set the unit of depth images that are rotated by three bits; ``given`` is whether a file gives a unit."""
+        """Set the unit of depth images that are rotated by three bits."""
 
         def read(index: int) -> NDArray[np.float32]:
             return self._read_depth(self._pairs[index][1].path, 1.0)
@@ -101,7 +101,7 @@ class ImageFolder(Recording):
         return f"the recording{taken}"
 
     def _take_truth(self) -> None:
-        """Set the ground truth. If it cannot be read it is omitted, with a remark, because no run needs it."""
+        """Set the ground truth; if unreadable, it is omitted with a remark."""
         try:
             self.ground_truth = self._find_ground_truth()
             said = self.ground_truth.remarks if self.ground_truth is not None else ()
@@ -158,7 +158,6 @@ class ImageFolder(Recording):
         self.timed, self.sources["times"] = True, f"--fps {fps:g}"
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of all frames, by increasing time of the depth; see ``_alone`` for depth alone."""
         return self._pair_numbered(self._numbered(self.color_files), self._numbered(self.depth_files))
 
     def _numbered(self, files: tuple[str, str]) -> dict[int, Path]:
@@ -166,7 +165,6 @@ class ImageFolder(Recording):
         return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics from a file of a usual name, else of the data set, else from a file of any name that fits."""
         return camera_search.known(self.path, self._published(), self._sizes)
 
     def _sizes(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -180,16 +178,10 @@ class ImageFolder(Recording):
         return None
 
     def _published(self) -> intrinsics.Intrinsics | None:
-        """Intrinsics of the data set, if layout or name identify it."""
         return None if self.published is None else intrinsics.by_name(*self.published)
 
     def _one_view(self, cameras: list[dict[str, float]], source: str) -> intrinsics.Intrinsics:
-        """Intrinsics of depth images that show the view of the colour images, in the same or another size.
-
-        Args:
-            cameras: Numbers by key of each colour image; their median is used.
-            source: Origin of the numbers.
-        """
+        """Intrinsics of depth images with the view of the colour images, from the median of ``cameras``."""
         color, depth = (self._read_color(self._pairs[0][0].path), self._read_depth(self._pairs[0][1].path, 1.0))
         (height, width), unit = color.shape[:2], {"depth_scale": self.depth_scale}
         values = {key: float(np.median([camera.get(key, 0.0) for camera in cameras])) for key in cameras[0]}
@@ -200,30 +192,25 @@ class ImageFolder(Recording):
         return intrinsics.Intrinsics(intrinsics.from_camera(view).values | unit, source, values)
 
     def _find_ground_truth(self) -> Trajectory | None:
-        """True camera poses."""
         if self.pose_list:
             return self._listed_poses(self.path / self.pose_list)
         poses = self._numbered(self.pose_files) if self.pose_files else {}
         return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
 
     def _listed_poses(self, file: Path) -> Trajectory | None:
-        """Poses of a file with a matrix per frame, None if there is no such file."""
         if not file.is_file():
             return None
         return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(read_matrices(file)))
 
     def _stamped_poses(self) -> Trajectory | None:
-        """Poses of groundtruth.txt without conversion, None if there is no such file."""
         file = self.path / "groundtruth.txt"
         return Trajectory.load(file, optional=True) if file.is_file() else None
 
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
     ) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``.
-
-        With None, the numbers only count the frames, and the rate is ``FRAME_RATE``.
-        """
+        """(colour, depth) files of equal numbers, timed by number over ``per_second``; None: numbers count frames at
+        ``FRAME_RATE``."""
         numbers = sorted(colors.keys() & depths.keys())
         if not numbers:
             raise DatasetError(
@@ -236,7 +223,6 @@ class ImageFolder(Recording):
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
     def _alone(self, depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
-        """Pair depth files of a recording without colour with themselves."""
         self.has_color, self._pairing = False, f"{len(depths)} depth images without colour"
         return [(depth, depth) for depth in depths]
 
@@ -254,15 +240,13 @@ class ImageFolder(Recording):
         return [(colors[i], depths[j]) for i, j in pairs]
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
-        """Depth image (H, W) in metres."""
         return images.read_depth(path, depth_scale)
 
     def _read_color(self, path: Path) -> NDArray[np.uint8]:
-        """Colour image (H, W, 3), RGB."""
         return images.read_color(path)
 
     def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
-        """The given intrinsics, with the recording's colour camera if colour has another size than depth."""
+        """The given intrinsics, with the recording's colour camera if it has another size."""
         given = intrinsics.given(camera)
         try:
             own = self._find_intrinsics()
@@ -292,10 +276,7 @@ class ImageFolder(Recording):
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame.
-
-        A missing colour camera of another size is assumed to have the depth camera's field of view.
-        """
+        """Camera with the size of the first valid frame; a missing colour camera gets the same field of view."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -322,7 +303,6 @@ def _is_centered(camera: Camera) -> bool:
 
 
 def _same_view(camera: Camera, height: int, width: int) -> Camera:
-    """A camera with the horizontal field of view of another one, for images of another size."""
     factor = width / camera.width
     return Camera(factor * camera.fx, factor * camera.fy, (width - 1) / 2, (height - 1) / 2, width, height)
 

@@ -45,7 +45,6 @@ def _png(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg(data: bytes) -> tuple[int, int]:
-    """Size in the frame header; segments before it are skipped by their length (ITU T.81, B.1.1)."""
     if data.count(b"\xff\xda") > LARGEST_SCANS:
         raise ValueError("more scans than an encoder writes")
     at = 2
@@ -65,7 +64,6 @@ def _jpeg(data: bytes) -> tuple[int, int]:
 
 
 def _tags(data: bytes) -> dict[int, int]:
-    """First values of the tags of whole numbers in the first directory (TIFF 6.0, section 2)."""
     order = "<" if data.startswith(b"II") else ">"
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)
@@ -78,7 +76,6 @@ def _tags(data: bytes) -> dict[int, int]:
 
 
 def _tiff(data: bytes) -> tuple[int, int]:
-    """Size of a TIFF image; tiles may not be larger than that either."""
     found = _tags(data)
     if found.get(322, 1) * found.get(323, 1) > LARGEST_PIXELS or found.get(277, 1) > 4:
         raise ValueError("tiles or channels beyond all images")
@@ -94,7 +91,6 @@ def _bmp(data: bytes) -> tuple[int, int]:
 
 
 def _webp(data: bytes) -> tuple[int, int]:
-    """Size in a simple or extended file (RFC 9649, section 2)."""
     kind = data[12:16]
     if kind == b"VP8X":
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")

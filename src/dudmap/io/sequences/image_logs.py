@@ -53,7 +53,6 @@ class _FrameLog(Recording):
             return file.read(entry.sizes[0]), file.read(entry.sizes[1])
 
     def _depth(self, data: bytes, name: str, *, compressed: bool) -> NDArray[np.float32]:
-        """Depth (H, W), metres, of 16-bit values that are raw or deflated by zlib."""
         height, width = self.camera.shape
         expected = 2 * height * width
         if compressed:
@@ -127,7 +126,6 @@ class SensRecording(_FrameLog):
         return num_frames
 
     def _read_entry(self, file: IO[bytes], end: int) -> tuple[FrameEntry, list[float]]:
-        """Place and pose of the next frame, without reading its images."""
         *pose, color_time, depth_time, color_bytes, depth_bytes = _unpack(file, SENS_FRAME.format)
         entry = FrameEntry(file.tell(), (color_bytes, depth_bytes), depth_time, color_time)
         if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > end:
@@ -264,7 +262,6 @@ class Record3DRecording(Recording):
         return depth
 
     def _unpacked(self, member: str, kind: str) -> NDArray[Any]:
-        """Image (H, W) of a member that holds the pixels of the depth camera, compressed by LZFSE."""
         name, width, height = f"{member} of {self.path}", self.camera.width, self.camera.height
         packed = self._member(member)
         if largest_unpacked(packed) > RATIO_FREE_BYTES:
@@ -287,7 +284,6 @@ class Record3DRecording(Recording):
             raise FrameError(f"cannot read {name} in {self.path}: {error}") from None
 
     def _metadata(self) -> tuple[Camera, tuple[int, int], NDArray[np.float64]]:
-        """Colour camera, size of the depth images, and times (N,) in seconds of the frames."""
         try:
             tree: dict[str, Any] = parse_json(self._member("metadata"))
             fx, _, _, _, fy, _, cx, cy, _ = (float(number) for number in tree["K"])  # column by column

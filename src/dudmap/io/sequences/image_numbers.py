@@ -82,5 +82,4 @@ def _kinds_of_keys(colors: list[Path], depths: list[Path]) -> Iterator[Keys]:
 
 
 def _is_second(text: str) -> bool:
-    """Whether a number may be whole seconds since 1970."""
     return text.isdigit() and LARGEST_NUMBER <= int(text) < LARGEST_SECONDS

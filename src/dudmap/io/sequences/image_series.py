@@ -170,7 +170,6 @@ def listed(series: list[Series]) -> str:
 
 
 def _series_in(folder: Path, name: str = "") -> list[Series]:
-    """Series of numbered images directly in a folder; ``name`` are the folders that lead to it."""
     found: dict[str, list[Path]] = {}
     for file in sorted(os.listdir(folder)):
         if is_numbered_image(file):
@@ -186,7 +185,6 @@ def _series_in(folder: Path, name: str = "") -> list[Series]:
 
 
 def _folders(path: Path) -> list[tuple[str, list[Series]]]:
-    """Names of the folders in a folder, and the series in each, or in its only folder."""
     found = []
     for name in _folder_names(path):
         series, below = _series_in(path / name, f"{name}/"), _folder_names(path / name)
@@ -216,7 +214,6 @@ def _matching(path: Path, kind: str, pattern: str) -> Series:
 
 
 def _there(path: Path) -> str:
-    """Numbered images in a folder and its folders, for messages; empty if there are none."""
     return listed(_everything(path))
 
 
@@ -225,7 +222,7 @@ def _everything(path: Path) -> list[Series]:
 
 
 def _surest(series: list[Series], kind: str) -> Series | None:
-    """The surest series of a kind, with the others of its folder and kind that have other numbers."""
+    """The surest series of a kind, with others of its folder and kind that have other numbers."""
     known = [one for one in series if one.kind == kind]
     enough = LEAST_SHARE * max((len(one.files) for one in known), default=0)
     known.sort(
@@ -251,11 +248,7 @@ def _is_recording(series: list[Series]) -> bool:
 
 
 def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
-    """The two series with the surest names, and among these with the most pairs of images; empty if there is none.
-
-    Raises:
-        DatasetError: Several are alike in both.
-    """
+    """The two series with the surest names, then most pairs; a ``DatasetError`` if several are alike."""
     candidates = ([given[kind]] if kind in given else [one for one in series if one.may_be(kind)] for kind in WORDS)
     found: list[tuple[tuple, dict[str, Series]]] = []
     for color, depth in product(*candidates):
@@ -270,7 +263,7 @@ def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
 
 
 def _only(path: Path, kind: str, meant: list[Series]) -> Series:
-    """The one series that may be of a kind; an error names all if there are several."""
+    """The one series that may be of a kind; an error names all."""
     different = list({id(one): one for one in meant}.values())
     if len(different) > 1:
         raise DatasetError(

@@ -122,7 +122,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
-    """Image of the content of an image file as it is stored: a depth image has no EXIF orientation to turn it by."""
+    """Image as it is stored, without EXIF orientation, which depth images lack."""
     import cv2
 
     with damaged(FrameError, name):
@@ -133,7 +133,7 @@ def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[
 
 
 def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
+    """Content of a complete image file; decoders fill missing parts with grey."""
     raw = bytes(data)
     if not raw:
         raise FrameError(f"{name} is an empty file")

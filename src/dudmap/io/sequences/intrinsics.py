@@ -155,7 +155,6 @@ def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
 
 
 def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:
-    """Intrinsics of lines with a key and a number, and a motion of 12 or 16 numbers."""
     values, color, T_depth_color = {}, {}, np.eye(4)
     color_keys = [COLOR_PREFIX + key for key in (*COLOR_REQUIRED, *DISTORTION_KEYS)]
     for key, *fields in rows:

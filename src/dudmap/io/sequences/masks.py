@@ -98,7 +98,7 @@ def are_counts(masks: Sequence[Path]) -> bool:
 
 
 def _of_one_form(files: list[Path]) -> list[Path]:
-    """Files with the most frequent form of name; forms with the word mask have precedence."""
+    """Files with the most frequent form of name, first with the word mask."""
     forms: dict[str, list[Path]] = {}
     for file in files:
         forms.setdefault(re.sub(NUMBER, "N", file.stem), []).append(file)
@@ -118,7 +118,7 @@ def _is_count(name: str) -> bool:
 
 
 def _by_name(masks: list[Path], images: Images) -> dict[int, Path]:
-    """Masks by frame number: the colour image, or else the depth image, has the same name or number."""
+    """Masks by frame number: the colour or depth image has the same name or number."""
     found: dict[int, Path] = {}
     sides = list(zip(*images, strict=True))
     names = [{_core(file): index for index, file in enumerate(side)} for side in sides]
@@ -142,7 +142,6 @@ def _by_name(masks: list[Path], images: Images) -> dict[int, Path]:
 
 
 def _numbers(files: Sequence[Path]) -> dict[int, int]:
-    """Frames by a whole number in the names of their images: the last number that varies."""
     rows = [re.findall(NUMBER, file.stem) for file in files]
     for place in range(1, 1 + min(map(len, rows))):
         column = [row[-place] for row in rows]
@@ -154,7 +153,7 @@ def _numbers(files: Sequence[Path]) -> dict[int, int]:
 def _by_time(
     path: Path, masks: list[Path], timestamps: NDArray[np.float64], taken: dict[int, Path], images: Images
 ) -> dict[int, Path]:
-    """Masks named by a time, by frame number; ``taken`` are the frames that already have a mask."""
+    """Masks named by a time, by frame number; ``taken`` frames already have one."""
     counts = [mask for mask in masks if _is_count(_core(mask))]
     stamps = {float(_core(mask)): mask for mask in masks if mask not in counts and _is_time(_core(mask))}
     times = np.array(sorted(stamps))

@@ -101,7 +101,6 @@ class NumberedSequence(ImageFolder):
 
 
 def _timed(files: dict[float, Path]) -> list[TimedFile]:
-    """Files by time, whose numbers are times in one unit."""
     unit = time_unit(list(files))
     return sorted(TimedFile(number / unit.per_second, file, unit) for number, file in files.items())
 
@@ -128,7 +127,6 @@ class BopSequence(NumberedSequence):
 
     @cached_property
     def _cameras(self) -> dict[int, dict[str, Any]]:
-        """Entries of the file by number of the image, of the frames that there are."""
         try:
             found = {int(number): entry for number, entry in read_json(self.path / BOP_FILE).items()}
             return {int(depth.path.stem): found[int(depth.path.stem)] for _, depth in self._pairs}

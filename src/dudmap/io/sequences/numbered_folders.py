@@ -87,7 +87,7 @@ class ScanNetSequence(ImageFolder):
 
 
 def _parameter(path: Path, name: str) -> Path | None:
-    """File of the folder ``intrinsic``, or next to the images under the name of the 25k subset."""
+    """File of the folder ``intrinsic``, or under the name of the 25k subset."""
     places = (path / "intrinsic" / name, path / name, path / name.replace("intrinsic_", "intrinsics_"))
     return next((place for place in places if place.is_file()), None)
 
@@ -248,7 +248,7 @@ def _color_folder(path: Path) -> Path | None:
 
 
 def _logs(path: Path) -> list[Path]:
-    """Trajectories in a folder, by name, else any, or next to it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
+    """Trajectories in a folder or next to it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
     name = path.resolve().name.removesuffix("_png")
     inside = sorted(path.glob("*traj*.log")) or sorted(path.glob("*.log"))
     return inside or sorted(path.resolve().parent.glob(f"{name}[_-]traj*.log"))
@@ -360,10 +360,8 @@ class IclNuimLoopSequence(ImageFolder):
 
 
 def _freiburg(folder: Path) -> Trajectory | None:
-    """Poses of groundtruth.txt, else of the only ``*.gt.freiburg``, in dudmap's axes and in seconds.
-
-    The lines are ``number tx ty tz qx qy qz qw``. A file of real times must not be read as frame numbers.
-    """
+    """Poses of groundtruth.txt, else of the only ``*.gt.freiburg`` (``number tx ty tz qx qy qz qw``), in dudmap's
+    axes and seconds; real times must not be read as numbers."""
     found = [folder / "groundtruth.txt"]
     found = found if found[0].is_file() else list(folder.glob("*.gt.freiburg"))
     if len(found) != 1:
@@ -377,7 +375,6 @@ def _freiburg(folder: Path) -> Trajectory | None:
 
 
 def _pov_pose(path: Path) -> NDArray[np.float64]:
-    """T_world_camera (4, 4) in the renderer's axes: columns right, up, direction (made orthogonal), position."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:

@@ -101,7 +101,6 @@ class StrayScannerSequence(ArkitFolder):
         return Video(self.path / "rgb.mp4")
 
     def _read_color(self, path: Path) -> NDArray[np.uint8]:
-        """Frame of the video; the last part of the path is its number."""
         return self._video[int(path.name)]
 
 
@@ -182,7 +181,6 @@ class PolycamSequence(ArkitFolder):
 
     @cached_property
     def _cameras(self) -> dict[int, dict[str, Any]]:
-        """Content of the camera files by number of the frame."""
         files = numbered_files(self.path.glob(f"{self._kind}cameras/*"), r"(\d+)\.json")
         return {number: read_json(file) for number, file in files.items()}
 
@@ -208,7 +206,6 @@ class PolycamSequence(ArkitFolder):
             return None if poses is None else Gravity.of_rotations(_rotations(poses), Y_UP, f"{self._kind}cameras")
 
     def _poses(self) -> Trajectory | None:
-        """Poses of the cameras, estimates of ARKit or corrected ones."""
         poses = []
         for number, tree in self._cameras.items():
             T = np.eye(4)

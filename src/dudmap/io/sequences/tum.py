@@ -245,7 +245,6 @@ class OpenLorisSequence(ImageFolder):
 
 
 def _matrix(node: Any, key: str) -> NDArray[np.float64] | None:  # noqa: ANN401 - a value of a YAML file
-    """Matrix under a key of a node, as OpenCV writes it; None if there is none."""
     try:
         rows, columns, numbers = (node[key][name] for name in ("rows", "cols", "data"))
         return np.array(numbers, dtype=np.float64).reshape(max(int(rows), 0), max(int(columns), 0))

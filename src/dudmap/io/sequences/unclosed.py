@@ -173,7 +173,6 @@ def _completed_mcap(path: Path, file: IO[bytes]) -> CompletedFile:
 
 
 def _mcap_records(file: IO[bytes], position: int) -> Iterator[tuple[int, int, int]]:
-    """Operation code, position and length of the content of each complete record, up to the end of the data."""
     size = file.seek(0, os.SEEK_END)
     while position + 9 <= size:
         file.seek(position)
@@ -192,7 +191,6 @@ def _mcap_chunk(file: IO[bytes], start: int, length: int) -> _Chunk:
 
 
 def _fits(chunk: _Chunk, length: int) -> bool:
-    """Whether the sizes in the head of a chunk agree with its record."""
     head = len(chunk.head)
     return head >= 40 and head + struct.unpack("<Q", chunk.head[-8:])[0] == length
 
@@ -200,7 +198,7 @@ def _fits(chunk: _Chunk, length: int) -> bool:
 def _mcap_content(
     file: IO[bytes], chunk: _Chunk, known: dict[tuple[int, int], bytes]
 ) -> dict[int, list[tuple[int, int]]]:
-    """Times and positions of the messages in a chunk, by channel. Adds its schemas and channels to the known ones."""
+    """Times and positions of the messages in a chunk, by channel; adds its schemas and channels."""
     from rosbags.rosbag2 import storage_mcap
 
     start = chunk.start + 9 + len(chunk.head)
@@ -255,7 +253,7 @@ class _BagChunk:
 
 
 def _completed_bag(path: Path, file: IO[bytes]) -> CompletedFile:
-    """A ROS 1 bag with a new index. The last chunk is rewritten, because its size and indexes may be missing."""
+    """A ROS 1 bag with a new index; the last chunk is rewritten."""
     records = _bag_records(file, len(BAG))
     _, header, _, _ = next(records, (0, Fields(), 0, 0))
     chunks: list[_BagChunk] = []
@@ -299,7 +297,6 @@ def _completed_bag(path: Path, file: IO[bytes]) -> CompletedFile:
 
 
 def _bag_records(file: IO[bytes], position: int) -> Iterator[tuple[int, Fields, int, int]]:
-    """Position, header, and position and length of the content of each complete record."""
     size = file.seek(0, os.SEEK_END)
     while position + 8 <= size:
         length = _unsigned(_read(file, position, 4))
@@ -315,7 +312,6 @@ def _bag_records(file: IO[bytes], position: int) -> Iterator[tuple[int, Fields, 
 
 
 def _bag_fields(data: bytes) -> Fields:
-    """Fields of a header."""
     fields, position = Fields(), 0
     while position + 4 <= len(data):
         length = _unsigned(data[position : position + 4])
@@ -328,8 +324,7 @@ def _bag_fields(data: bytes) -> Fields:
 def _bag_content(
     file: IO[bytes], chunk: _BagChunk, connections: dict[int, bytes]
 ) -> tuple[dict[int, list[Entry]], bytes]:
-    """Times and positions of the messages in a chunk by topic, and its complete content. Adds its topics to the known
-    ones."""
+    """Times and positions of the messages in a chunk by topic, and its content; adds its topics."""
     from rosbags.rosbag1.reader import decompressors
 
     packed, name = _read(file, chunk.content, chunk.length), chunk.fields["compression"].decode("ascii", "replace")

@@ -69,7 +69,6 @@ class Video:
             self._open()
 
     def _finds(self, index: int) -> bool:
-        """Whether seeking a frame arrives at this frame."""
         import cv2
 
         self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)

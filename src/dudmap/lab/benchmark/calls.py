@@ -109,7 +109,6 @@ def memory_rate() -> float:
 
 @contextmanager
 def _weighed(slam: Slam, view: FrameView, inside: dict[str, Counter[str]]) -> Iterator[None]:
-    """Count the bytes that registration and fusion of a frame move."""
     backend: Any = slam.reference.backend
     register, fuse = backend.register, backend.fuse
 

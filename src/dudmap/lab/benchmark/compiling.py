@@ -38,7 +38,7 @@ class _Times(event.Listener):
 
 
 def _caller() -> str:
-    """The nearest function of dudmap on the stack that is not of the cache, the decorators or the threads."""
+    """Nearest function of dudmap on the stack outside of cache, decorators and threads."""
     own = {__name__, "dudmap.core.backends.cpu.teams", "dudmap.core.backends.threads", "dudmap.core.kernel_cache"}
     frame = sys._getframe()
     while frame.f_back is not None:

@@ -270,7 +270,6 @@ def _moved(T: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.f
 def _moving(
     points: NDArray[np.floating], velocity: NDArray[np.float64]
 ) -> Callable[[NDArray[np.float32]], NDArray[np.floating]]:
-    """Points exp(tau xi) X as a function of tau (n,) in seconds, of points X (3, n), to the second order."""
     turn, shift = se3.hat(velocity[3:]).astype(np.float32), velocity[:3, None].astype(np.float32)
     speed = turn @ points + shift
     bend = np.float32(0.5) * turn @ speed
@@ -280,10 +279,8 @@ def _moving(
 def _seen(
     points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64], offset: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Pixels (n, 2) at which a second camera recorded points (3, n) of the depth camera, and their depths (n,) there.
-
-    See ``Calibration``; ``offset`` is the difference of the time stamps.
-    """
+    """Pixels (n, 2) at which a second camera recorded points (3, n), and their depths (n,); see ``Calibration``.
+    ``offset``: difference of the stamps."""
     camera, at = calibration.camera, _moving(points, velocity)
     readout, delay = calibration.depth_readout + calibration.readout, np.float32(offset + calibration.delay)
     seen = _moved(calibration.T_color_depth, at(np.full(points.shape[1], -delay)))
@@ -297,7 +294,6 @@ def _seen(
 def _shades(
     images: Images, points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Intensities (h, w) of points (3, h * w) in the colour image, NaN outside, and their vignetting factor."""
     height, width = images.intensity.shape
     camera = calibration.camera.resized(width, height)
     pixels, _ = _seen(points, replace(calibration, camera=camera), velocity, images.color_offset)
@@ -308,7 +304,6 @@ def _shades(
 
 
 def _sampled(image: NDArray[np.float32], pixels: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Interpolated values (h, w), ``shape``, of an image at pixels (h * w, 2), NaN outside of it."""
     import cv2
 
     us, vs = pixels.T.reshape(2, *shape)
@@ -328,7 +323,6 @@ def _velocity(poses: Mapping[int, NDArray[np.float64]], stamps: NDArray[np.float
 
 
 def _pose(trajectory: Trajectory, timestamp: float) -> NDArray[np.float64] | None:
-    """Pose (4, 4) at a time within the trajectory; None if no row is near."""
     stamps = trajectory.timestamps
     if not stamps[0] - 1e-6 <= timestamp <= stamps[-1] + 1e-6 or np.abs(stamps - timestamp).min() > LARGEST_GAP:
         return None

@@ -247,7 +247,7 @@ def _processes(count: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this process with its parent, which may be killed, because it would wait for its next job forever."""
+    """End this process with its parent; it would wait for its next job forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

@@ -73,7 +73,6 @@ def _median_ms(rows: list[Row]) -> float:
 
 
 def _save_frames(sequence: Sequence, count: int, folder: Path) -> list[float]:
-    """Write the arrays that open3d_slam.py reads; returns the timestamps."""
     camera, stamps = sequence.camera, []
     depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.uint16, (count, *camera.shape))
     color = np.lib.format.open_memmap(folder / "color.npy", "w+", np.uint8, (count, *camera.shape, 3))

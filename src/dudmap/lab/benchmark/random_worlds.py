@@ -27,7 +27,6 @@ def _drawn(fault: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - a num
 
 
 def _rounded(value: Any) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
-    """Four decimals, so that a command line holds the same number."""
     return tuple(round(float(x), 4) for x in value) if np.ndim(value) else round(float(value), 4)
 
 

@@ -151,7 +151,7 @@ with compiling:
 
 
 def _start_times() -> list[SpeedFigure]:
-    """Times of the import, of the help page, and from the start of the program to the first computed pose."""
+    """Times of import, help page, and start to the first pose."""
     from dudmap.lab.synthetic.folder import write_folder
 
     figures = [
@@ -187,10 +187,8 @@ def _room(frames: int) -> "Sequence":
 
 
 def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
-    """Process a recording; yield the system and the time of every frame in milliseconds.
-
-    As in a run, the next frame is prepared meanwhile, and the time ends when both are complete. Rendering is not timed.
-    """
+    """Process a recording; yield the system and the time of every frame, ms, without rendering. As in a run the next
+    frame is prepared meanwhile."""
     from dudmap.core.slam import Slam
 
     slam = Slam(sequence.camera, config)

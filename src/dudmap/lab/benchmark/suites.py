@@ -177,10 +177,7 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder or archive is ``data``, in it or one level below, and the missing ones.
-
-    The images of a CoRBS scene are in ``<name>_pre_registereddata``, as downloaded.
-    """
+    """Entries whose folder or archive is ``data``, in it or one level below, and the missing ones."""
     places = [*(path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern))), data.absolute()]
     found = {stem(path): path for path in places if is_archive(path)} | {p.name: p for p in places if p.is_dir()}
     for name in list(found):

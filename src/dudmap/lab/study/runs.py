@@ -95,7 +95,7 @@ def measure_run(job: Job) -> Row:
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak resident memory (Linux only); elsewhere the peak covers all earlier runs of the process."""
+    """Reset the peak resident memory (Linux only)."""
     import gc
 
     gc.collect()
@@ -106,7 +106,7 @@ def _reset_peak_memory() -> None:
 
 @lru_cache(maxsize=1)
 def _recording(entry: Entry) -> "Recording":
-    """Recording of a run; a short one is read or rendered once for all runs that follow each other."""
+    """Recording of a run, read or rendered once for runs that follow each other."""
     sequence = entry.open()
     frames = min(len(sequence), entry.max_frames or len(sequence))
     size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES

@@ -116,7 +116,6 @@ def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
 
 
 def _signs(values: Table) -> Any:  # noqa: ANN401 - an array
-    """-1 and +1 of the two values of a factor; a list of numbers is ordered by its first element."""
     plain = values.map(lambda value: value[0] if isinstance(value, list | tuple) else value)
     return np.where(plain == plain.max(), 1.0, -1.0)
 

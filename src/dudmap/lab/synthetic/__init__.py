@@ -16,7 +16,6 @@ _MODULES = {"SensorFaults": "dudmap.lab.synthetic.faults", "sequence": "dudmap.l
 
 
 def __getattr__(name: str) -> object:
-    """Import the module of a public name on the first access to it."""
     if name not in _MODULES:
         raise AttributeError(f"module 'dudmap.lab.synthetic' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

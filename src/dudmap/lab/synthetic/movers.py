@@ -124,7 +124,7 @@ def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
 
 
 def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
-    """Person on the walk line of the scene, shifted to its left (metres at life size), and in the other direction."""
+    """Person on the walk line of the scene, shifted to its left (m), possibly reversed."""
     scene, speed, size = staging.scene, staging.pace(1.2), staging.scene.mover_scale
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     aside = shift * size * (np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a))
@@ -165,7 +165,7 @@ def _solids(name: str, size: float) -> list[Primitive]:
 
 
 def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
-    """Person who brings a box, puts it down and leaves; or who enters, takes a box and leaves with it."""
+    """Person who brings a box and leaves it, or who takes one away."""
     scene, speed, size = staging.scene, staging.pace(1.0), staging.scene.mover_scale
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     spot = scene.rest[:2, 3]

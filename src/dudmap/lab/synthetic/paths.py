@@ -20,10 +20,8 @@ Array = NDArray[np.float64]
 
 
 def _wander(rng: np.random.Generator, times: Array, speed: float, quick: float = 1.0) -> Array:
-    """Smooth random motion (N, 3) around zero: a sum of slow sines per axis, mean speed ``speed`` in units per second.
-
-    ``quick`` multiplies the frequencies; at the same speed the amplitude is then smaller.
-    """
+    """Smooth random motion (N, 3): slow sines per axis, mean ``speed`` units per second; ``quick`` multiplies the
+    frequencies."""
     dense = np.arange(0.0, 30.0, 0.02)
     frequency = quick * rng.uniform([0.08, 0.18, 0.3], [0.16, 0.28, 0.45], (3, 3))
     phase = rng.uniform(0, 2 * np.pi, (3, 3))
@@ -44,13 +42,11 @@ def _tremor(rng: np.random.Generator, times: Array, size: float) -> Array:
 
 
 def _aimed(positions: Array, targets: Array) -> Array:
-    """Camera poses (N, 4, 4) at positions (N, 3) looking at targets (N, 3), or at one."""
     targets = np.broadcast_to(targets, positions.shape)
     return np.stack([look_at(eye, target) for eye, target in zip(positions, targets, strict=True)])
 
 
 def _shaken(Ts: Array, rotations: Array) -> Array:
-    """Poses rotated in the camera frame by rotation vectors (N, 3)."""
     out = Ts.copy()
     for T, vector in zip(out, rotations, strict=True):
         T[:3, :3] = T[:3, :3] @ se3.exp(np.concatenate([np.zeros(3), vector]))[:3, :3]
@@ -84,33 +80,30 @@ def handheld(
 
 
 def _turned(offset: Array, angle: Array) -> Array:
-    """Offset (3,) rotated about the vertical by angles (N,) in radians, as (N, 3)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1)
 
 
 def _at_target(scene: Scene, rng: np.random.Generator, times: Array, eyes: Array, tremor_deg: float = 0.04) -> Array:
-    """Poses at eyes (N, 3) aimed at the target of the scene, with a tremor of the hand."""
+    """Poses at eyes (N, 3) aimed at the target, with hand tremor."""
     Ts = _aimed(eyes, np.asarray(scene.target))
     return _shaken(Ts, _tremor(rng, times, np.radians(tremor_deg)))
 
 
 def _turning(scene: Scene, rng: np.random.Generator, times: Array, angle: Array, speed: float) -> Array:
-    """Camera near home, at a mean speed in m/s (at life size), turned from the target by angles (N,) in radians."""
+    """Camera near home at a mean speed in m/s, turned by angles (N,) in radians."""
     aims = _turned(scene.target - scene.home[:3, 3], angle)
     eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, speed * scene.mover_scale))
     return _shaken(_aimed(eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
 
 
 def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Motion around the target on an arc of 30 degrees to either side."""
     home, target = scene.home[:3, 3], np.asarray(scene.target)
     around = _turned(home - target, np.radians(30.0) * np.sin(2 * np.pi * times / 20.0))
     return _at_target(scene, rng, times, home + _within(scene, target + around - home))
 
 
 def _dolly(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Motion towards the target and back, at most 0.3 m/s."""
     ahead = scene.home[:3, 2] * scene.mover_scale * 0.5 * np.sin(0.6 * times)[:, None]
     eyes = scene.home[:3, 3] + _within(scene, ahead + _wander(rng, times, 0.05 * scene.mover_scale))
     return _at_target(scene, rng, times, eyes, 0.06)

@@ -246,7 +246,6 @@ class SyntheticSequence:
         return self._by_pixel(moving, rendering)
 
     def _by_pixel(self, of_movers: NDArray[Any], rendering: Rendering) -> NDArray[Any]:
-        """Value (H, W) of the mover that each pixel shows, from values (M,) per mover; 0 or False for none."""
         still = np.zeros(len(self.scene.primitives), dtype=of_movers.dtype)
         return np.concatenate([still, of_movers[self._owner], still[:1]])[rendering.primitive]
 

@@ -101,8 +101,8 @@ class Renderer:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Front-to-back order, smallest depths, and tile columns and rows covered by the box of each primitive.
 
-        A box is left of the plane x = s z through the camera centre if its support function along the plane's normal is
-        negative. Tile columns and rows share these planes, so the test costs P (C + R).
+        A box is left of the plane x = s z through the camera if its support function along the normal is negative.
+        Columns and rows share planes: the test costs P (C + R).
         """
         center, axes = Ts[:, :3, 3], Ts[:, :3, :3] * self._bounds[:, None, :]
         reach = np.abs(axes[:, 2]).sum(axis=1)

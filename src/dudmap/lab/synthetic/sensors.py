@@ -137,7 +137,7 @@ def _measured_range(
     cosine: NDArray[np.float32],
     noise: tuple[NDArray[np.float32], NDArray[np.int64], np.uint64],
 ) -> NDArray[np.float32]:
-    """Depth (H, W) of a time-of-flight sensor, measured at its native resolution and interpolated where valid."""
+    """Depth (H, W) of a time-of-flight sensor at its native resolution, interpolated where valid."""
     height, width = exact.shape
     if not 0 < model.native_width < width:
         depth = np.empty_like(exact)

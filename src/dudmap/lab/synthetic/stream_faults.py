@@ -104,7 +104,7 @@ def _out_of_order(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
-    """In the span frames arrive in bursts and are stamped on arrival, when the last one was taken."""
+    """In the span frames arrive in bursts, stamped on arrival."""
     items = _plain(times)
     first, stop = _span(times)
     for start in range(first, stop - BURST + 1, BURST):
@@ -115,17 +115,14 @@ def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _missing(times: NDArray[np.float64], gap: float) -> list[Delivery]:
-    """The frames of the span never arrive, and it lasts ``gap`` seconds longer, because the camera moves meanwhile."""
+    """The frames of the span are missing; it lasts ``gap`` seconds longer."""
     first, stop = _span(times)
     kept = [item for item in _plain(times) if not first <= item.number < stop]
     return [item._replace(timestamp=item.timestamp + gap * (item.number >= stop)) for item in kept]
 
 
 def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -> list[Delivery]:
-    """Add ``step`` seconds to the stamps of ``frames`` frames (None: all) after the start of the span.
-
-    It models a pause of a camera at rest, or a clock adjustment.
-    """
+    """Add ``step`` seconds to the stamps of ``frames`` frames (None: all) from the start of the span."""
     items, (first, _) = _plain(times), _span(times)
     stop = len(items) if frames is None else first + frames
     return [item._replace(timestamp=item.timestamp + step * (first <= item.number < stop)) for item in items]

@@ -18,7 +18,6 @@ Faces = NDArray[np.int64]
 
 
 def _grid_faces(rows: int, columns: int) -> Faces:
-    """Two triangles per cell of a grid of vertices (rows, columns), vertex number = row * columns + column."""
     a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     return np.concatenate(
         [np.stack([a, a + 1, a + columns + 1], axis=1), np.stack([a, a + columns + 1, a + columns], axis=1)]
@@ -75,7 +74,7 @@ def _profile(primitive: Primitive, fine: float, detail: float) -> tuple[Points, 
 
 
 def _divided(values: Points, pieces: Points) -> Points:
-    """Values (K, 2) with as many steps of equal length between neighbours as ``pieces`` (K - 1,) says."""
+    """Values (K, 2) with ``pieces`` (K - 1,) equal steps between neighbours."""
     counts = np.maximum(pieces, 1).astype(int)
     at = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(len(at)) - (np.cumsum(counts) - counts)[at] + 1) / counts[at]
@@ -166,7 +165,6 @@ def tessellate(
 
 
 def _cross(a: Points, b: Points) -> Points:
-    """Cross products (3, N) of vectors (3, N), several times faster by axis than row by row."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

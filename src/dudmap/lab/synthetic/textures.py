@@ -114,7 +114,7 @@ def _brick(rng: np.random.Generator) -> Image:
 
 
 def _poster(rng: np.random.Generator) -> Image:
-    """Four different pictures, one per quarter: blobs, discs, bars and lines of 'text' on a coloured ground."""
+    """Four different pictures: blobs, discs, bars and lines of 'text'."""
     x, y = _grid()
     image = np.empty((SIZE, SIZE, 3))
     for quarter in range(4):
@@ -259,7 +259,7 @@ def build_atlas(names: set[str]) -> NDArray[np.int32]:
 
 @cache
 def _mip_maps(name: str) -> NDArray[np.int32]:
-    """Texels of all levels of a texture, finest first; cached, because they take long to compute."""
+    """Texels of all levels of a texture, finest first; cached."""
     image = np.clip(_MAKERS[name](np.random.default_rng([0, TEXTURES.index(name)])), 0.0, 1.0)
     levels = []
     for level in range(LEVELS):

@@ -297,7 +297,7 @@ def _is_same(a: Primitive, b: Primitive) -> bool:
 
 
 def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
-    """Visible part of a change: surface that one visit saw and the other saw or looked through."""
+    """Visible part of a change: surface that one visit saw, the other saw or looked through."""
     recoloured = thing.kind == "recoloured"
     changed, shown, areas = [], [], []
     for own, other, solids in zip(recordings, recordings[::-1], (thing.before, thing.after), strict=True):

@@ -167,5 +167,4 @@ class CpuBackend:
 
 
 def _concatenated(found: NDArray[np.int32], counts: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The first ``counts[n]`` entries of each array, concatenated."""
     return np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)])

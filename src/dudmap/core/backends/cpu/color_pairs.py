@@ -27,8 +27,8 @@ last portion contains no points."""
 def _central(image, u, v):
     """Value of an image at a position with sixteen neighbours, and its interpolated central differences.
 
-    The noise of central differences is uncorrelated with the noise of the value. Slopes between the four nearest pixels
-    are correlated with it: at whole pixels the mean of their product is the noise variance, which biases all estimates.
+    Their noise is uncorrelated with the noise of the value; slopes between the four nearest pixels would bias all
+    estimates.
     """
     i, j = int(u), int(v)
     a, b = u - f32(i), v - f32(j)
@@ -104,7 +104,6 @@ def _by_point(seen, intrinsics, lens, su, sv):
 
 @scalar
 def _by_parameters(seen, place, intrinsics, scale, su, sv, g):
-    """Derivatives of su u + sv v by the 13 parameters; ``g`` are the derivatives by the point in the colour camera."""
     u, v, a, d, share = seen[0], seen[1], seen[8], seen[9], seen[12]
     rx, ry, rz = seen[2] - place[3], seen[3] - place[7], seen[4] - place[11]
     r2 = a * a + d * d
@@ -119,7 +118,6 @@ def _by_parameters(seen, place, intrinsics, scale, su, sv, g):
 
 @scalar
 def _back(place, g):
-    """Derivatives by a point in the depth camera, from the derivatives by the point in the colour camera."""
     return (
         place[0] * g[0] + place[4] * g[1] + place[8] * g[2],
         place[1] * g[0] + place[5] * g[1] + place[9] * g[2],
@@ -129,19 +127,16 @@ def _back(place, g):
 
 @scalar
 def _along(g, a, b, c, d, e, f):
-    """Derivatives along both tangents of the surface, from the derivatives by a surface point."""
     return g[0] * a + g[1] * b + g[2] * c, g[0] * d + g[1] * e + g[2] * f
 
 
 @scalar
 def _padded(count):
-    """Smallest multiple of ``PADDED`` that is not smaller than ``count``."""
     return (count + PADDED - 1) & -PADDED
 
 
 @scalar
 def _six(values):
-    """Six numbers as a tuple, like ``elements``."""
     return values[0], values[1], values[2], values[3], values[4], values[5]
 
 
@@ -224,11 +219,9 @@ def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
 
 @scalar
 def _colored_points(count, tangents, first, second, number, at, pixels, shades):
-    """Keep the first ``count`` points that both colour images show at ``pixels``; returns their number.
-
-    The points move to the front of ``number`` and ``at``, whose rows from 6 receive the tangents. ``shades`` receives
-    value and slopes of both images.
-    """
+    """Keep the first ``count`` points that both colour images show at ``pixels``; returns their number. They move to
+    the front of ``number`` and ``at``, whose rows from 6 receive the tangents. ``shades`` receives values and
+    slopes."""
     height, width = f32(first.shape[0]) - MARGIN, f32(first.shape[1]) - MARGIN
     left = 0
     for n in range(count):

@@ -40,7 +40,6 @@ def _along_row(T, y):
 
 @scalar
 def _moved(t, x, z):
-    """Such a point after the motion."""
     return (t[0] * x + t[3]) * z + t[6], (t[1] * x + t[4]) * z + t[7], (t[2] * x + t[5]) * z + t[8]
 
 

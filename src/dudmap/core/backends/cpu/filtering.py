@@ -168,8 +168,8 @@ def range_weight(difference, inverse):
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
     """Add one tap on each side of every pixel of a line to the sums of the filter, or none if one lies outside.
 
-    The sum over a pair of opposite taps is independent of the surface slope. A single tap at the image border would
-    bias slanted surfaces, exactly where new surface enters the map.
+    The sum over opposite taps is independent of the surface slope; a single tap would bias slanted surfaces at the
+    border.
     """
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]

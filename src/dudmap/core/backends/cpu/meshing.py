@@ -23,10 +23,8 @@ BAND = 256
 
 @scalar
 def _corner_words(geometry, near, row, words):
-    """Words (9, 9, 9) of a block's voxels and of the voxels one step beyond its upper sides; 0 without a block.
-
-    Element by element: the assignment of an array compiles for seconds.
-    """
+    """Words (9, 9, 9) of a block and one voxel beyond its upper sides; 0 without a block. Assigning arrays would
+    compile for seconds."""
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
         slot = near[row, 13 + 9 * dx + 3 * dy + dz]
@@ -40,10 +38,9 @@ def _corner_words(geometry, near, row, words):
 
 @kernel
 def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
-    """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or with an untrusted corner keep 0.
+    """Case of each cell of blocks ``start`` to ``stop``; 0 without a surface or with an untrusted corner.
 
-    A cell with a distance jump above ``max_jump`` steps holds no surface. It is an occlusion boundary between the band
-    behind one object and adjacent free space.
+    A distance jump above ``max_jump`` steps is an occlusion boundary, no surface.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -90,7 +87,7 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
 
 @scalar
 def _edge(row, n, corner, near, row_of):
-    """Row of the block, and number in it, of the voxel at a corner of cell ``n`` of the block in ``row``."""
+    """Row and number in it of the voxel at a corner of cell ``n`` of the block in ``row``."""
     i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
     if (i | j | k) & 8:
         row = np.int64(row_of[near[row, 13 + 9 * (i >> 3) + 3 * (j >> 3) + (k >> 3)]])
@@ -99,8 +96,7 @@ def _edge(row, n, corner, near, row_of):
 
 @kernel
 def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned):
-    """Set bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex, and count the
-    vertices per block."""
+    """Set bit ``axis`` of ``flags`` for each voxel whose edge along it carries a vertex; count vertices per block."""
     for row in range(len(cases)):
         for n in range(512):
             case = cases[row, n]
@@ -113,7 +109,6 @@ def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned)
 
 @scalar
 def _slope(words, n, step):
-    """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
     return slope(words[n], words[n + step], words[n - step])
 
 
@@ -122,7 +117,6 @@ def _write_vertices(
     start, stop, geometry, colors, slots, coords, near, flags, begin, voxel_size, first, vertices, vertex_colors,
     normals,
 ):  # fmt: skip
-    """Position, colour and normal of each vertex; ``first`` receives each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
     for row in range(start, stop):
@@ -173,7 +167,6 @@ def _write_vertices(
 
 @kernel
 def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, begin, triangle_count, triangles, faces):
-    """Triangles of the cells of blocks ``start`` to ``stop`` as vertex numbers."""
     for row in range(start, stop):
         number = begin[row]
         if number == begin[row + 1]:
@@ -273,8 +266,7 @@ def _extract(
     num_meshed: int,
     covered: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the first face (n +
-    1,) of each block."""
+    """Vertices, faces, colours, normals of the first ``num_meshed`` blocks, and the first face (n + 1,) of each."""
     n = len(slots)
     slots, row_of = np.ascontiguousarray(slots, dtype=np.int32), np.full(len(geometry), -1, dtype=np.int32)
     row_of[slots] = np.arange(n, dtype=np.int32)
@@ -318,5 +310,4 @@ def _extract(
 
 
 def _offsets(counts: list[NDArray]) -> NDArray[np.int64]:
-    """Offset of the first item of each block, and the total at the end."""
     return np.concatenate([[0], *counts]).astype(np.int64).cumsum()

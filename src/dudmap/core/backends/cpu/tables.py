@@ -53,8 +53,7 @@ EDGE_FACES = tuple(
 def _segments(case: int) -> dict[int, int]:
     """Segments of all faces, from crossed edge to crossed edge; the inside is on the right, seen from outside the cell.
 
-    Along the border of a face, counter-clockwise, a segment starts at the edge that enters the inside and ends at the
-    edge that leaves it. It separates one run of inside corners.
+    A segment starts at the edge that enters the inside, counter-clockwise, and ends at the edge that leaves it.
     """
     out = {}
     for face in FACES:
@@ -71,7 +70,6 @@ def _segments(case: int) -> dict[int, int]:
 
 
 def _loops(case: int) -> list[list[int]]:
-    """Closed loops of crossed edges."""
     following, out = _segments(case), []
     while following:
         start = min(following)

@@ -34,8 +34,6 @@ else:
 
 @intrinsic
 def _add(typing_context, array, index, value):
-    """Add atomically to an element of an int64 array; returns the previous value."""
-
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         return builder.atomic_rmw("add", builder.gep(data, [arguments[1]]), arguments[2], "seq_cst")
@@ -45,8 +43,6 @@ def _add(typing_context, array, index, value):
 
 @intrinsic
 def _load(typing_context, array, index):
-    """Load atomically an element of an int64 array."""
-
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         return builder.load_atomic(builder.gep(data, [arguments[1]]), "seq_cst", 8)
@@ -56,8 +52,6 @@ def _load(typing_context, array, index):
 
 @intrinsic
 def _store(typing_context, array, index, value):
-    """Store atomically into an element of an int64 array."""
-
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         builder.store_atomic(arguments[2], builder.gep(data, [arguments[1]]), "seq_cst", 8)

@@ -91,7 +91,7 @@ class WarpBackend(CpuBackend):
     def _linearization(
         self, grid: VoxelGrid, image: LevelImage, parameters: RegistrationParameters
     ) -> Callable[[NDArray[np.float32]], NormalEquations]:
-        """Normal equations of an image as a function of its pose in the lattice; the images are uploaded once."""
+        """Normal equations as a function of the pose in the lattice; images are uploaded once."""
         shape, p, camera = image.depth.shape, struct(parameters), camera_of(image.intrinsics)
         threads = -(-image.depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
         with self._using():
@@ -132,7 +132,6 @@ class WarpBackend(CpuBackend):
         return faults.using(self.device)
 
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
-        """Run a kernel, unless it has no threads."""
         if np.prod(dim) > 0:
             wp.launch(kernel, dim=dim, inputs=list(arguments), device=in_warp(self.device))
 
@@ -143,7 +142,6 @@ class WarpBackend(CpuBackend):
         return up(array, self.device)
 
     def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
-        """The window and its voxels as kernel argument."""
         lattice = Lattice()
         lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
         lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)

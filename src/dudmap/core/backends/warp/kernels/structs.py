@@ -13,7 +13,6 @@ _STRUCTS: dict[type, Any] = {}
 
 
 def _struct_of(kind: type) -> Any:
-    """Warp structure with the fields of a named tuple of numbers and nested tuples."""
     fields = {name: _STRUCTS.get(one, wp.float32) for name, one in kind.__annotations__.items()}
     _STRUCTS[kind] = wp.struct(type(kind.__name__, (), {"__annotations__": fields, "__module__": __name__}))
     return _STRUCTS[kind]
