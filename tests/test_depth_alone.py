@@ -139,4 +139,4 @@ def test_a_depth_image_listed_as_colour_is_refused(recording, tmp_path):
 
 def test_depth_alone_has_no_colour_camera_to_calibrate(folder):
     with pytest.raises(DatasetError, match="has no colour images: there is no colour camera to calibrate"):
-        known_calibration(open_sequence(folder), print)
+        known_calibration(open_sequence(folder))

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from dudmap import Config
-from dudmap.app.pipeline.calibration import calibrate_start, findings
+from dudmap.app.pipeline.calibration import calibrate_start
 from dudmap.core.calibration.estimator import GROUPS, SHUTTER, TESTED, Estimate
+from dudmap.core.calibration.findings import findings, outcome
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
@@ -49,7 +50,26 @@ def test_what_was_estimated_has_its_uncertainty():
     assert "delay 2 ms" in timing
 
 
-def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
+def test_the_outcome_is_one_line_on_the_place_and_the_estimated_groups():
+    untested, tested = estimate(np.nan, np.nan).calibration, estimate(0.002, 4.0).calibration
+    assert outcome(untested, CAMERA) == "colour: registered; not tested"
+    assert outcome(tested, CAMERA) == "colour: registered; no correction is proven"
+    darker = replace(tested, estimated=(*GROUPS["timing"], "vignetting"), delay=0.01, vignetting=0.1)
+    assert outcome(darker, CAMERA) == "colour: registered; timing, vignetting estimated"
+    moved = replace(tested, camera=replace(CAMERA, fx=150.0), estimated=GROUPS["geometry"])
+    assert outcome(moved, CAMERA) == "colour: a camera of its own; geometry estimated"
+
+
+def test_the_findings_are_comments_of_the_file(tmp_path):
+    found = estimate(0.002, 4.0)
+    said = findings(found)
+    replace(found.calibration, notes=tuple(said)).save(tmp_path / "calibration.toml")
+    text = (tmp_path / "calibration.toml").read_text()
+    assert [line[2:] for line in text.splitlines() if line.startswith("# ")][1:] == said
+    assert Calibration.load(tmp_path / "calibration.toml").sigmas["delay"] == 0.002
+
+
+def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed(caplog):
     class Short:
         camera, calibration = CAMERA, None
 
@@ -59,6 +79,6 @@ def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
         def __getitem__(self, index):
             return Frame(index / 30, np.full(CAMERA.shape, 2, np.float32), np.zeros((*CAMERA.shape, 3), np.uint8))
 
-    said = []
-    assert calibrate_start(Short(), Config(), len(Short()), said.append, lambda done, total: None) is None
-    assert said == ["colour camera: assumed as given, not tested: that takes 90 frames"]
+    caplog.set_level("INFO", "dudmap")
+    assert calibrate_start(Short(), Config(), len(Short()), lambda done, total: None) is None
+    assert caplog.messages == ["colour: assumed as given, not tested: that takes 90 frames"]

@@ -10,7 +10,7 @@ import pytest
 
 from dudmap.config import Config, SensorConfig
 from dudmap.core.calibration import self_calibration
-from dudmap.core.calibration.estimator import Estimate
+from dudmap.core.calibration.estimator import SHUTTER, TESTED, Estimate
 from dudmap.core.calibration.self_calibration import SelfCalibration
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry import se3
@@ -50,7 +50,7 @@ class Estimator:
     def estimate(self, keyframes):
         self.may.wait(20)
         self.keyframes.append(len(keyframes))
-        return Estimate(self.result, {}, 0.3, 80)
+        return Estimate(self.result, dict.fromkeys((*TESTED, SHUTTER), 4.0), 0.3, 80)
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ def register(patch, oracle, similar):
     patch.setattr(registration, "register_pairs", oracle)
     patch.setattr(registration, "_block_centers", lambda run: box_points((-1, -2, -1), (1, 2, 1)))
     with Workers(1) as crew:
-        return registered_runs([Path(str(run)) for run in range(RUNS)], crew, lambda text: None)
+        return registered_runs([Path(str(run)) for run in range(RUNS)], crew)
 
 
 def similarity():

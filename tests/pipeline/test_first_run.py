@@ -1,6 +1,7 @@
 """What somebody sees of a first run: that kernels are compiled, that the program works, and how long all of it took."""
 
 import io
+import logging
 import time
 
 import numba
@@ -17,14 +18,15 @@ from dudmap.io.sequences import open_sequence
 from recordings import write_recording
 
 
-def test_compilation_is_announced_only_while_the_cache_is_empty(tmp_path, monkeypatch, capsys):
+def test_compilation_is_announced_only_while_the_cache_is_empty(tmp_path, monkeypatch, caplog):
+    caplog.set_level(logging.INFO, "dudmap")
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     assert kernel_cache.count() == 0
     RunProgress(3, bar=False).announce_compilation()
-    assert COMPILING in capsys.readouterr().err
+    assert caplog.messages == [COMPILING]
     (kernel_cache.folder() / "kernel.nbi").touch()
     RunProgress(3, bar=False).announce_compilation()
-    assert not capsys.readouterr().err
+    assert caplog.messages == [COMPILING]
 
 
 def test_a_bar_moves_while_nothing_is_finished():

@@ -114,15 +114,14 @@ def test_warnings_are_in_the_metrics_and_the_report(tmp_path):
 
 
 @pytest.mark.parametrize(("ratio", "seed"), [(1.6, 1), (1.3, 0), (0.65, 2)])
-def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(ratio, seed):
+def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(ratio, seed, caplog):
     faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.015, 0.0, 0.0))
     recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=seed)
-    said = []
     assert color_magnification(recorded) == pytest.approx(ratio, rel=0.1)
-    start = calibrate_start(recorded, Config(), 24, said.append, lambda done, total: None)
+    start = calibrate_start(recorded, Config(), 24, lambda done, total: None)
     assert start.camera.fx / recorded.camera.fx == color_magnification(recorded)
     assert start.estimated == ("log_focal",)
-    assert "the edges of both images agree where its focal length is" in said[0]
+    assert "the edges of both images agree where its focal length is" in caplog.messages[0]
 
 
 @pytest.mark.parametrize("ratio", [0.9, 1.0, 1.1])
@@ -145,5 +144,5 @@ def test_colours_of_another_size_are_calibrated_from_the_view_of_the_depth(tmp_p
     folder = open_sequence(tmp_path, camera=recorded.camera)
     assert folder.calibration.camera.shape == (270, 480)
     assert folder.sources["colour camera"].startswith("the depth camera, assumed")
-    start = calibrate_start(folder, Config(), 16, lambda text: None, lambda done, total: None)
+    start = calibrate_start(folder, Config(), 16, lambda done, total: None)
     assert start.camera.fx / (1.5 * 1.5 * recorded.camera.fx) == pytest.approx(1, rel=0.1)

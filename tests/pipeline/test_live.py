@@ -2,6 +2,7 @@
 
 import csv
 import json
+import logging
 import time
 
 import numpy as np
@@ -41,7 +42,8 @@ def test_a_run_in_time_drops_nothing(slam, sequence, tmp_path, capsys):
     assert "dropped" not in capsys.readouterr().err
 
 
-def test_all_frames_are_recorded_while_some_are_dropped(slam, sequence, tmp_path, capsys, monkeypatch):
+def test_all_frames_are_recorded_while_some_are_dropped(slam, sequence, tmp_path, caplog, monkeypatch):
+    caplog.set_level(logging.INFO, "dudmap.app")
     slowed(slam, monkeypatch, 0.5)
     file = tmp_path / "walk.mcap"
     report = run(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
@@ -51,7 +53,7 @@ def test_all_frames_are_recorded_while_some_are_dropped(slam, sequence, tmp_path
         rows = list(csv.DictReader(opened))
     assert sum(int(row["dropped"]) for row in rows) == report.metrics["dropped"]
     assert all(float(row["latency"]) >= float(row["total"]) for row in rows)
-    said = capsys.readouterr().err
+    said = caplog.messages
     assert f"live: {report.metrics['dropped']} of 8 frames were dropped" in said
     again = open_sequence(file)
     assert f"recorded {len(again)} frames to {file}" in said
@@ -74,13 +76,14 @@ def test_the_recording_is_complete_though_the_run_folder_cannot_be_written(slam,
     assert len(open_sequence(file)) >= 7, "a busy machine may be late with one"
 
 
-def test_ctrl_c_ends_a_run_and_writes_the_results(slam, sequence, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_ends_a_run_and_writes_the_results(slam, sequence, tmp_path, caplog, monkeypatch):
+    caplog.set_level(logging.INFO, "dudmap.app")
     monkeypatch.setattr(slam, "script", {4: KeyboardInterrupt()})
     report = run(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)
     assert report.metrics["frames"] == 4
     assert report.metrics["complete"]
     assert json.loads((tmp_path / "out/metrics.json").read_text())["frames"] == 4
-    assert "stopped by Ctrl-C after 4 frames" in capsys.readouterr().err
+    assert "stopped by Ctrl-C after 4 frames" in caplog.messages
     assert len(open_sequence(tmp_path / "walk.mcap")) >= 4
 
 
@@ -129,11 +132,11 @@ def test_a_depth_image_that_comes_twice_is_taken_once(slam, sequence, tmp_path):
     assert len(open_sequence(tmp_path / "walk.mcap")) == 3
 
 
-def test_a_frame_that_cannot_be_read_is_skipped(slam, sequence, tmp_path, capsys):
+def test_a_frame_that_cannot_be_read_is_skipped(slam, sequence, tmp_path, caplog):
     camera = FragileCamera(sequence, [100, 101, 102, 103])
     metrics = run(camera, Config(), tmp_path / "out", progress=False).metrics
     assert (metrics["tracked"], metrics["unreadable"]) == (3, 1)
-    assert "skipped: frame 102 is damaged" in capsys.readouterr().err
+    assert "skipped: frame 102 is damaged" in caplog.text
 
 
 def test_a_camera_that_breaks_leaves_its_results(slam, sequence, tmp_path):

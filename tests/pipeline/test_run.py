@@ -2,6 +2,7 @@
 
 import csv
 import json
+import logging
 
 import cv2
 import numpy as np
@@ -110,23 +111,24 @@ def test_masks_are_written_and_scored(slam, recording, tmp_path):
     assert report.metrics["mask_iou_frames"] == 1
 
 
-def test_unreadable_frames_are_skipped_and_counted(slam, recording, tmp_path, capsys):
+def test_unreadable_frames_are_skipped_and_counted(slam, recording, tmp_path, caplog):
+    caplog.set_level(logging.INFO, "dudmap.app")
     cut(recording / "depth/3.png")
     (recording / "rgb/4.png").unlink()
     metrics = go(recording, tmp_path / "out").metrics
     assert (metrics["frames"], metrics["unreadable"], metrics["tracked"]) == (8, 2, 6)
     assert "frame 3" in metrics["unreadable_frames"][0]
-    said = capsys.readouterr().err.replace("\n", "")
+    said = " ".join(caplog.messages)
     assert "skipped: frame 3" in said
     assert "skipped: frame 4" not in said, "one sentence for a gap"
     assert "frame 5: readable again, 2 skipped" in said
 
 
-def test_a_lost_track_is_said_once_per_gap(slam, recording, tmp_path, capsys):
+def test_a_lost_track_is_said_once_per_gap(slam, recording, tmp_path, caplog):
+    caplog.set_level(logging.INFO, "dudmap.app.pipeline.progress")
     slam.script = {2: "lost", 3: "lost", 6: "lost"}
     go(recording, tmp_path / "out")
-    said = capsys.readouterr().err.splitlines()
-    assert said == [
+    assert [message for message in caplog.messages if message.startswith("frame")] == [
         "frame 2: lost, too few inliers",
         "frame 4: tracked again, 2 lost",
         "frame 6: lost, too few inliers",

@@ -1,7 +1,9 @@
-"""Print text without interpreting control characters or markup in file names."""
+"""Print text and the log without interpreting control characters or markup in file names."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -35,6 +37,36 @@ def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Conso
     return PlainConsole(markup=False, emoji=False, highlight=False, **options)
 
 
+@cache
+def stderr_console() -> "Console":
+    """Console on stderr that progress bars and the log share, so that messages appear above the bar."""
+    return plain_console(stderr=True)
+
+
+class TerminalHandler(logging.Handler):
+    """Prints each message of the log as a line on stderr; warnings are marked."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        try:
+            mark, style = ("warning: ", "yellow") if record.levelno >= logging.WARNING else ("", "")
+            stderr_console().print(f"{mark}{record.getMessage()}", style=style, soft_wrap=True)
+        except Exception:
+            self.handleError(record)
+
+
+def show_log(*, quiet: bool = False, verbose: bool = False) -> None:
+    """Print the log ``dudmap`` on stderr: the messages of a run, with ``quiet`` warnings alone, with ``verbose`` all.
+
+    The core logs each loss of the camera by its time; a run logs the same by the number of the frame.
+    """
+    log, core = logging.getLogger("dudmap"), logging.getLogger("dudmap.core")
+    if not any(isinstance(handler, TerminalHandler) for handler in log.handlers):
+        log.addHandler(TerminalHandler())
+    log.setLevel(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO)
+    core.setLevel(logging.NOTSET if verbose else logging.ERROR)
+
+
 @contextmanager
 def counted(name: str, *, quiet: bool, console: "Console | None" = None) -> Iterator[Callable[[int, int], None]]:
     """Show a progress bar on stderr, if it is a terminal; yield a function of the numbers of finished and of all
@@ -44,7 +76,7 @@ def counted(name: str, *, quiet: bool, console: "Console | None" = None) -> Iter
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = console or plain_console(stderr=True)
+    console = console or stderr_console()
     columns = SpinnerColumn(), TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(name, total=None)

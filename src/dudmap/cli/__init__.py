@@ -20,7 +20,7 @@ from typer.core import TyperGroup
 
 from dudmap import interruption
 from dudmap.cli.options import arranged, grouped
-from dudmap.errors import DudmapError
+from dudmap.errors import DudmapError, printable
 from dudmap.version import __version__
 
 COMMANDS = {
@@ -145,7 +145,9 @@ def _dudmap(
         bool, Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
-    pass
+    from dudmap.app.terminal import show_log
+
+    show_log()
 
 
 def main() -> None:
@@ -164,9 +166,7 @@ def main() -> None:
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:
-    from dudmap.app.terminal import say
-
-    say(f"warning: {message}", err=True)
+    logging.getLogger(__name__).warning(printable(message))
 
 
 def _share_one_heap() -> None:

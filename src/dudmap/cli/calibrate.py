@@ -1,5 +1,6 @@
 """``dudmap calibrate``: estimate pose, lens and timing of the colour camera relative to the depth camera."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,26 +40,26 @@ def calibrate(
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.sequences.images import read_ignored
 
-    recording, notices = reading.open(sequence), list[str]()
+    recording = reading.open(sequence)
     if out is not None:
         check_outside(out, recording)
     config = parameters.read(seen=[frame for _, frame in sample(recording)[0]])
-    given = known_calibration(recording, notices.append) if calibration is None else Calibration.load(calibration)
+    given = known_calibration(recording) if calibration is None else Calibration.load(calibration)
     ignored = None if ignore is None else read_ignored(ignore, recording.camera, given)
     with counted("calibrating", quiet=as_json) as progress:
         estimate = calibrate_sequence(recording, config, given, max_frames, progress=progress, ignore=ignored)
     if out is not None:
-        estimate.calibration.save(out)
+        replace(estimate.calibration, notes=tuple(remarks(estimate))).save(out)
     if as_json:
         evidence = {name: value for name, value in estimate.evidence.items() if value == value}
         answer(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}, "", as_json=True)
         return
     console = plain_console()
     console.print(table(given, estimate))
-    for line in [*notices, *remarks(estimate)]:
+    for line in remarks(estimate):
         console.print(line, soft_wrap=True)
     if out is not None:
-        console.print(f"written to {out}", soft_wrap=True)
+        console.print(f"written to {out}; use it with dudmap run {sequence} --calibration {out}", soft_wrap=True)
 
 
 def table(given: "Calibration", estimate: "Estimate") -> "Table":
@@ -66,7 +67,7 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     import numpy as np
     from rich.table import Table
 
-    from dudmap.app.pipeline.calibration import UNITS, kind_of
+    from dudmap.core.calibration.findings import UNITS, kind_of
 
     out = Table("parameter", "change", "sigma", "unit", "")
     found = estimate.calibration
@@ -87,7 +88,7 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
 
 def remarks(estimate: "Estimate") -> list[str]:
     """Sentences on the decisions and their reasons."""
-    from dudmap.app.pipeline.calibration import findings
+    from dudmap.core.calibration.findings import findings
 
     return [
         *findings(estimate),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.terminal import show_log
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.view import observers
@@ -38,11 +39,12 @@ def demo(
     from dudmap.lab.synthetic import sequence
     from dudmap.lab.warmup import compiled_for_demo
 
+    show_log(quiet=quiet, verbose=watching.verbose)
     config = o.read_config(None, None, assignments)
     recording = sequence(scene="room", movers=("person",), frames=max_frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
-    with observers(watching) as watchers, compiled_for_demo(quiet=quiet):
+    with observers(watching) as watchers, compiled_for_demo():
         done = run(
             recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watchers, keeper),
         )  # fmt: skip

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from dudmap.app.terminal import show_log
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.run import for_range, run_parameters
@@ -45,6 +46,7 @@ def live(
     from dudmap.io.cameras import open_camera
     from dudmap.lab.warmup import compiled_during_run
 
+    show_log(quiet=quiet, verbose=watching.verbose)
     config, saved_map = run_parameters(parameters, mapped, out)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)

@@ -1,13 +1,16 @@
 """``dudmap merge``: merge the maps of two or more runs of one place."""
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
 from typer import Argument, Option
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import show_log
 from dudmap.cli import options as o
 from dudmap.cli.output import answer, free_folder
+
+log = logging.getLogger(__name__)
 
 
 def merge(
@@ -39,14 +42,11 @@ def merge(
     else:
         from dudmap.fleet.merge import merge_fleet
 
-        def note(sentence: str) -> None:
-            if not (quiet or as_json):
-                say(sentence, err=True)
-
-        fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=jobs, note=note)
+        show_log(quiet=quiet)
+        fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=jobs)
         found = fleet.tree
         for sentence in fleet.sentences:
-            say(f"dudmap: {sentence}", err=True)
+            log.warning(sentence)
         text = (
             f"{len(found['runs'])} of {len(runs)} runs joined: {found['map_blocks']} blocks in {len(found['ranges'])} "
             f"parts, {found['tiles']} tiles\nwritten to {fleet.out}"

@@ -25,7 +25,7 @@ GROUPS = {
     "Input": "--camera --fps --depth-unit --color --depth --topics --sequence --data --masks --ignore --run "
     "--trajectory --reference --max-frames --every",
     "Output": "--out --sheet --save-masks --report --rerun --log --record --size --plots --plot-format "
-    "--table-format --quiet --json",
+    "--table-format --quiet --verbose --json",
     "Map": "--map --localize --passes --max-memory --crop --drop-pieces-below --fill-holes --max-triangles --up "
     "--z-up --resolution --heights --world",
     "Calibration": "--calibration",
@@ -224,6 +224,7 @@ class WatchingOptions:
     host: HostOption = "127.0.0.1"
     port: PortOption = 8080
     token: TokenOption = None
+    verbose: Annotated[bool, Option("--verbose", help="Also print how the calibration and the core decide.")] = False
 
 
 @dataclass(frozen=True)

@@ -56,11 +56,11 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
     if as_json:
         answer(metrics, "", as_json=True)
     elif not quiet:
-        from dudmap.app.pipeline.progress import summary
+        from dudmap.app.pipeline.progress import outcome, summary
         from dudmap.app.terminal import plain_console
 
         console = plain_console()
         console.print(summary(metrics))
-        console.print(f"written to {out}", soft_wrap=True)
+        console.print(outcome(metrics, out), soft_wrap=True)
     if metrics.get("useless"):
         fail(str(metrics["useless"]), code=USELESS)

@@ -1,5 +1,6 @@
 """``dudmap run``: process a recording into a run folder."""
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import show_log
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.view import observers
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from dudmap.config import Config
     from dudmap.core.frames.frame import Frame
     from dudmap.core.places.saved_map import SavedMap
+
+log = logging.getLogger(__name__)
 
 
 def run(
@@ -98,6 +101,7 @@ def run(
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.lab.warmup import compiled_during_run
 
+    show_log(quiet=quiet, verbose=watching.verbose)
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume continues a run with its own options; leave out the recording and --out")
@@ -114,7 +118,7 @@ def run(
     config = for_range(config, parameters, mapped, [frame for _, frame in frames])
     warnings = inspect(recording, frames, unreadable, config).warnings
     for warning in warnings:
-        say(f"warning: {warning}", err=True)
+        log.warning(warning)
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     ours = config.system == "dudmap"
@@ -170,7 +174,7 @@ def for_range(
     """Configuration for the given range, or for the range of some frames; prints a chosen range."""
     chosen = _config(parameters, mapped, frames)
     if chosen != config:
-        say(f"{chosen.range_text}, chosen from the depth images; --range room keeps the defaults of a room", err=True)
+        log.info("%s, chosen from the depth images; --range room keeps the defaults of a room", chosen.range_text)
     return chosen
 
 

@@ -13,6 +13,7 @@ from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.ego_motion import Restart
+from dudmap.core.frame_log import log_changes
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
@@ -181,7 +182,9 @@ class Slam(SlamResults, Stateful):
         """
         view = self.prepare(given_frame(frame, arrays, self.camera.depth_scale), dynamic_mask)
         self.motion.give(T_world_camera)
-        return self._processed(view).detached()
+        before, result = self._last, self._processed(view)
+        log_changes(before, result)
+        return result.detached()
 
     # -- steps of process ---------------------------------------------------------------------------------------------
 

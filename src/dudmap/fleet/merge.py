@@ -1,10 +1,11 @@
 """Merge run folders: two maps of one place into a run folder, many into worlds of map parts and tiles."""
 
 import json
+import logging
 import re
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -39,6 +40,8 @@ from dudmap.fleet.run_graph import RunGraph
 from dudmap.fleet.workers import MapHeader, Workers, check_runs
 from dudmap.input_files import damaged, read_bytes, read_json
 from dudmap.own_folder import remove_files
+
+log = logging.getLogger(__name__)
 
 MERGE_FILE = "merge.json"
 
@@ -130,9 +133,7 @@ class FleetReport:
     sentences: list[str]
 
 
-def merge_fleet(
-    runs: Sequence[str | Path], out: str | Path, *, workers: int = 1, note: Callable[[str], None] = lambda _: None
-) -> FleetReport:
+def merge_fleet(runs: Sequence[str | Path], out: str | Path, *, workers: int = 1) -> FleetReport:
     """Merge the maps of two or more runs.
 
     The folder must be new, or hold a world, which is replaced. It receives:
@@ -143,7 +144,7 @@ def merge_fleet(
     - trajectory.txt, trajectory-2.txt, ...: all runs in the world of the first.
 
     Groups of at least two runs that do not overlap the largest group become worlds in part-2, part-3, ... ``workers``
-    is the number of processes; ``note`` receives progress messages.
+    is the number of processes.
 
     Raises:
         ConfigError: A run is named twice, or the voxels differ in size.
@@ -156,14 +157,14 @@ def merge_fleet(
     _load_kernels(like)
     started = time.perf_counter()
     with Workers(workers) as crew:
-        pairs, graph = registered_runs(folders, crew, note)
+        pairs, graph = registered_runs(folders, crew)
         worlds = [part for part in graph.components if len(part) > 1]
         if not worlds:
             raise MapError(f"no two of the {len(folders)} runs are joined, nothing is written: {_why_not(pairs)}")
         times = {"registration_s": round(time.perf_counter() - started, 2)}
         tree: dict[str, Any] = {}
         for number, part in enumerate(worlds, start=1):
-            note(f"{len(part)} runs are fused")
+            log.info("%d runs are fused", len(part))
             folder = out if number == 1 else out / f"part-{number}"
             world = _write_world(folder, part, folders, graph, like, crew)
             world |= {"pairs": [_pair_entry(one, pairs, folders, graph) for one in pairs if set(one) <= set(part)]}

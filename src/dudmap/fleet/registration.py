@@ -8,7 +8,8 @@ are k-means centres of features of all runs. Whitening (Jegou and Chum 2012) sca
 equal variance, because many places share doors and wallpaper.
 """
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,8 @@ from dudmap.fleet.map_merging import NOT_RECOGNISED, Hypothesis, MapPair, decide
 from dudmap.fleet.map_samples import transformed
 from dudmap.fleet.run_graph import Join, RunGraph, drift_covariance, solve
 from dudmap.fleet.workers import MapHeader, Workers, keyframes_of, surface_of
+
+log = logging.getLogger(__name__)
 
 WORDS = 16
 """Visual words; a descriptor then has 2048 numbers, 8 KB."""
@@ -190,7 +193,7 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
     return decided(surface_of(a), surface_of(b), found, many=True)
 
 
-def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str], None]) -> tuple[Pairs, RunGraph]:
+def registered_runs(runs: Sequence[Path], workers: Workers) -> tuple[Pairs, RunGraph]:
     """Relative poses of pairs of runs, and the poses of all runs.
 
     The first round compares each run with its most similar runs. Each further round compares runs that overlap at the
@@ -209,7 +212,7 @@ def registered_runs(runs: Sequence[Path], workers: Workers, note: Callable[[str]
     for number in range(ROUNDS):
         if not wanted:
             break
-        note(f"round {number + 1}: {len(wanted)} of {n * (n - 1) // 2} pairs of runs are compared")
+        log.info("round %d: %d of %d pairs of runs are compared", number + 1, len(wanted), n * (n - 1) // 2)
         found |= register_pairs(runs, wanted, workers, guesses)
         graph = _graph(n, found, guesses)
         near = _brought_together(graph, blocks, found, guesses)

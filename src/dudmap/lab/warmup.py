@@ -4,6 +4,7 @@ One process compiles with one thread only, so that two take half the time: a sec
 Each loads the kernels that the other has compiled.
 """
 
+import logging
 import os
 import subprocess
 import sys
@@ -16,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from dudmap.app.doctor import COMPILING
-from dudmap.app.terminal import say
 from dudmap.config import Config
 from dudmap.core import kernel_cache
 from dudmap.core.backends.cpu import points, rvl
@@ -38,6 +38,8 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.thesis.slam import ThesisSlam
 from dudmap.thesis_config import ThesisConfig
+
+log = logging.getLogger(__name__)
 
 SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
@@ -177,7 +179,7 @@ def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[],
 
 
 @contextmanager
-def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
+def compiled_for_demo() -> Iterator[None]:
     """Before the first run of a demo, compile its kernels in two other processes and wait for them.
 
     The demo waits, because a compiler needs as much memory as the run.
@@ -185,8 +187,7 @@ def compiled_for_demo(*, quiet: bool) -> Iterator[None]:
     if not kernel_cache.is_cold() or num_threads() < 2:
         yield
         return
-    if not quiet:
-        say(COMPILING, err=True)
+    log.info(COMPILING)
     with compiled_in_background(("tracking, labels and map", "synthetic frames"), DURING_RUN) as wait:
         wait()
         yield
@@ -204,6 +205,7 @@ def compiled_during_run(*, live: bool = False) -> AbstractContextManager[object]
 
 
 if __name__ == "__main__":
+    logging.disable()  # the images are no recording of a camera
     actions = dict(steps())
     for part in sys.argv[1:]:
         actions[part]()

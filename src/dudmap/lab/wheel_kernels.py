@@ -6,6 +6,7 @@ needs the lowest level only.
 """
 
 import hashlib
+import logging
 import os
 import pickle
 import subprocess
@@ -81,6 +82,7 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
+    logging.disable()  # the images of the steps are no recording of a camera
     first, *more = map(Path, sys.argv[1:])
     if more:
         compile_level(first, *more)

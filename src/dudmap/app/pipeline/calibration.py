@@ -1,5 +1,6 @@
-"""Calibrate a whole recording, and describe its colour camera in sentences."""
+"""Calibrate a whole recording."""
 
+import logging
 from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,16 +13,8 @@ from dudmap.app.pipeline.image_checks import color_magnification, unregistered
 from dudmap.config import Config
 from dudmap.core.backends.cpu.filtering import halve
 from dudmap.core.backends.threads import num_threads
-from dudmap.core.calibration.estimator import (
-    EVIDENCE,
-    MIN_PAIRS,
-    SHUTTER,
-    SHUTTER_PARAMETER,
-    TESTED,
-    CalibrationEstimator,
-    Estimate,
-    mask_of,
-)
+from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate, mask_of
+from dudmap.core.calibration.findings import ASSUMED, findings, outcome
 from dudmap.core.calibration.keyframes import ColorKeyframe, KeyframeCollector, halvings_to
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import HALVING_BAND
@@ -35,24 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from dudmap.core.calibration.estimator import Estimate
     from dudmap.io.sequences import Sequence
 
-UNITS = {
-    "translation": ("mm", 1000.0),
-    "rotation": ("deg", 57.29578),
-    "log_focal": ("%", 100.0),
-    "center": ("px", 1.0),
-    "k1": ("", 1.0),
-    "k2": ("", 1.0),
-    "delay": ("ms", 1000.0),
-    "readout": ("ms", 1000.0),
-    "vignetting": ("%", 100.0),
-    "depth_readout": ("ms", 1000.0),
-}
-"""Display unit of each kind of parameter, and units per metre, radian, pixel or second."""
-ASSUMED = "assumed as given, not tested"
-"""Finding on a colour camera that was not compared with images."""
+log = logging.getLogger(__name__)
 
 START_FRAMES, MIN_FRAMES = 300, 90
 """Frames at the start of a recording that calibrate a run, and fewest such frames. The estimator compares pairs of
@@ -69,94 +47,42 @@ VOXEL_SIZE = 0.02
 """Smallest voxel size of the map that tracks these frames, reference depths."""
 
 
-def kind_of(parameter: str) -> str:
-    """Kind of a parameter, a key of ``UNITS``; the axes of a translation are one kind."""
-    return parameter.rpartition("_")[0] if parameter[-2:] in ("_x", "_y", "_z") else parameter
-
-
-def findings(estimate: "Estimate") -> list[str]:
-    """One sentence per group of parameters: estimated or assumed, test result, and standard deviations."""
-    out = [_shutter_finding(estimate)]
-    for name, members in TESTED.items():
-        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
-        if np.isnan(evidence):
-            said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
-        elif members[0] in estimate.calibration.estimated:
-            said = f"estimated; other images fit {evidence:.1f} standard errors better; standard deviations {known}"
-        elif evidence >= EVIDENCE:
-            said = (
-                f"assumed as given; tested: other values fit {evidence:.1f} standard errors better, but by too small a "
-                f"share to be used; standard deviations {known}"
-            )
-        else:
-            said = (
-                f"assumed as given; tested: other values are not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} "
-                f"are needed); standard deviations, if they are nearly right, {known}"
-            )
-        out.append(f"colour camera, {name}: {said}")
-    return out
-
-
-def _shutter_finding(estimate: "Estimate") -> str:
-    evidence, readout = estimate.evidence[SHUTTER], 1000 * estimate.calibration.depth_readout
-    taken = f"rows are taken to be read out within {readout:.1f} ms"
-    if np.isnan(evidence):
-        said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
-    elif SHUTTER_PARAMETER in estimate.calibration.estimated:
-        said = f"estimated; other images fit {evidence:.1f} standard errors better; {taken}"
-    else:
-        said = f"not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} are needed); {taken}"
-    return f"depth camera, {SHUTTER}: {said}"
-
-
-def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
-    largest: dict[str, float] = {}
-    for name in members:
-        largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), calibration.sigmas[name])
-    said = []
-    for kind, sigma in largest.items():
-        unit, factor = UNITS[kind]
-        value = f"{factor * sigma:.2g} {unit}".strip() if np.isfinite(sigma) else "unknown"
-        said.append(f"{kind.replace('log_focal', 'focal length')} {value}")
-    return ", ".join(said)
-
-
 def calibrate_start(
     sequence: "Sequence",
     config: Config,
     max_frames: int,
-    notice: "Callable[[str], None]",
     progress: "Callable[[int, int], None]",
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Calibration | None:
-    """Calibration estimated from the first frames of a recording; None without one, with the reason as a notice.
+    """Calibration estimated from the first frames of a recording; None without one, with the reason in the log.
 
-    Short recordings are not calibrated. ``notice`` receives sentences on progress and results, ``progress`` the numbers
-    of tracked and of all frames. Pixels ``ignore`` (H, W) are never used.
+    Short recordings are not calibrated. ``progress`` receives the numbers of tracked and of all frames. Pixels
+    ``ignore`` (H, W) are never used.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
     if not has_color(sequence):
         return None
-    given = known_calibration(sequence, notice)
+    given = known_calibration(sequence)
     if count < MIN_FRAMES:
-        notice(f"colour camera: {ASSUMED}: that takes {MIN_FRAMES} frames")
+        log.info("colour: %s: that takes %d frames", ASSUMED, MIN_FRAMES)
         return given if given.estimated else None
-    notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
+    log.debug("calibrating the colour camera from the first %d frames (--calibration given leaves this out)", count)
     try:
-        estimate = calibrate_sequence(sequence, config, given, count, notice, progress, ignore)
+        estimate = calibrate_sequence(sequence, config, given, count, progress, ignore)
     except DatasetError as error:
-        notice(f"colour camera: {ASSUMED}: {error}")
+        log.warning("colour: %s: %s", ASSUMED, error)
         return None
-    for finding in findings(estimate):
-        notice(finding)
-    return estimate.calibration
+    found = replace(estimate.calibration, notes=tuple(findings(estimate)))
+    log.info(outcome(found, sequence.camera))
+    for finding in found.notes:
+        log.debug(finding)
+    return found
 
 
-def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> Calibration:
+def known_calibration(sequence: "Sequence") -> Calibration:
     """Calibration given by a recording, else of registered colours, with a corrected focal length if needed.
 
-    The focal length is corrected if the edges of depth and colour clearly contradict it; ``notice`` receives a
-    sentence.
+    The focal length is corrected, with a warning, if the edges of depth and colour clearly contradict it.
     """
     if not has_color(sequence):
         raise DatasetError(f"{sequence.name} has no colour images: there is no colour camera to calibrate")
@@ -164,7 +90,7 @@ def known_calibration(sequence: "Sequence", notice: "Callable[[str], None]") -> 
     magnification = color_magnification(sequence)
     if magnification is None:
         return given
-    notice(f"colour camera: {unregistered(magnification)}; the calibration begins there")
+    log.warning("colour camera: %s; the calibration begins there", unregistered(magnification))
     found = given.retract(np.log(magnification) * (np.arange(NUM_PARAMETERS) == PARAMETERS.index("log_focal")))
     return replace(found, estimated=(*given.estimated, "log_focal"))
 
@@ -174,14 +100,13 @@ def calibrate_sequence(
     config: Config,
     given: Calibration,
     max_frames: int | None = None,
-    notice: "Callable[[str], None]" = lambda text: None,
     progress: "Callable[[int, int], None]" = lambda done, total: None,
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Estimate:
     """Track a recording quickly with the given calibration, and estimate a better one.
 
-    The poses are estimated too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, suffice. For ``notice``,
-    ``progress`` and ``ignore`` see ``calibrate_start``.
+    The poses are estimated too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, suffice. For ``progress``
+    and ``ignore`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -195,7 +120,7 @@ def calibrate_sequence(
         small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence),
         ignore=None if ignore is None else _halved(ignore, halvings),
     )  # fmt: skip
-    notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
+    log.debug("calibration: tracking %d images of %dx%d", len(small), small.camera.width, small.camera.height)
     collector, submap, keyframes = KeyframeCollector(small.calibration, GAP * small.interval), 0, list[ColorKeyframe]()
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
         for number, (_, read, *_) in enumerate(frames, start=1):
@@ -217,7 +142,7 @@ def calibrate_sequence(
     keyframes = max(keyframes, collector.keyframes, key=len)
     if len(keyframes) < 2:
         raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
-    notice(f"calibration: comparing {len(keyframes)} of them with each other")
+    log.debug("calibration: comparing %d of them with each other", len(keyframes))
     estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(keyframes)
     found = _enlarged(estimate.calibration, given.camera, halvings)
     before = tuple(name for name in given.estimated if name not in found.estimated)

@@ -1,5 +1,6 @@
 """One frame of a run: processed, counted, reported."""
 
+import logging
 import time
 from functools import partial
 from pathlib import Path
@@ -10,12 +11,15 @@ from dudmap.app.pipeline.frame_source import SourceFrame
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run_folder import save_mask
+from dudmap.core.calibration.findings import outcome
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.given_poses import GivenPoses
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.slam import Slam
+
+log = logging.getLogger(__name__)
 
 MAKE_ROOM = "make room on the disk of the run folder"
 
@@ -45,10 +49,10 @@ def process_source(
         return
     true_mask, given_mask = read.true_mask, read.given_mask
     if isinstance(true_mask, FrameError):
-        display.note(f"frame {index}: the true mask is not scored, {true_mask}")
+        log.warning("frame %d: the true mask is not scored, %s", index, true_mask)
         true_mask = None
     if isinstance(given_mask, FrameError):
-        display.note(f"frame {index}: the given mask is ignored, {given_mask}")
+        log.warning("frame %d: the given mask is ignored, %s", index, given_mask)
         given_mask = None
     start = time.perf_counter()
     frame = read.prepared or read.frame
@@ -94,5 +98,5 @@ def process_source(
         background.do(partial(record.add_movers, row, result))
     notify(in_background=False)
     if result.calibrated:
-        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
+        log.info("frame %d: %s", index, outcome(slam.calibration, slam.camera))
     display.frame(index, result, record.dropped)

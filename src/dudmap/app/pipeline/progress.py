@@ -1,7 +1,9 @@
 """Terminal output of a run: a progress bar and a summary table."""
 
+import logging
 import time
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -9,12 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from dudmap.app.doctor import COMPILING
-from dudmap.app.terminal import plain_console
+from dudmap.app.terminal import stderr_console
 from dudmap.core import kernel_cache
 
 if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
     from dudmap.errors import FrameError
+
+log = logging.getLogger(__name__)
 
 FIGURES = (
     ("  dropped", "dropped", "{}", 1),
@@ -43,11 +47,10 @@ NOT_FUSED = {
 class RunProgress:
     """Progress bar on stderr, if it is a terminal, with frame number, frames per second, dynamic share and state.
 
-    Lost and unreadable frames are reported once per gap, even without the bar. ``total`` is None if unknown.
+    Lost and unreadable frames are logged once per gap, even without the bar. ``total`` is None if unknown.
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
-        self.console = plain_console(stderr=True)
         self._bar = Progress(
             SpinnerColumn(),  # turns while kernels compile and no frame is finished
             TextColumn("frame"),
@@ -57,8 +60,8 @@ class RunProgress:
             TextColumn("{task.fields[dynamic]:4.0%} dynamic"),
             TextColumn("{task.fields[state]}"),
             TimeRemainingColumn(),
-            console=self.console,
-            disable=not (bar and self.console.is_terminal),
+            console=stderr_console(),
+            disable=not (bar and stderr_console().is_terminal),
         )
         self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="starting")
         self._times: deque[float] = deque(maxlen=30)
@@ -75,14 +78,14 @@ class RunProgress:
     def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
         """Show a processed frame and the number of frames that a live run has dropped so far."""
         if self._skipped > 1:
-            self.note(f"frame {index}: readable again, {self._skipped} skipped")
+            log.info("frame %d: readable again, %d skipped", index, self._skipped)
         self._skipped = 0
         if result.state == "lost":
             if self._lost == 0:
-                self.note(f"frame {index}: lost, {result.lost_reason}")
+                log.info("frame %d: lost, %s", index, result.lost_reason)
             self._lost += 1
         elif self._lost:
-            self.note(f"frame {index}: tracked again, {self._lost} lost")
+            log.info("frame %d: tracked again, %d lost", index, self._lost)
             self._lost = 0
         self._times.append(time.perf_counter())
         seconds = self._times[-1] - self._times[0]
@@ -100,23 +103,19 @@ class RunProgress:
     def skip(self, error: "FrameError") -> None:
         """Report the first of consecutive frames that cannot be read or used."""
         if self._skipped == 0:
-            self.note(f"skipped: {error}")
+            log.warning("skipped: %s", error)
         self._skipped += 1
 
-    def note(self, sentence: str) -> None:
-        """Print a sentence above the bar."""
-        self.console.print(sentence, style="yellow", soft_wrap=True)
-
     def announce_compilation(self) -> None:
-        """Report that kernels are compiled first, if none is cached or part of the installation."""
+        """Log that kernels are compiled first, if none is cached or part of the installation."""
         if kernel_cache.is_cold():
-            self.note(COMPILING)
+            log.info(COMPILING)
 
     def once(self, sentence: str) -> None:
-        """Print a sentence above the bar unless it was printed before."""
+        """Log a warning unless it was logged before."""
         if sentence not in self._said:
             self._said.add(sentence)
-            self.note(sentence)
+            log.warning(sentence)
 
     def working(self, what: str) -> None:
         """Show an activity other than the processing of a frame."""
@@ -143,6 +142,17 @@ def summary(metrics: dict[str, Any]) -> Table:
             rigid = sum(body["rigid"] for body in metrics["bodies"])
             table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
     return table
+
+
+def outcome(metrics: dict[str, Any], out: Path) -> str:
+    """Last line of a run: the folder, how complete and accurate it is, and the command that shows it."""
+    found = [f"the poses of {metrics['tracked'] + metrics['repeated']} of {metrics['frames']} frames"]
+    if triangles := metrics["mesh_triangles"]:
+        found.append(f"a mesh of {triangles} triangles")
+    if metrics.get("ate_rmse_m") is not None:
+        found.append(f"ATE {1000 * metrics['ate_rmse_m']:.1f} mm")
+    page = out / "report.html"
+    return f"written to {out}: {', '.join(found)}; next: {f'open {page}' if page.exists() else f'dudmap report {out}'}"
 
 
 def _reasons(metrics: dict[str, Any]) -> str:

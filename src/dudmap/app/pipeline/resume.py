@@ -1,5 +1,6 @@
 """Continue an interrupted run from the state in its folder."""
 
+import logging
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -18,6 +19,8 @@ from dudmap.input_files import damaged
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.io.sequences import Sequence
+
+log = logging.getLogger(__name__)
 
 
 def resume(
@@ -70,7 +73,7 @@ def resume(
                 masks = open_masks(options.masks, sequence)
                 job = Job(sequence, out, options, display, masks, observers)
                 try:
-                    store = RunStore(out, storing.every, display.note)
+                    store = RunStore(out, storing.every, log.warning)
                     state = job.restored(reader, store)
                 except sqlite3.Error as error:
                     raise StateError(f"the state of the run in {out} cannot be read: {error}") from error

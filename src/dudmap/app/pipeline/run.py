@@ -1,5 +1,6 @@
 """Process a recording or a camera: read frames, run the system, record metrics, write the run folder."""
 
+import logging
 import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
     from dudmap.io.sequences import Sequence
     from dudmap.io.sequences.masks import MaskFolder
+
+log = logging.getLogger(__name__)
 
 PREVIEW = 3
 """Frames that compile or load the kernels before the stream of a camera begins."""
@@ -113,7 +116,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names the saved
             files.
     """
-    from dudmap.app.pipeline.calibration import ASSUMED, calibrate_start
+    from dudmap.app.pipeline.calibration import calibrate_start
 
     interruption.check()
     out = Path(out)
@@ -160,7 +163,6 @@ def run(
     )  # fmt: skip
     with locked(out), ExitStack() as files:
         display = RunProgress(count and count * passes, bar=progress)
-        notice = display.note if progress else lambda text: None
         prepare_run_folder(out, masks, save_masks=save_masks)
         if ignored is not None:
             save_mask(out / IGNORED, ignored)
@@ -169,29 +171,28 @@ def run(
         recorder = store = None
         if record is not None:
             recorder = Recorder(Path(record), sequence.camera, sequence.calibration)
-            files.callback(_finish_recording, recorder, display)
+            files.callback(_finish_recording, recorder)
         if isinstance(sequence, LiveCamera):
             files.callback(sequence.close)
         folder = open_masks(masks, sequence)
         if folder is not None:
-            notice(folder.said)
+            log.log(logging.INFO if folder.complete else logging.WARNING, folder.said)
             figures.warnings += [] if folder.complete else [folder.said]
         job = Job(sequence, out, options, display, folder, observers, recorder)
         if storing is not None and not isinstance(sequence, LiveCamera):
-            store = RunStore(out, storing.every, display.note)
+            store = RunStore(out, storing.every, log.warning)
             store.order(sequence, options)
-        if progress:
-            display.announce_compilation()
+        display.announce_compilation()
         if calibrate and count is not None and not isinstance(sequence, LiveCamera):
-            with counted("calibrating", quiet=not progress, console=display.console) as counting:
+            with counted("calibrating", quiet=not progress) as counting:
                 try:
                     with interruption.recognised():
-                        calibration = calibrate_start(sequence, config, count, notice, counting, ignored)
+                        calibration = calibrate_start(sequence, config, count, counting, ignored)
                 except KeyboardInterrupt:
                     resume = "" if store is None else f"; dudmap run --resume {out} begins again"
                     raise KeyboardInterrupt(f"interrupted while it calibrated{resume}") from None
         elif calibration is None and not live and has_color(sequence):
-            notice(f"colour camera: {ASSUMED}")
+            log.info("colour: assumed as given, not tested")
         calibration = calibration or sequence.calibration
         slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
         state = RunState(slam, figures, calibration)
@@ -257,18 +258,18 @@ class Job:
                 except DeviceError as error:
                     if store is None:
                         raise
-                    display.note(f"{error}; the run goes on on the CPU")
+                    log.warning("%s; the run goes on on the CPU", error)
                     state, store = files.enter_context(self._from_checkpoint(state, store))
                     self._process(state, store)
                 for remark in remarks(state.slam, state.record):
-                    display.note(remark)
+                    log.warning(remark)
             except KeyboardInterrupt:
                 count, of_pass = len(state.record.rows), " of the second pass" if state.number else ""
                 if not isinstance(self.sequence, LiveCamera):
                     stopped = f"interrupted after {count} frames{of_pass}"
                     resume = "" if store is None else f"; dudmap run --resume {out} goes on"
                     raise KeyboardInterrupt(f"{stopped}; {_saved(state)} in {out}{resume}") from None
-                display.note(f"stopped by {interruption.name()} after {count} frames")  # like a stream that ends
+                log.info("stopped by %s after %d frames", interruption.name(), count)  # like a stream that ends
             except DudmapError as error:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state)} in {out}") from error
@@ -342,7 +343,7 @@ class Job:
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
             old, state = state, self.restored(reader, store)
-            self.display.note(f"frames {state.next} to {old.next - 1}, after the last checkpoint, are processed again")
+            log.info("frames %d to %d, after the last checkpoint, are processed again", state.next, old.next - 1)
             yield state, store
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
@@ -361,7 +362,7 @@ class Job:
                 save_map=save_map, defect=defect, poses=self.poses,
             )  # fmt: skip
             if said := (report.metrics.get("up") or {}).get("contradiction"):
-                self.display.note(said)
+                log.warning(said)
             for observer in self.observers:
                 observer.finish(self.out)
             complete = not stopped
@@ -377,7 +378,7 @@ class Job:
         if held:
             from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 
-            self.display.note(
+            log.warning(
                 f"{held} frames were fused at the end, although motion in them may become visible only after "
                 f"{LONGEST_BASELINE:g} s; the recording has {len(stamps)} frames in {stamps[-1] - stamps[0]:.2f} s: "
                 f"expected {LONGEST_BASELINE:g} s or more"
@@ -388,12 +389,12 @@ def _saved(state: RunState) -> str:
     return f"the trajectory and the map {'of the first pass' if state.number else 'up to there'} are"
 
 
-def _finish_recording(recorder: Recorder, display: RunProgress) -> None:
+def _finish_recording(recorder: Recorder) -> None:
     with interruption.postponed():
         recorder.close()
-    display.note(f"recorded {recorder.written} frames to {recorder.path}")
+    log.info("recorded %d frames to %s", recorder.written, recorder.path)
     if recorder.dropped:
-        display.note(f"{recorder.dropped} frames are missing in the recording: the disk is too slow for the camera")
+        log.warning("%d frames are missing in the recording: the disk is too slow for the camera", recorder.dropped)
 
 
 def _resolved(path: str | Path | None) -> Path | None:

@@ -1,6 +1,8 @@
 """Calibration of the colour camera during tracking, and the switch to a better one."""
 
+import logging
 from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config, SensorConfig
 from dudmap.core.calibration.estimation_process import estimate_beside
 from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
+from dudmap.core.calibration.findings import findings, outcome
 from dudmap.core.calibration.keyframes import KeyframeCollector
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.observation import Observation
@@ -17,6 +20,8 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion
 from dudmap.core.tracking.frame_view import FrameView
+
+log = logging.getLogger(__name__)
 
 ATTEMPTS = (120, 240, 480, 960)
 """Numbers of tracked frames after which the calibration is estimated. Four seconds of hand-held motion show every
@@ -98,7 +103,10 @@ class SelfCalibration(Stateful):
             return None
         self.waits += not self._running.done()
         self.estimate, self._running = self._running.result(), None
-        return self.estimate.calibration if self.estimate.calibration.estimated else None
+        found = replace(self.estimate.calibration, notes=tuple(findings(self.estimate)))
+        for note in found.notes:
+            log.debug(note)
+        return found if found.estimated else None
 
 
 class ColorCalibration(Stateful):
@@ -165,6 +173,7 @@ class ColorCalibration(Stateful):
             else:
                 self._estimation.add(view.observation, T_world_camera, dynamic_mask, self._atlas.current)
             if self._next is None and (found := self._estimation.found()) is not None:
+                log.info("%.3f s: %s", view.timestamp, outcome(found, self._camera))
                 self._next = found
                 self._atlas.recolor()
             if self._next is None or self._atlas.repainting is not None:

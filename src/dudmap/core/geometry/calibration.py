@@ -13,7 +13,7 @@ from dudmap.atomic_file import write_text
 from dudmap.core.arrays import copied
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import DatasetError
+from dudmap.errors import DatasetError, printable
 from dudmap.input_files import DAMAGE, read_toml
 
 PARAMETERS = (
@@ -55,6 +55,7 @@ class Calibration:
             grows with the squared distance to the middle.
         vignetting_sigma: Standard deviation of the vignetting, NaN if unknown.
         depth_readout_sigma: Standard deviation of ``depth_readout``, s.
+        notes: Sentences on the estimation, which are comments of the file.
     """
 
     camera: Camera
@@ -68,6 +69,7 @@ class Calibration:
     vignetting: float = 0.0
     vignetting_sigma: float = float("nan")
     depth_readout_sigma: float = float("nan")
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         T = copied(self.T_color_depth, "motion between depth and colour camera", shape=(4, 4))
@@ -193,7 +195,8 @@ class Calibration:
 
     def save(self, path: str | Path) -> None:
         """Write a TOML file."""
-        text = "# Colour camera relative to the depth camera: metres, radians, pixels, seconds\n"
+        head = "Colour camera relative to the depth camera: metres, radians, pixels, seconds", *self.notes
+        text = "".join(f"# {printable(line)}\n" for line in head)
         write_text(path, text + tomli_w.dumps(self.tree()))
 
     @classmethod

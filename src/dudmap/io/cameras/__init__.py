@@ -1,5 +1,6 @@
 """Live cameras: one class per driver, all with the interface ``LiveCamera``."""
 
+import logging
 from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
 
 __all__ = ["CAMERAS", "MAX_WAIT", "CameraFrame", "LiveCamera", "driver", "open_camera"]
+
+log = logging.getLogger(__name__)
 
 CAMERAS = {
     "realsense": "drivers:RealSenseCamera",
@@ -113,14 +116,13 @@ def open_camera(text: str | None = None) -> LiveCamera:
 
 
 def _first_connected() -> LiveCamera:
-    reasons = []
     for name in CAMERAS:
         if name != "replay":
             try:
                 return open_camera(name)
             except (CameraError, MissingExtraError) as error:
-                reasons.append(f"{name}: {error}")
-    raise CameraError("no camera was found; " + "; ".join(reasons))
+                log.warning("%s: %s", name, error)
+    raise CameraError("no camera was found; connect one, or replay a recording as one: dudmap live replay:PATH")
 
 
 def driver(module: str, extra_name: str) -> Any:  # noqa: ANN401 - an optional package

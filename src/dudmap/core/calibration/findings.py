@@ -1,0 +1,89 @@
+"""Sentences on a calibration: one line on its outcome, and one finding per group of parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dudmap.core.calibration.estimator import EVIDENCE, MIN_PAIRS, SHUTTER, SHUTTER_PARAMETER, TESTED, Estimate
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+
+UNITS = {
+    "translation": ("mm", 1000.0),
+    "rotation": ("deg", 57.29578),
+    "log_focal": ("%", 100.0),
+    "center": ("px", 1.0),
+    "k1": ("", 1.0),
+    "k2": ("", 1.0),
+    "delay": ("ms", 1000.0),
+    "readout": ("ms", 1000.0),
+    "vignetting": ("%", 100.0),
+    "depth_readout": ("ms", 1000.0),
+}
+"""Display unit of each kind of parameter, and units per metre, radian, pixel or second."""
+ASSUMED = "assumed as given, not tested"
+"""Finding on a colour camera that was not compared with images."""
+
+
+def kind_of(parameter: str) -> str:
+    """Kind of a parameter, a key of ``UNITS``; the axes of a translation are one kind."""
+    return parameter.rpartition("_")[0] if parameter[-2:] in ("_x", "_y", "_z") else parameter
+
+
+def findings(estimate: "Estimate") -> list[str]:
+    """One sentence per group of parameters: estimated or assumed, test result, and standard deviations."""
+    out = [_shutter_finding(estimate)]
+    for name, members in TESTED.items():
+        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
+        if np.isnan(evidence):
+            said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+        elif members[0] in estimate.calibration.estimated:
+            said = f"estimated; other images fit {evidence:.1f} standard errors better; standard deviations {known}"
+        elif evidence >= EVIDENCE:
+            said = (
+                f"assumed as given; tested: other values fit {evidence:.1f} standard errors better, but by too small a "
+                f"share to be used; standard deviations {known}"
+            )
+        else:
+            said = (
+                f"assumed as given; tested: other values are not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} "
+                f"are needed); standard deviations, if they are nearly right, {known}"
+            )
+        out.append(f"colour camera, {name}: {said}")
+    return out
+
+
+def _shutter_finding(estimate: "Estimate") -> str:
+    evidence, readout = estimate.evidence[SHUTTER], 1000 * estimate.calibration.depth_readout
+    taken = f"rows are taken to be read out within {readout:.1f} ms"
+    if np.isnan(evidence):
+        said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+    elif SHUTTER_PARAMETER in estimate.calibration.estimated:
+        said = f"estimated; other images fit {evidence:.1f} standard errors better; {taken}"
+    else:
+        said = f"not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} are needed); {taken}"
+    return f"depth camera, {SHUTTER}: {said}"
+
+
+def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
+    largest: dict[str, float] = {}
+    for name in members:
+        largest[kind_of(name)] = max(largest.get(kind_of(name), 0.0), calibration.sigmas[name])
+    said = []
+    for kind, sigma in largest.items():
+        unit, factor = UNITS[kind]
+        value = f"{factor * sigma:.2g} {unit}".strip() if np.isfinite(sigma) else "unknown"
+        said.append(f"{kind.replace('log_focal', 'focal length')} {value}")
+    return ", ".join(said)
+
+
+def outcome(found: Calibration, camera: Camera) -> str:
+    """One line on the colour camera of a depth ``camera``: where it is, and which groups were estimated."""
+    plain = replace(found, delay=0.0, readout=0.0, vignetting=0.0)
+    place = "registered" if plain.is_registered(replace(camera, distortion=())) else "a camera of its own"
+    first = {name: members[0] for name, members in TESTED.items()} | {SHUTTER: SHUTTER_PARAMETER}
+    names = [name for name, member in first.items() if member in found.estimated]
+    if "geometry" in names and "center" in names:
+        names.remove("center")
+    said = f"{', '.join(names)} estimated" if names else "no correction is proven"
+    return f"colour: {place}; {'not tested' if np.isnan(found.sigma).all() else said}"
