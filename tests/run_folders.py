@@ -67,6 +67,13 @@ def write_run(folder, **metrics):
     (folder / "movers.jsonl").write_text(json.dumps({"timestamp": stamp(5), "movers": [mover]}) + "\n")
     edges, counts = np.linspace(0, 8, 33), np.round(1000 * np.exp(-np.arange(32)))
     np.savez(folder / "residuals.npz", edges=edges, counts=counts, prior=[0.9, 0.1], sigma=[0.5, 3.0])
+    kept = np.tile(np.eye(4), (2, 1, 1))
+    kept[:, 0, 3] = -0.4, 0.9
+    np.savez(
+        folder / "keyframes.npz", format="dudmap keyframes 1", voxel_size=0.01, timestamps=[stamp(0), stamp(8)],
+        Ts_world_camera=kept, counts=[1, 1], points=np.ones((2, 3), np.float32),
+        descriptors=np.zeros((2, 128), np.float16), residuals=np.zeros(0), shares=np.zeros(0), colors=np.zeros(0),
+    )  # fmt: skip
     (folder / "thumbnails").mkdir()
     for k in range(0, FRAMES, 4):
         for number, kind in enumerate(KINDS):

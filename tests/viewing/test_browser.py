@@ -214,9 +214,42 @@ def test_the_slider_of_the_window_moves_the_camera(live, window):
     thumb.focus()
     for _ in range(5):
         thumb.press("ArrowRight")
-    until(lambda: window._shown == 5)
+    until(lambda: window._shown == 5 and "/movers/4/box" in window._handles)
     np.testing.assert_allclose(window._handles["/camera"].position, [0.25, 0, 0], atol=1e-6)
-    assert "/movers/4/box" in window._handles
+
+
+LAYERS = ["map", "trajectory", "camera", "labels", "moving objects", "keyframes"]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_every_layer_of_a_finished_run_can_be_switched(live, window, layer):
+    window.show_frame(5)  # something moves
+    switch = live.page.get_by_label(layer, exact=True)
+    for turn in (switch.uncheck, switch.check):
+        until(lambda: np.array_equal(live.picture(), live.picture()))  # parts fade in
+        before = live.picture()
+        turn(force=True)
+        until(lambda before=before: np.abs(live.picture() - before).max() > 20)
+
+
+def test_two_clicks_measure_a_distance_on_the_map(live, window):
+    """The wall is the plane z = 2; the rays of the pixels come from the page's camera alone."""
+    canvas = live.page.locator("canvas[data-engine]")
+    box = canvas.bounding_box()
+    (client,) = window._server.get_clients().values()
+    at, ahead = np.array(client.camera.position), np.array(client.camera.look_at)
+    z = (ahead - at) / np.linalg.norm(ahead - at)
+    x = np.cross(z, [0, -1, 0]) / np.linalg.norm(np.cross(z, [0, -1, 0]))
+    points = []
+    for u, v in ((0.45, 0.5), (0.55, 0.56)):
+        canvas.click(position={"x": u * box["width"], "y": v * box["height"]})
+        up = 2 * np.tan(client.camera.fov / 2) / box["height"]
+        ray = z + (u - 0.5) * box["width"] * up * x + (v - 0.5) * box["height"] * up * np.cross(z, x)
+        points.append(at + (2 - at[2]) / ray[2] * ray)
+        until(lambda: window._point.content.startswith("x ") and len(window._marks) == len(points))
+    measured = float(window._point.content.split("**")[1].split(" m")[0])
+    assert measured == pytest.approx(np.linalg.norm(points[1] - points[0]), abs=0.01)
+    assert live.page.locator(f"text={measured:.3f} m").count() == 1
 
 
 def test_a_live_window_grows(browser, window):

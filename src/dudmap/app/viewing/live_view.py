@@ -176,6 +176,7 @@ def show_run(window: Window, run: RunFiles) -> None:
     if run.mesh is not None:
         window.show_mesh(MeshChanges({(0, 0, 0): simplified(run.mesh, TRIANGLES)}))
     window.stay()
+    window.show_keyframes(run.keyframes)
     window.add_frames(run.figures())
     for stamp, images in run.thumbnails.items():
         window.add_images(float(stamp), images)

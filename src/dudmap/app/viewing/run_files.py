@@ -11,6 +11,7 @@ from dudmap.app.viewing.snapshot import KINDS, FrameFigures, MoverBox
 from dudmap.core.geometry.mesh import Mesh, ply_layout
 from dudmap.core.geometry.mesh_pieces import load_simplified
 from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.saved_map import KEYFRAME_FILE, load_keyframes
 from dudmap.errors import DatasetError
 from dudmap.evaluation.trajectory import AteResult, ate
 from dudmap.input_files import DAMAGE, damaged, read_bytes, read_text
@@ -80,6 +81,13 @@ class RunFiles(RunContent):
             return None if self.truth is None else ate(self.trajectory, self.truth)
         except DatasetError:  # accuracy_missing in metrics.json gives the reason
             return None
+
+    @cached_property
+    def keyframes(self) -> np.ndarray:
+        """Poses (N, 4, 4) of the places that the map is recognised by; none without a saved map."""
+        path = self.folder / KEYFRAME_FILE
+        poses = [keyframe.T_world_camera for keyframe in load_keyframes(path)[0]] if path.is_file() else []
+        return np.array(poses).reshape(-1, 4, 4)
 
     @property
     def config(self) -> str:

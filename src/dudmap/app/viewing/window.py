@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 
 from dudmap.app.viewing.mesh_feed import MeshChanges
 from dudmap.app.viewing.page_access import PageAccess, port_problem
+from dudmap.app.viewing.picking import first_hit
 from dudmap.app.viewing.snapshot import KINDS, FrameFigures
 from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
 from dudmap.errors import DudmapError
 from dudmap.extras import extra
 from dudmap.io.exporting.mesh_files import encoded
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from dudmap.core.geometry.camera import Camera
 
 MAX_IMAGES = 300
@@ -27,7 +31,15 @@ PLOT_POINTS = 500
 """Points of a plot over time."""
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
 CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
-PATH_COLOR, CAMERA_COLOR = (0, 150, 220), (255, 120, 40)
+PATH_COLOR, CAMERA_COLOR, KEYFRAME_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (120, 90, 200), (255, 200, 0)
+CAMERA_SIZE, KEYFRAME_SIZE = 0.25, 0.08
+"""Lengths of the pyramids that stand for the camera and the keyframes, metres."""
+LAYERS = {
+    "map": "map", "path": "trajectory", "camera": "camera", "labels": "labels",
+    "movers": "moving objects", "keyframes": "keyframes",
+}  # fmt: skip
+"""First part of the names of nodes in the scene to the name of their switch."""
+MEASURE = "click on the map for a point, again for a distance"
 
 
 class Window:
@@ -56,13 +68,15 @@ class Window:
         self.url = self.access.url
         self._camera: Camera | None = None
         self._handles: dict[str, Any] = {}
-        self._chunks: set[Chunk] = set()
+        self._chunks: dict[Chunk, Mesh] = {}
         self._frames: list[FrameFigures] = []
         self._images: dict[float, dict[str, bytes]] = {}
         self._shown = -1
+        self._marks: list[NDArray[np.float64]] = []
         self._server.gui.set_panel_label(title)
         self._make_controls(title)
         self._server.scene.set_up_direction("-y")
+        self._server.scene.on_click()(lambda event: self.mark(event.ray_origin, event.ray_direction))
         self._server.initial_camera.position = (0.0, -0.9, -1.6)
         self._server.initial_camera.look_at = (0.0, 0.0, 1.5)
 
@@ -81,8 +95,10 @@ class Window:
             self.show_mesh(MeshChanges(reset=True))
             self._frames.clear()
             self._images.clear()
+            self._marks.clear()
+            self._point.content = MEASURE
             self._shown = -1
-            for name in [name for name in self._handles if name.startswith("/changes/")]:
+            for name in [name for name in self._handles if name.split("/")[1] in ("changes", "marks", "keyframes")]:
                 self._remove(name)
 
     def show_mesh(self, changes: MeshChanges) -> None:
@@ -94,10 +110,10 @@ class Window:
                 self._chunks.clear()
             for key, mesh in changes.chunks.items():
                 if mesh is None or len(mesh.faces) == 0:
-                    self._chunks.discard(key)
+                    self._chunks.pop(key, None)
                     self._remove(_mesh_name(key))
                 else:
-                    self._chunks.add(key)
+                    self._chunks[key] = mesh
                     file = encoded(mesh, double_sided=False)  # rooms are viewed from outside
                     self._add(_mesh_name(key), "add_glb", file)
 
@@ -160,6 +176,36 @@ class Window:
             if not self._follow.value and self._images:
                 self._draw_images(min(self._images, key=lambda stamp: abs(stamp - frame.timestamp)))
 
+    def show_keyframes(self, Ts_world_camera: NDArray[np.float64]) -> None:
+        """Show the poses (N, 4, 4) of the keyframes as pyramids."""
+        if self._camera is None or len(Ts_world_camera) == 0:
+            return
+        with self._lock:
+            x, y = self._camera.width / 2 / self._camera.fx, self._camera.height / 2 / self._camera.fy
+            rim = [(-x, -y, 1.0), (x, -y, 1.0), (x, y, 1.0), (-x, y, 1.0)]
+            sides = [((0.0, 0.0, 0.0), corner) for corner in rim]
+            edges = KEYFRAME_SIZE * np.array(sides + list(zip(rim, rim[1:] + rim[:1], strict=True)))
+            R, t = Ts_world_camera[:, None, None, :3, :3], Ts_world_camera[:, None, None, :3, 3]
+            points = ((R @ edges[..., None])[..., 0] + t).reshape(-1, 2, 3).astype(np.float32)
+            self._add("/keyframes", "add_line_segments", points=points, colors=KEYFRAME_COLOR, thickness=0.004)
+
+    def mark(self, origin: "ArrayLike", direction: "ArrayLike") -> None:
+        """Mark the point of the map on a ray; a second one gives the distance, a third one begins again."""
+        with self._lock:
+            if not self._layers["map"].value:
+                return
+            point = first_hit(np.array(origin), np.array(direction), self._chunks.values())
+            if point is None:
+                return
+            self._marks = [self._marks[0], point] if len(self._marks) == 1 else [point]
+            text, ends = "x {:.3f}, y {:.3f}, z {:.3f} m".format(*point), np.array([self._marks[0], point])
+            if len(self._marks) == 2:
+                text += f"; **{np.linalg.norm(ends[1] - ends[0]):.3f} m** from the point before"
+            self._point.content = text
+            ends = ends.astype(np.float32)
+            self._add("/marks/points", "add_point_cloud", points=ends, colors=MARK_COLOR, point_size=0.02)
+            self._add("/marks/line", "add_line_segments", points=ends[None], colors=MARK_COLOR, thickness=0.006)
+
     def stop(self) -> None:
         """End the server."""
         with redirect_stdout(io.StringIO()):
@@ -176,6 +222,10 @@ class Window:
         self._follow = gui.add_checkbox("follow the run", initial_value=True)
         self._slider.on_update(lambda event: self._slide(event))
         self._follow.on_update(lambda _: self.show_frame(len(self._frames) - 1) if self._follow.value else None)
+        self._layers = {layer: gui.add_checkbox(label, initial_value=True) for layer, label in LAYERS.items()}
+        for layer in self._layers.values():
+            layer.on_update(lambda _: self._switch())
+        self._point = gui.add_markdown(MEASURE)
         empty = np.zeros((48, 64, 3), dtype=np.uint8)
         self._pictures = {kind: gui.add_image(empty, label=kind, format="jpeg") for kind in KINDS}
         nothing, seconds = (np.zeros(1), np.zeros(1)), _series("s")
@@ -190,6 +240,16 @@ class Window:
         with self._lock:
             self._follow.value = False
             self.show_frame(int(self._slider.value))
+
+    def _switch(self) -> None:
+        with self._lock:
+            for name, handle in self._handles.items():
+                handle.visible = self._is_visible(name)
+            self._draw_in_camera()
+
+    def _is_visible(self, name: str) -> bool:
+        layer = self._layers.get(name.split("/")[1])
+        return layer is None or layer.value
 
     # -- scene --------------------------------------------------------------------------------------------------------
 
@@ -211,8 +271,14 @@ class Window:
             return
         height, width = self._camera.shape
         fov = 2 * np.arctan(height / 2 / self._camera.fy)
-        look = {"fov": float(fov), "aspect": width / height, "scale": 0.15, "color": CAMERA_COLOR}
+        look = {"fov": float(fov), "aspect": width / height, "scale": CAMERA_SIZE, "color": CAMERA_COLOR}
         self._add("/camera", "add_camera_frustum", **look, **place)
+
+    def _draw_in_camera(self) -> None:
+        """Show the image in the camera: with the labels, or without them."""
+        if "/camera" in self._handles:
+            kind = "mask" if self._layers["labels"].value else "color"
+            self._handles["/camera"].image = self._pictures[kind].image
 
     def _draw_movers(self, frame: FrameFigures) -> None:
         for name in [name for name in self._handles if name.startswith("/movers/")]:
@@ -231,6 +297,7 @@ class Window:
         for kind, data in self._images.get(timestamp, {}).items():
             decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             self._pictures[kind].image = np.asarray(decoded)[..., ::-1]
+        self._draw_in_camera()
 
     def _draw_plots(self) -> None:
         step = max(1, len(self._frames) // PLOT_POINTS)
@@ -242,7 +309,8 @@ class Window:
         self._residual_plot.data = (t, np.nan_to_num(residuals))
 
     def _add(self, name: str, method: str, *content: Any, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
-        self._handles[name] = getattr(self._server.scene, method)(name, *content, **values)
+        visible = self._is_visible(name)
+        self._handles[name] = getattr(self._server.scene, method)(name, *content, visible=visible, **values)
 
     def _remove(self, name: str) -> None:
         handle = self._handles.pop(name, None)
