@@ -249,7 +249,7 @@ def test_two_clicks_measure_a_distance_on_the_map(live, window):
         until(lambda: window._point.content.startswith("x ") and len(window._marks) == len(points))
     measured = float(window._point.content.split("**")[1].split(" m")[0])
     assert measured == pytest.approx(np.linalg.norm(points[1] - points[0]), abs=0.01)
-    assert live.page.locator(f"text={measured:.3f} m").count() == 1
+    live.page.wait_for_selector(f"text={measured:.3f} m", timeout=20000)
 
 
 def test_a_live_window_grows(browser, window):

@@ -23,7 +23,10 @@ def render(
     ] = 60.0,
     max_frames: o.FramesOption = 120,
     fps: o.RateOption = 30.0,
-    size: Annotated[str | None, Option(help="Image size in pixels.", metavar="WxH")] = None,
+    size: Annotated[
+        str | None,
+        Option(help="Image size in pixels; default: 1280x720, along a trajectory the recording's.", metavar="WxH"),
+    ] = None,
     up: o.UpOption = None,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
@@ -37,16 +40,19 @@ def render(
     from dudmap.io.exporting.run_content import ExportOptions, RunContent
     from dudmap.io.exporting.up import up_of
 
-    orbit = orbit or (trajectory is None and out.suffix.lower() == rendering.PICTURE)
+    picture = out.suffix.lower() == rendering.PICTURE
+    orbit = orbit or (trajectory is None and picture)
     if (trajectory is None) == (not orbit):
         raise ConfigError("name either a --trajectory or --orbit")
     content = RunContent.load(run)
     pixels = None if size is None else o.image_size(size)
+    own = content.volume.camera
+    camera = rendering.wide_camera(own, pixels or rendering.SIZE) if orbit else own.resized(*pixels) if pixels else own
     with counted("rendering", quiet=quiet or as_json) as progress:
         if trajectory is not None:
             path = Trajectory.load(trajectory)
         else:
-            upright, camera = up_of(content, ExportOptions(up=o.direction(up))), rendering.view_camera(content, pixels)
-            path = rendering.orbit(content, upright, sweep, max_frames, fps, camera)
-        count = rendering.render_run(content, path, out, size=pixels, fps=fps, progress=progress, whole=orbit)
+            upright = up_of(content, ExportOptions(up=o.direction(up)))
+            path = rendering.orbit(content, upright, sweep, 1 if picture else max_frames, fps, camera)
+        count = rendering.render_run(content, path, out, camera=camera, fps=fps, progress=progress, whole=orbit)
     answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)

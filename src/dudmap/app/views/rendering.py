@@ -13,6 +13,7 @@ from dudmap.app.viewing.snapshot import shading
 from dudmap.atomic_file import atomic_path, write_image, write_text
 from dudmap.core.frames.frame import GREY
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError, printable
 from dudmap.io.exporting.mesh_editing import without_small_pieces
@@ -22,9 +23,13 @@ CODECS = {".mp4": "vp09", ".avi": "XVID"}
 """Codec by file suffix: VP9 plays in browsers (0.1 s per frame), MPEG-4 in desktop players (3 ms)."""
 PICTURE = ".png"
 """Suffix of a single picture."""
-NEAREST, EDGE = 0.3, 0.04
-"""Least distance of an orbit's camera from the map (metres), and margin of its pictures as a share of half their size.
-"""
+SIZE = (1280, 720)
+"""Width and height of views of the whole map, pixels."""
+NEAREST, EDGE, BEYOND = 0.3, 0.04, 0.005
+"""Least distance of an orbit's camera from the map (metres), margin of its pictures as a share of half their size, and
+share of the surface beyond each side of a picture, so that a picture holds 98 %."""
+SAMPLES = 20_000
+"""Points that stand for the surface: 100 of them lie beyond each side of a picture."""
 EMPTY = 32
 """Grey value of pixels without surface."""
 
@@ -97,13 +102,13 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callab
 def orbit(
     run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float, camera: Camera
 ) -> Trajectory:
-    """Trajectory on an arc around the mesh, 27 degrees above, as near as it stays fully visible.
+    """Trajectory on an arc around the mesh, 27 degrees above, as near as 98 % of the surface stay visible.
 
     The arc is centred on the side of the recording cameras. It spans ``sweep_deg``, there and back; 360 or more gives a
     circle. ``up`` (3,) is a unit vector against gravity.
     """
     large = without_small_pieces(run.surface)
-    points = (large if len(large.faces) else run.surface).vertices.astype(np.float64)
+    points = _spread(large if len(large.faces) else run.surface)
     if len(points) == 0:
         raise MapError(f"the mesh of {run.folder} is empty: there is nothing to render")
     Ts = run.trajectory.Ts_world_camera
@@ -127,23 +132,33 @@ def orbit(
     return Trajectory(np.arange(frames) / fps, np.array(poses))
 
 
+def _spread(mesh: Mesh) -> NDArray[np.float64]:
+    """Points (n, 3) of a mesh, each for the same area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if len(area) == 0 or area[-1] == 0:
+        return mesh.vertices.astype(np.float64)
+    chosen = np.searchsorted(area, (np.arange(SAMPLES) + 0.5) / SAMPLES * area[-1])
+    return (a[chosen] + b[chosen] + c[chosen]) / 3
+
+
 def _framing(
     points: NDArray[np.float64], back: NDArray[np.float64], up: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.float64], float]:
-    """Pose (4, 4) of a camera that looks against ``back`` and just sees all points (n, 3), and its distance.
+    """Pose (4, 4) of a camera that looks against ``back`` and just sees 98 % of the points (n, 3), and its distance.
 
     A camera at (cx, cy, cz) sees (x, y, z), in camera axes, if |x - cx| <= r (z - cz), r the tangent of half the view;
-    likewise for y.
+    likewise for y. ``BEYOND`` of the points break each of these four rules; points behind the camera break one too.
     """
     forward = -back / np.linalg.norm(back)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
     T = np.eye(4)
     T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
     x = points @ T[:3, :3]
-    place = np.array([0.0, 0.0, x[:, 2].min() - NEAREST])
+    place = np.array([0.0, 0.0, np.quantile(x[:, 2], BEYOND) - NEAREST])
     for axis, tangent in enumerate((camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)):
         reach = tangent * (1 - EDGE)
-        low, high = (x[:, 2] + x[:, axis] / reach).min(), (x[:, 2] - x[:, axis] / reach).min()
+        low, high = (np.quantile(x[:, 2] + sign * x[:, axis] / reach, BEYOND) for sign in (1, -1))
         place[axis] = reach * (low - high) / 2
         place[2] = min(place[2], (low + high) / 2)
     T[:3, 3] = T[:3, :3] @ place
@@ -155,7 +170,7 @@ def render_run(
     trajectory: Trajectory,
     out: Path,
     *,
-    size: tuple[int, int] | None = None,
+    camera: Camera | None = None,
     fps: float = 30.0,
     progress: Callable[[int, int], None] | None = None,
     whole: bool = False,
@@ -167,7 +182,7 @@ def render_run(
     groundtruth.txt.
 
     Args:
-        size: Width and height in pixels; None takes the size of the recording.
+        camera: Camera of the views; None takes the recording's.
         fps: Frames per second of a video.
         progress: Receives the numbers of finished and of all frames.
         whole: Render to the far end of the map, not only to the depth range of the run.
@@ -178,7 +193,7 @@ def render_run(
         MapError: There is no map.
         OSError: A file cannot be written.
     """
-    camera = view_camera(run, size)
+    camera = camera or run.volume.camera
     if whole:
         run.volume.extend_range(_farthest(run, trajectory))
     if out.suffix.lower() == PICTURE and not out.is_dir():
@@ -215,9 +230,10 @@ def render_run(
     return len(trajectory)
 
 
-def view_camera(run: RunContent, size: tuple[int, int] | None) -> Camera:
-    """Camera of the run, resized to (width, height)."""
-    return run.volume.camera if size is None else run.volume.camera.resized(*size)
+def wide_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Camera with square pixels and the vertical field of view of another one, for images of (width, height)."""
+    (width, height), focal = size, camera.fy * size[1] / camera.height
+    return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=camera.depth_scale)
 
 
 def _farthest(run: RunContent, trajectory: Trajectory) -> float:
