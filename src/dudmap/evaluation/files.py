@@ -91,8 +91,8 @@ def load_trajectories(
 ) -> tuple[Loaded, Loaded | None]:
     """Estimate, and true camera poses of a path from ``find_reference``.
 
-    Poses without times (KITTI) take the times of ``clock``. Without it, they take the frame times of the reference's
-    recording, or else the times of the other trajectory, if the numbers match.
+    Poses without times (KITTI) take the times of ``clock``, else of the reference's recording, else of the other
+    trajectory, if the numbers match.
 
     Args:
         estimate: A file.
@@ -231,11 +231,8 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | None:
-    """Rigid motion (4, 4) of a run's first pose onto the true one; None unless both folders have a trajectory.
-
-    The world frame of a run is its first camera. An alignment of all positions would rotate the map, because the
-    positions of a short path hardly determine the rotation.
-    """
+    """Rigid motion (4, 4) of a run's first pose onto the true one, or None. All positions of a short path would
+    hardly determine the rotation of the map."""
     estimate, truth = run / "trajectory.txt", _truth_in(recording)
     if truth is None or not estimate.is_file():
         return None
@@ -249,10 +246,8 @@ def _truth_in(recording: Path) -> Trajectory | None:
 
 
 def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float | None:
-    """Share of the recording's frames that have a pose; None if the number of frames is unknown.
-
-    The number of frames comes from the run's metrics.json, or else from the image lists next to the true trajectory.
-    """
+    """Share of the recording's frames that have a pose, or None; frames are counted by metrics.json or by image
+    lists."""
     frames = _num_frames(run, reference)
     return round(poses / frames, 6) if frames else None
 

@@ -9,8 +9,7 @@ from dudmap.evaluation.time_offset import LARGEST_HINT, MotionComparison
 from dudmap.evaluation.trajectory import adjusted, ate, body_rotation
 
 EXPLAINED = 0.5
-"""Largest remaining share of an error that a cause explains. Noise is not halved by chance: the causes have one and
-three degrees of freedom, the errors as many as the trajectory has seconds."""
+"""Largest remaining share of an error that a cause explains; noise is not halved by one to three degrees of freedom."""
 
 
 def hints(estimate: Trajectory, reference: Trajectory, max_difference: float) -> list[str]:

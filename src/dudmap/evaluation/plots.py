@@ -155,9 +155,8 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
 
     Args:
         axes: Axes for the plot.
-        residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the measurement and
-            ``counts`` (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,),
-            ``sigma`` (2,).
+        residuals: NPZ file: ``edges`` (B + 1,) in standard deviations of the measurement, ``counts`` (B,), and a
+            mixture of two half-normal densities (static, dynamic): ``prior`` (2,), ``sigma`` (2,).
     """
     try:
         with open_arrays(residuals) as data:

@@ -1,7 +1,6 @@
 """Comparison of a reconstructed surface with the true one: accuracy, completeness and ghosts.
 
-Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
-comparison of vertices would weight a mesh by its triangle density.
+Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other.
 
 Errors: ``MapError`` for a mesh with NaN or without faces (unless point clouds are accepted); ``ConfigError`` for a
 distance or number of samples that is not positive.
@@ -24,12 +23,12 @@ Distances = NDArray[np.float32]
 THRESHOLDS = (0.01, 0.02, 0.05)
 """Default distances of precision and recall, metres."""
 GHOST_DISTANCE = 0.05
-"""Distance from the true surface beyond which estimated surface is a ghost, metres. It exceeds the error by noise and a
-truncation band of a few voxels, and is smaller than the thickness of an arm."""
+"""Distance from the true surface beyond which estimated surface is a ghost, metres: more than noise and a band of a
+few voxels, less than an arm."""
 SAMPLES = 300_000
-"""Number of points sampled on each surface; the standard error of a share of 1 % is then at most 0.02 %."""
+"""Points sampled on each surface: the standard error of a share of 1 % is at most 0.02 %."""
 HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
-"""Histogram of the distances: bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
+"""Bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
 
 
 class ThresholdScore(NamedTuple):
@@ -115,7 +114,7 @@ def compare_surfaces(
         thresholds: Distances in metres for precision, recall and F-score.
         ghost_distance: Distance from the true surface beyond which estimated surface is a ghost, metres.
         samples: Number of points sampled on each surface.
-        points: Accept point clouds, whose points serve as samples and which have no area.
+        points: Accept point clouds, whose points serve as samples.
     """
     thresholds = tuple(thresholds)
     _check_positive("samples", samples)

@@ -19,8 +19,7 @@ Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCORED_COVERAGE = 0.05
-"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio of two small
-numbers is not significant."""
+"""Share of the image above which a frame counts for the mean intersection over union."""
 
 
 class MaskPair(NamedTuple):
@@ -70,9 +69,7 @@ def mask_iou(estimate: Mask, reference: Mask) -> float:
 
 
 def compare_masks(pairs: Iterable[MaskPair], num_missing: int = 0) -> MaskResult:
-    """Precision, recall and intersection over union, per frame and over all frames.
-
-    Every pixel counts, with or without depth.
+    """Precision, recall and intersection over union of all pixels, per frame and over all frames.
 
     Args:
         pairs: Estimated and true masks of the same frames.
@@ -118,9 +115,9 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
     """Estimated masks of a run and the true ones, paired by time and read one after the other.
 
     Args:
-        estimate: Run folder with masks/, or a folder of PNG files named by their time stamp.
-        reference: Recording in TUM layout with mask.txt, or a folder of PNG files. Their names are time stamps, or
-            numbers of the images of the run's recording.
+        estimate: Run folder with masks/, or a folder of PNG files named by time stamp.
+        reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by time stamps or by image
+            numbers.
 
     Returns:
         The pairs, and the number of true masks without an estimated one.

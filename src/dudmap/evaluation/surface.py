@@ -23,8 +23,8 @@ ANCHORS = 400_000
 BATCH = 200_000
 """Points measured at a time; bounds the memory."""
 OVERLAP, REACH, ITERATIONS = 0.8, 0.3, 60
-"""Registration: share of the estimate that has a counterpart, largest distance of a pair in metres, and largest number
-of iterations."""
+"""Registration: share of the estimate with a counterpart, largest distance of a pair (m), largest number of
+iterations."""
 
 
 class Surface:
@@ -72,8 +72,7 @@ class Surface:
     def samples(self, count: int, seed: int = 0) -> Points:
         """Points (count, 3) distributed uniformly over the area; of a point cloud, ``count`` of its points.
 
-        Stratified: one point per equal share of the area. ``trimesh.sample`` draws independently: more variance, and
-        ten times slower (0.27 s for 100,000 points).
+        One point per equal share of the area: less variance, and ten times faster than ``trimesh.sample``.
         """
         random = np.random.default_rng(seed)
         if self.is_cloud:
@@ -87,9 +86,8 @@ class Surface:
     def distances(self, points: Points) -> NDArray[np.float32]:
         """Distances (N,) of points (N, 3) to the surface, metres.
 
-        Exact for the triangles of the nearest anchors. Every triangle has an anchor at its centroid. Large triangles
-        have more, spaced so that ``ANCHORS`` of them cover the surface. A nearer triangle is missed only if all nearest
-        anchors lie on its neighbours, and then by less than the anchor spacing.
+        Exact for the triangles of the nearest anchors. Every triangle has an anchor at its centroid, large ones have
+        more. A nearer triangle is missed only by less than the anchor spacing.
         """
         out = np.empty(len(points), np.float32)
         for start in range(0, len(points), BATCH):
@@ -171,8 +169,8 @@ def register(
 ) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 
-    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``.
-    Ghosts and missing parts thus have no influence.
+    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``, so
+    that ghosts and missing parts have no influence.
 
     Args:
         estimate: Mesh to be moved.

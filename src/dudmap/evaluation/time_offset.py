@@ -21,7 +21,7 @@ WINDOW = 2 * LARGEST_STEP
 SAMPLES = 300
 """Largest number of compared poses of the estimate; temporal neighbours are not independent."""
 SMALLEST_OVERLAP = 0.5
-"""Smallest share of the estimate within the time of the reference. Short parts of two paths agree by chance."""
+"""Smallest share of the estimate within the time of the reference; short parts agree by chance."""
 CHUNK = 1000
 """Number of offsets that are compared at a time; bounds the memory to 30 MB."""
 LARGEST_HINT = CHUNK * STEP / 2
@@ -31,8 +31,8 @@ LARGEST_HINT = CHUNK * STEP / 2
 class TimeOffset(NamedTuple):
     """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
 
-    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. Here r is the correlation of the aligned
-    positions or of the angles of rotation. If both are defined, ``unexplained`` is the mean of both.
+    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. r is the correlation of the aligned
+    positions or of the angles of rotation; the mean of both if both are defined.
     """
 
     seconds: float

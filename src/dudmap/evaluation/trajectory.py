@@ -27,7 +27,7 @@ FEWEST_PAIRS = 3
 SMALLEST_SHARE = 0.1
 """Smallest share of the shorter trajectory's poses with a partner; fewer do not describe its path."""
 SMALLEST_SPREAD = 1e-3
-"""Smallest spread of positions across their principal direction (metres, and as a share of the spread along it) that
+"""Smallest spread of positions across their principal direction (metres, and share of the spread along it) that
 determines a rotation."""
 LONGEST_STEP = 3.0
 """Number of median time steps between consecutive poses beyond which they enclose a gap of lost frames."""
@@ -102,8 +102,8 @@ class AteResult(PoseErrors):
 
     Attributes:
         T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
-        alignment: Method of this motion: ``se3``, ``origin``, ``none``, or ``se3-orientations``. The last replaces
-            ``se3`` if the positions (all equal, or collinear) do not determine the rotation.
+        alignment: ``se3``, ``origin``, ``none``, or ``se3-orientations``: the positions (equal or collinear) do not
+            determine the rotation.
     """
 
     T_reference_estimate: Numbers
@@ -193,9 +193,8 @@ def ate(
 
     Args:
         align: ``se3``: A minimises the squared distances of the positions, without scale (Umeyama 1991, as in the TUM
-            script). If the positions do not determine its rotation, it is the mean of the rotations that align the
-            orientations. ``origin``: A maps the first pose onto its partner, so that the error of a fixed camera is its
-            drift from the start. ``none``: A is the identity.
+            script); an undetermined rotation is the mean of the rotations between orientations. ``origin``: A maps the
+            first pose onto its partner, so that the error of a fixed camera is its drift. ``none``: A is the identity.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -220,10 +219,9 @@ def rpe(
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
     Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``: j is
-    the pose nearest to that distance. A pair is dropped if it misses ``delta`` by too much: more than half the median
-    time between two poses (at least ``max_difference``) for ``s``, more than a tenth for ``m``. Metres are measured
-    along the reference path. The script differs: it pairs across gaps of lost frames, and drops all pairs that end at
-    the last pose.
+    the pose nearest to that distance, metres along the reference path. A pair is dropped if it misses ``delta`` by more
+    than half the median time between two poses (at least ``max_difference``) for ``s``, a tenth for ``m``. The script
+    pairs across gaps of lost frames, and drops all pairs that end at the last pose.
     """
     times, motion_estimate, motion_reference = _motions(estimate, reference, delta, unit, max_difference)
     return RpeResult.of(times, se3.inverse(motion_reference) @ motion_estimate, delta, unit)
@@ -234,8 +232,7 @@ def body_rotation(
 ) -> tuple[Numbers, float, float]:
     """Rotation between the reference's body and the camera, if the reference has poses of another body on the camera.
 
-    Two bodies on one camera differ by ``R_body_camera``: ``r_camera = R_camera_body r_body`` for the rotation vectors
-    of their motions in one second.
+    ``r_camera = R_camera_body r_body`` for the rotation vectors of their motions in one second.
 
     Returns:
         R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976). Root mean square of the rotational
@@ -280,11 +277,8 @@ def trajectory_figures(
     """All metrics of a trajectory by name and unit, for tables and JSON.
 
     * ``covered_share``: share of the reference's duration between consecutive pairs without a gap
-    * ATE
-    * ``drift_rmse_m`` and ``rotation_rmse_deg``: root mean squares of distance and angle after aligning the first pose
-      only, for a fixed or merely rotating camera
-    * RPE per second and per metre: None if the recording is too short, for the reason in ``rpe_per_s_missing`` or
-      ``rpe_per_m_missing``
+    * ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``: root mean squares after aligning the first pose only
+    * RPE per second and per metre: None for the reason in ``rpe_per_s_missing`` or ``rpe_per_m_missing``
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)

@@ -17,27 +17,24 @@ MIN_CELL_POINTS = 8
 MIN_COLORED = 200
 """Fewest points with colours in both maps for a comparison of colours."""
 MAX_COLOR_DIFFERENCE = 20.0
-"""Largest difference of a cell's mean colours that agree, per channel, after the gain of that channel, grey levels."""
+"""Largest difference of a cell's mean colours that agree, per channel, after its gain, grey levels."""
 
 MIN_AREA, MIN_OVERLAP = 1.0, 0.1
 """Smallest common surface: square metres, and share of the surface of the smaller map."""
 CLEAR_DISTANCE = 0.1
-"""Smallest distance of denied surface from all surface of the other map, metres. Drift, noise and a bent map shift
-surface by centimetres; another place differs by decimetres."""
+"""Smallest distance of denied surface from all surface of the other map, metres: drift, noise and bending shift
+surface by centimetres."""
 MAX_DENIED = 0.01
-"""Largest share of the compared surface that lies in free space of the other map. Measured: two runs of one place 0 to
-0.006; rendered rooms with moved furniture 0.0185 to 0.12. Floors of a building with other plants and boxes have 0.006
-to 0.024."""
+"""Largest share of the compared surface in free space of the other map. Measured: 0 to 0.006 for one place, 0.0185
+to 0.12 for moved furniture, 0.006 to 0.024 for similar floors."""
 MAX_CHANGED = 0.5
-"""The same share for two visits between which things may have moved; above it, the place is another or was emptied."""
+"""The same share for two visits between which things may have moved."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
-"""Smallest correlation of intensities, and smallest share of cells with agreeing colours. Two maps of one rendered room
-have 0.995 and 1.0. Other textures on small things give 0.86 and 0.80, on all walls 0.48 and 0.44."""
+"""Smallest correlation of intensities, and smallest share of cells with agreeing colours. Measured: 0.995 and 1.0
+for one rendered room; 0.86 and 0.80 with other textures on small things."""
 MAX_OTHER_COLOR, MAX_OTHER_SHARE = 0.1, 0.003
-"""Largest surface with disagreeing colours, square metres, or this share of the common surface if that is more. It
-applies to pairs among many runs, most of which show different places. Similar places differ by single things such as a
-picture; a mere share would accept them if much is seen. Similar floors of a rendered building have at least 0.35 m2,
-maps of one floor up to 0.05 m2."""
+"""Largest surface with disagreeing colours, square metres, or this share of the common surface, for pairs among many
+runs: similar places differ by single things. Similar floors have at least 0.35 m2, maps of one floor up to 0.05 m2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +44,8 @@ class Agreement:
     Attributes:
         area: Surface that both maps have at the same place, square metres (mean of both directions).
         overlap: That surface as a share of the smaller map's surface.
-        denied: Share of the compared surface in known free space of the other map, the larger of both directions. Only
-            surface near enough to a camera counts.
+        denied: Share of the compared surface, near enough to a camera, in known free space of the other map; the larger
+            of both directions.
         color_correlation: Correlation of the intensities of the common surface.
         color_share: Share of the cells of the common surface whose mean colours agree.
         other_color: Common surface in the other cells, square metres.
@@ -69,8 +66,8 @@ class Agreement:
     def rejection_reason(self, many: bool = False, changed: bool = False) -> str:
         """Sentence on the first check that fails, empty if the maps can be merged.
 
-        ``many``: The pair is one of many runs. ``changed``: Two visits, between which things may have moved, been
-        painted or lit differently; these differences are then no reason.
+        ``many``: one of many runs. ``changed``: two visits, whose things may have moved, been painted or lit
+        differently.
         """
         if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"

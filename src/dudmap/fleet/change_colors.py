@@ -1,8 +1,7 @@
 """Surface that stayed in place and got other colours: a poster, a screen, a painted wall.
 
-Light changes brightness smoothly; paint changes it abruptly. The colours of both visits are averaged over small cells,
-which removes pose errors of a pixel. A gain is fitted to the cells around each cell. The remaining difference marks
-other colours if it exceeds the spread of all cells.
+Light changes brightness smoothly, paint abruptly. Colours are averaged over small cells, a gain is fitted to the cells
+around each cell, and a remaining difference above the spread of all cells marks other colours.
 """
 
 import numpy as np
@@ -22,8 +21,8 @@ LEAST_POINTS, LEAST_AROUND = 6, 12
 LEAST_DIFFERENCE = 20.0
 """Smallest difference of changed cell colours, grey levels; the limit of agreeing cells in a merge."""
 CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0
-"""Changes that light alone does not cause: this difference of the shares of red, green and blue, or a lower correlation
-of textures. Textures have at least this standard deviation (grey levels)."""
+"""Changes that light does not cause: this difference of the shares of red, green and blue, or a lower correlation of
+textures of at least this standard deviation (grey levels)."""
 SOLID = 0.7
 """Smallest recoloured share of the surface within a change's extent: highlights are scattered."""
 

@@ -1,11 +1,9 @@
 """Compare the surface of one map with another map of the same place.
 
-Every vertex of one mesh is confirmed, denied, behind a surface, or not seen by the other map. A vertex is denied if the
-other map has free space there and no surface within the noise of both maps.
-
-This noise is one voxel plus three standard deviations of the local noise. The local noise is the larger of the sensor's
-at the camera's distance and the spread of the distances between both surfaces nearby. The latter includes errors of the
-alignment and the bending of maps.
+Every vertex of one mesh is confirmed, denied, behind a surface, or not seen by the other map. It is denied if the other
+map has free space there and no surface within the noise of both maps: one voxel plus three standard deviations of the
+local noise. This is the larger of the sensor's noise and the spread of the distances between both surfaces nearby,
+which includes alignment and bending.
 """
 
 from dataclasses import dataclass
@@ -37,8 +35,7 @@ CELL = 0.5
 MIN_CELL_POINTS = 50
 """Fewest vertices of a cell with its own noise estimate."""
 MAX_NOISE = 2.0
-"""Largest local noise in multiples of the noise of the whole place. It limits a cell in which most of the surface
-moved."""
+"""Largest local noise in multiples of the whole place's: it limits cells in which most of the surface moved."""
 EDGE_PIXELS = 2.0
 """Width of a depth edge in pixels, and in voxels: measurements there mix both surfaces."""
 READINGS = 2
@@ -163,8 +160,8 @@ def evidence(own: Visit, other: Visit) -> Evidence:
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
     """Number of views (n,) of a visit that look through points (n, 3) of the common frame at a surface behind them.
 
-    The surface must lie farther than twice a margin (n,), metres, behind the point, in the pixel and its neighbours.
-    Views are rendered because the map stores free space per block only.
+    It must lie farther than twice a margin (n,), metres, behind the point, in the pixel and its neighbours. Views are
+    rendered because the map stores free space per block only.
     """
     import cv2
 
@@ -193,12 +190,8 @@ def surface_tree(points: NDArray[np.floating]) -> KDTree:
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3), in the unit of the
-    distances.
-
-    It is 1.48 times the median absolute distance below a limit (n,) in a cell, and at least that value for the whole
-    place.
-    """
+    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3): 1.48 times the median
+    absolute distance below a limit (n,) in a cell, at least the value of the whole place."""
     near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
     if not near.any():
         return np.ones(len(points))

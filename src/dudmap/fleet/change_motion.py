@@ -1,12 +1,11 @@
 """Find the motion of a thing between two visits: from a missing surface in one map to a new surface in the other.
 
 Start motions bring a point onto a point of similar colour and slope, with a turn about the vertical. ICP refines them
-in both directions, by point-to-plane distances (Chen and Medioni 1992) and by intensities along the surface (Park et
-al. 2017). Neighbours are searched by position and colour (Johnson and Kang 1997). A prior keeps the tilt small.
+in both directions, by point-to-plane distances (Chen and Medioni 1992) and intensities along the surface (Park et al.
+2017). Neighbours are searched by position and colour (Johnson and Kang 1997). A prior keeps the tilt small.
 
-The score of a motion is the close surface with similar colours minus the surface that it moves into free space. The
-highest score wins. Motions that are not significantly worse make it ambiguous. The standard deviations follow from the
-matched points and their noise.
+The score is the close surface with similar colours minus the surface moved into free space. Motions not significantly
+worse than the best make it ambiguous.
 """
 
 from dataclasses import dataclass, replace
@@ -32,16 +31,14 @@ TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
 ICP_ROUNDS, STOP = 20, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
 TILT = np.radians(0.3)
-"""Standard deviation of the tilt of a thing between two visits, from level surfaces in maps and their bending, radians.
-"""
+"""Standard deviation of the tilt of a thing between two visits, radians: from level surfaces and the bending of
+maps."""
 FACE = 0.1
-"""Edge of the patches that count as one measurement each, metres. Errors of calibration and map shift whole faces."""
+"""Edge of the patches that count as one measurement each, metres: calibration and map shift whole faces."""
 PATCH, DEVIATIONS_APART = 0.05, 2.0
-"""Edge of the patches whose scores are assumed independent, metres. Standard errors by which a worse sum is
-significant."""
+"""Edge of the patches with independent scores, metres. Standard errors by which a worse sum is significant."""
 COLOR_LENGTH = 0.3
-"""Length equivalent to black minus white in the neighbour search (Johnson and Kang 1997), as a share of
-the size of the thing."""
+"""Length equivalent to black minus white in the neighbour search (Johnson and Kang 1997), share of the size."""
 COLOR_GATE = 50.0
 """Largest colour difference of matched points, grey levels."""
 COLOR_SCALE = 15.0
@@ -54,22 +51,21 @@ DEVIATIONS, LEAST_NOISE = (2.0, 3.0), (1e-3, 4.0)
 """Residuals, in standard deviations, at which Geman-McClure weights fall to a quarter, for distances and intensities.
 Smallest standard deviations assumed (m, grey levels)."""
 LIGHT, DAMPING = 0.2, 0.02
-"""Difference of log intensities at which the weight in the fit of the light falls to a quarter. Damping of the light's
-direction per point."""
+"""Difference of log intensities at which the weight of the light falls to a quarter. Damping of its direction per
+point."""
 MIN_POINTS = 60
 """Fewest matched points that determine a motion."""
 LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
-"""Smallest shares of matched surface: of the surface that matches or lies in free space, and of the larger body.
-Smallest explained share of the former, because other shapes or colours also match by chance."""
+"""Smallest shares of matched surface: of the surface that matches or lies in free space, of the larger body; and
+smallest explained share of the former."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
-"""Largest median colour difference of an untextured thing under one light, grey levels. Largest difference of the
+"""Largest median colour difference of an untextured thing under one light, grey levels; largest difference of the
 shares of red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
-"""Standard deviation of intensities above which a surface has texture, grey levels. Smallest correlation of equal
-textures; things of one make share a texture, others hardly correlate."""
+"""Standard deviation of intensities above which a surface has texture, grey levels; smallest correlation of equal
+textures."""
 FLAT = 0.05
-"""Second eigenvalue of the mean outer product of normals below which the matched points are one flat face. One flat
-face may resemble another."""
+"""Second eigenvalue of the mean outer product of normals below which the matched points are one flat face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +213,8 @@ class _Meeting:
     def starts(self) -> list[Array]:
         """Candidate motions (4, 4), by decreasing number of points with a neighbour.
 
-        Each brings a point of the first body onto one of the second with a similar colour. The turn about the vertical
-        aligns their normals; it is random for vertical normals.
+        Each brings a point onto one of the second body with a similar colour; the turn about the vertical aligns their
+        normals, and is random for vertical ones.
         """
         (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()
         gate = max(0.1 * self.size, 3 * self.gate)

@@ -15,15 +15,13 @@ REACH = 0.5
 SLIM, OUTLINE = 0.5, 1.1
 """Largest width of a leg relative to its height; factor that widens the observed outline of a thing."""
 LEAST_FACE = 0.3
-"""Smallest area of a change in squares of the smallest size, because a cube may show part of one face."""
+"""Smallest area of a change in squares of the smallest size: a cube may show part of one face."""
 LEAST_FACING = 0.1
-"""Smallest median cosine between the normals of a change and the best keyframe's ray; artefacts at depth edges fall
-below."""
+"""Smallest median cosine between the normals of a change and the best keyframe's ray."""
 LEAST_COVER = 0.125
-"""Smallest share of the larger face of its box that a change fills: fragments at depth edges are scattered."""
+"""Smallest share of the larger face of its box that a change fills: edge fragments are scattered."""
 CLEAR = 2.0
-"""Smallest median gap between a change and the other surface, in noise tolerances. A bent map shifts surface by less.
-"""
+"""Smallest median gap between a change and the other surface, in noise tolerances."""
 CERTAIN = 3
 """A change is certain if its median weight is this multiple of the smallest weight of the mesh."""
 
@@ -60,10 +58,10 @@ def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[P
 
 
 def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[Piece]:
-    """Join pieces with their smaller parts and legs; return the largest first.
+    """Join pieces with their smaller parts and legs, largest first.
 
-    A part has no observed free space between it and the piece, because another thing occluded its middle. Legs are seen
-    as thin as a pixel.
+    A part has no observed free space between it and the piece: something occluded its middle. Legs are as thin as a
+    pixel.
     """
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):

@@ -74,9 +74,9 @@ class _Cells:
 class ChangeWatch(RunObserver):
     """Writes changes.jsonl into the run folder: an object per change with id, kind, box, centre, timestamp and frame.
 
-    Even frames search new surface in the earlier map's free space. Odd frames search surface of the earlier map that
-    the frame looks through. A change that later frames deny is written again with the kind "withdrawn". Each is passed
-    to ``event`` of the other observers as "change".
+    Even frames search new surface in the earlier map's free space, odd frames earlier surface that is looked through. A
+    change that later frames deny is written again as "withdrawn". Each is also an event "change" of the other
+    observers.
 
     Args:
         before: Map of the earlier visit; it must not be the map that the run updates.

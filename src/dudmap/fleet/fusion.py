@@ -1,13 +1,11 @@
 """Fuse many maps on disk, one range of space at a time, and write the surface as 3D Tiles 1.1 (OGC 22-025r4).
 
 The world is cut into cells of 16x16x16 blocks, nodes of an octree with consecutive Morton codes. A range is a sequence
-of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker adds the maps that reach a range, and writes its
-blocks as a map file and the surface of every cell as a tile. Touching blocks of neighbouring ranges are fused for the
-triangles at the border, and not stored.
+of cells with about ``RANGE_BLOCKS`` blocks. A worker adds the maps that reach it, and writes a map file and the surface
+of every cell as a tile. Touching blocks of other ranges are fused for the border triangles only.
 
-The tiles form a tree of GLB files with levels of detail. Leaves are cells with their full surface. An inner tile joins
-the vertices of its children in cubes of twice the size, so that all tiles have about as many triangles. A browser
-replaces a near tile by its children (refinement REPLACE).
+Leaves are cells with their full surface. An inner tile joins the vertices of its children in cubes of twice the size,
+so that all have about as many triangles (refinement REPLACE).
 """
 
 import json
@@ -31,8 +29,8 @@ from dudmap.io.exporting.mesh_files import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Rotation of tiles from map axes (x right, y down) to glTF. glTF is y up and readers of 3D Tiles turn it to z up; this
-undoes their turn. The same matrix turns the tileset, which is z up."""
+"""Rotation of tiles from map axes (x right, y down) to glTF (y up); it undoes the turn by readers of 3D Tiles, and
+turns the z-up tileset."""
 BITS_PER_LEVEL = 3
 
 CELL_BITS = 12
@@ -87,11 +85,8 @@ def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path,
 
 
 def error_of(height: int, voxel_size: float) -> float:
-    """Geometric error of a tile, metres: largest displacement of a vertex by joining.
-
-    One level moves a vertex by less than the diagonal of its cube, ``sqrt(3) s 2^h``. All levels below together add
-    less than this again.
-    """
+    """Geometric error of a tile, metres. One level moves a vertex by less than the diagonal of its cube, ``sqrt(3) s
+    2^h``; all levels below together by less than this again."""
     return 0.0 if height == 0 else 2 * np.sqrt(3) * voxel_size * 2**height
 
 

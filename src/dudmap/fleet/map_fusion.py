@@ -1,10 +1,7 @@
-"""Fuse maps with known relative poses, one range of blocks at a time, by exact integer sums.
+"""Fuse maps with known relative poses, one range of blocks (Morton codes) at a time, by exact integer sums.
 
-The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, so that of several maps is the quotient of two
-sums, ``sdf = sum(w_i sdf_i) / sum(w_i)``, rounded once. The sums are integers, so that the order and grouping of the
-maps do not change the voxels.
-
-A range is all blocks with Morton codes between two numbers. It bounds the memory for maps and result.
+The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, so that of several maps is ``sdf = sum(w_i
+sdf_i) / sum(w_i)``, rounded once. Integer sums make it independent of the order of the maps.
 """
 
 from collections.abc import Iterable, Sequence
@@ -137,10 +134,8 @@ def block_sums(
 def empty_counts(
     volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None
 ) -> NDArray[np.int64]:
-    """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``.
-
-    On another grid a block is empty if all its ``PROBES`` are. An unseen part smaller than half a block can be missed.
-    """
+    """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``. On
+    another grid all ``PROBES`` of a block must be empty."""
     if T_volume_grid is None:
         entries = hashing.find_all(volume.blocks.table, volume.blocks.coords, coords)
         return np.where(entries >= 0, volume.blocks.free_count[np.maximum(entries, 0)], 0).astype(np.int64)
@@ -197,9 +192,9 @@ def _sums(
 def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
     """Divide the sums.
 
-    Emptiness seen by one map where another has voxels counts as an observation of free space. Its distance is
-    ``free_steps`` (truncation in steps), its weight ``carve_rate`` per observation. Objects that left before the other
-    runs so disappear. A block that is then empty everywhere, by ``free_after`` observations, loses its voxels.
+    Emptiness in one map where another has voxels counts as an observation at ``free_steps`` (truncation in steps) with
+    weight ``carve_rate``, so that objects that left disappear. A block that is then empty everywhere, by ``free_after``
+    observations, loses its voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
     emptiness = (carve_rate * sums.free * held)[:, None]
@@ -233,11 +228,8 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
-    """Blocks of the result that a map contributes to, as ascending Morton codes.
-
-    ``near`` (n,) contains blocks that the map's voxels reach, ``empty`` (m,) blocks that its blocks without voxels
-    reach. A block can be in both.
-    """
+    """Blocks of the result that a map contributes to, as ascending Morton codes: ``near`` (n,) by voxels, ``empty``
+    (m,) by blocks without voxels. A block can be in both."""
 
     near: NDArray[np.int64]
     empty: NDArray[np.int64]
@@ -266,9 +258,9 @@ def fused_blocks(
 ) -> FusedRange:
     """Fuse maps, in any order, into some blocks given by Morton codes.
 
-    Voxels of at least one map reach the blocks ``near`` (n,); the blocks ``empty`` (m,) are empty in at least one map.
-    The result has the camera and parameters of ``like``. The ``maps`` come with their poses (4, 4): maps on the same
-    grid are copied exactly, others interpolated trilinearly.
+    Voxels of a map reach the blocks ``near`` (n,); ``empty`` (m,) are empty in a map. The result has the camera and
+    parameters of ``like``. The ``maps`` come with their poses (4, 4): on the same grid they are copied exactly,
+    otherwise interpolated trilinearly.
     """
     sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
     for volume, T, reached in maps:
@@ -291,11 +283,8 @@ def fused_blocks(
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first.
-
-    Maps with identity pose are added voxel by voxel, others by trilinear interpolation. The sums are exact: on one grid
-    the order does not change the voxels.
-    """
+    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first;
+    identity poses are copied exactly, others interpolated."""
     reached = [
         ReachedBlocks.of(one.coords[:n], one.slot_of[:n] >= 0, T, volumes[0].block_size)
         for one, n, T in ((v.blocks, v.blocks.num_entries, T) for v, T in zip(volumes, Ts_world_volume, strict=True))

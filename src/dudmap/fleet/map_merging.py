@@ -25,16 +25,16 @@ from dudmap.fleet.map_samples import SurfacePoints, surface_points
 from dudmap.fleet.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.1, 4.0
-"""Two keyframe pairs vote for one relative pose if it places the camera of either within this distance (m, deg). The
-pose of one pair is accurate to some centimetres and a degree (``POSITION_ERROR``)."""
+"""Keyframe pairs vote for one relative pose within this distance (m, deg) of either camera; a pair is accurate to
+centimetres and a degree."""
 MAX_HYPOTHESES = 5
 """Most relative poses returned."""
 
 SURFACE_POINTS = 20_000
 """Surface points of each map for the alignment and the checks."""
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
-"""Keyframes of one map that must be recognised in the other at one relative pose. A single keyframe needs this many
-matching features. Look-alike places reach 200 and are left to the checks."""
+"""Keyframes that must be recognised at one relative pose; a single one needs this many features. Look-alike places
+reach 200."""
 NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
 
 
@@ -56,8 +56,7 @@ def relative_poses(
     """Relative poses ``T_a_b`` of two maps from their keyframes, best first; empty if no keyframe of b is recognised in
     a.
 
-    Each keyframe of b is matched to the keyframes of a (``KeyframeDatabase.match``) with the ``camera`` of a. Agreeing
-    matches are averaged, weighted by their number of features. Poses with more matching features come first.
+    Matches (``KeyframeDatabase.match``, with the ``camera`` of a) that agree are averaged, weighted by their features.
     """
     database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []
@@ -172,11 +171,8 @@ def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
 def decided(
     a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False, changed: bool = False
 ) -> MapPair:
-    """Refine and check relative poses (at least one) in order; return the first that passes all checks.
-
-    If none passes, the result is the rejection of the first. ``many``: The maps belong to a large set in which most
-    pairs show different places.
-    """
+    """Refine and check relative poses in order; return the first that passes all checks, else the rejection of the
+    first. ``many``: most pairs of a large set show different places."""
     empty = [name for name, one in (("first", a), ("second", b)) if not len(one.points)]
     if empty:
         return MapPair(None, f"the {' and the '.join(empty)} has no surface, its mesh is empty; leave that run out")

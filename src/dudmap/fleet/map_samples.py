@@ -12,11 +12,11 @@ from dudmap.core.map.volume import TsdfVolume
 __all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
 
 IN_BAND = 0.9
-"""Share of the truncation distance within which a voxel holds a distance to a surface; beyond it is free space
-(``SURFACE_SHARE`` in ``core/formulas/voxel.py``)."""
+"""Share of the truncation distance beyond which a voxel is free space (``SURFACE_SHARE`` in
+``core/formulas/voxel.py``)."""
 NOISE_IN_BAND = 2.0
-"""Standard deviations of depth noise that must fit into the truncation distance for free space to contradict a surface.
-Then 95 % of the measurements lie within the band."""
+"""Standard deviations of depth noise that must fit into the truncation distance for free space to contradict a
+surface."""
 
 
 @dataclass(frozen=True, eq=False)

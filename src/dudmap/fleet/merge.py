@@ -57,8 +57,8 @@ WRITTEN = {
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
     """Merge the maps of two run folders into a new run folder, in the world frame of the first; return merge.json.
 
-    The folder holds map, keyframes, mesh, metrics.json, merge.json, config.toml of the first run, and the trajectories
-    of both (trajectory.txt, trajectory-2.txt). If the maps do not match, nothing is written.
+    The folder holds map, keyframes, mesh, metrics.json, merge.json, the first config.toml, and both trajectories. If
+    the maps do not match, nothing is written.
 
     Raises:
         MapError: The maps do not match; the message says why.
@@ -136,15 +136,10 @@ class FleetReport:
 def merge_fleet(runs: Sequence[str | Path], out: str | Path, *, workers: int = 1) -> FleetReport:
     """Merge the maps of two or more runs.
 
-    The folder must be new, or hold a world, which is replaced. It receives:
-
-    - world.json: runs with their poses, ranges, pairs.
-    - map/<code>.npz: one map file per range, for ``TsdfVolume.load``.
-    - tileset.json and tiles/: 3D Tiles 1.1.
-    - trajectory.txt, trajectory-2.txt, ...: all runs in the world of the first.
-
-    Groups of at least two runs that do not overlap the largest group become worlds in part-2, part-3, ... ``workers``
-    is the number of processes.
+    The folder must be new, or hold a world, which is replaced. It receives world.json, map/<code>.npz per range
+    (``TsdfVolume.load``), tileset.json and tiles/ (3D Tiles 1.1), and trajectory.txt, trajectory-2.txt, ... in the
+    world of the first run. Other groups of at least two runs become worlds in part-2, part-3, ... ``workers`` is the
+    number of processes.
 
     Raises:
         ConfigError: A run is named twice, or the voxels differ in size.

@@ -1,11 +1,9 @@
 """Relative poses of runs, in rounds: similar runs first, then runs that overlap at the poses found so far.
 
-Candidate pairs come from place recognition or from the pose graph; features, surfaces and checks decide on each pair.
-
 Places are recognised by VLAD (Jegou et al. 2010): the differences of a keyframe's features to their nearest visual
-words are summed per word. Each sum is normalised (Arandjelovic and Zisserman 2013), then the whole vector. The words
-are k-means centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components towards
-equal variance, because many places share doors and wallpaper.
+words are summed per word, normalised per word (Arandjelovic and Zisserman 2013) and as a whole. The words are k-means
+centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components, because many places
+share doors and wallpaper.
 """
 
 import logging
@@ -78,11 +76,8 @@ def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDAr
 
 
 def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Similarity (n, n) of the places of runs from descriptors (k, d) of each; symmetric, 0 on the diagonal.
-
-    Every keyframe votes for the ``NEIGHBOURS`` runs with the most similar keyframes. A vote is the excess over the
-    similarity of the last of these runs.
-    """
+    """Similarity (n, n) of the places of runs from descriptors (k, d) of each. Every keyframe votes for the
+    ``NEIGHBOURS`` runs with the most similar keyframes, by its excess over the last of them."""
     everything = _whitened(np.concatenate(runs))
     sizes = np.array([len(run) for run in runs], np.int64)
     ends, held = np.cumsum(sizes), np.flatnonzero(sizes)
@@ -196,8 +191,8 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
 def registered_runs(runs: Sequence[Path], workers: Workers) -> tuple[Pairs, RunGraph]:
     """Relative poses of pairs of runs, and the poses of all runs.
 
-    The first round compares each run with its most similar runs. Each further round compares runs that overlap at the
-    current poses, and runs of smaller groups with the next similar runs of other groups.
+    The first round compares each run with its most similar runs, further ones the runs that overlap at the current
+    poses and smaller groups with the next similar runs.
 
     Raises:
         MapError: A file is damaged.

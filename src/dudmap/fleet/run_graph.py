@@ -1,8 +1,7 @@
-"""Poses of many runs from pairwise relative poses: rejection by cycles, then a robust pose graph.
+"""Poses of many runs from pairwise relative poses: rejection by cycles, then a robust pose graph (Huber).
 
-Relative poses around a cycle must compose to the identity. If they do not, the joins of the cycle that no other cycle
-confirms are rejected, because a false join costs more than a missed one. The remaining joins are optimised with a Huber
-kernel.
+Relative poses around a cycle must compose to the identity. If not, its joins that no other cycle confirms are rejected:
+a false join costs more than a missed one.
 """
 
 from collections import deque
@@ -21,13 +20,12 @@ Pair = tuple[int, int]
 
 SIGMA_DISTANCE, SIGMA_ANGLE = 0.01, np.radians(0.2)
 """Standard deviation per axis of a relative pose of two runs, at the middle of their common surface (m, rad): drift
-within the runs. The alignment of the surfaces is more exact."""
+within the runs."""
 HALF = 0.5
-"""Overlap at which these standard deviations hold. Joins of rendered runs err by 4.4 mm (root mean square) above half
-overlap. They err by 4.9 mm at 35 to 50 %, 11.8 mm at 25 to 35 %, and 17 mm below."""
+"""Overlap at which these hold. Joins of rendered runs err by 4.4 mm above it, 4.9 mm at 35 to 50 %, 11.8 mm at 25 to
+35 %, 17 mm below."""
 CHI_SQUARE = 22.46
-"""99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of a cycle's squared error, in
-standard deviations."""
+"""99.9 % quantile of chi-square with 6 degrees of freedom: limit of a cycle's squared error."""
 HUBER = 1.345
 """Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
 
@@ -35,8 +33,8 @@ HUBER = 1.345
 def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
     """Cut of a graph that separates at least as many pairs ``apart`` as it has edges; empty if there is none.
 
-    Of all minimum cuts between such pairs, the one with most separated pairs per edge is returned as edge indices.
-    Minimum cuts follow from maximum flow with unit capacities (Ford and Fulkerson 1956). ``edges`` must be unique.
+    Of all minimum cuts between such pairs (Ford and Fulkerson 1956, unit capacities), the edge indices of the one with
+    most separated pairs per edge. ``edges`` must be unique.
     """
     if not edges or not apart:
         return set()
@@ -159,11 +157,8 @@ def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
 
 
 def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[Join]:
-    """Remove joins that at least as many pairs of runs deny.
-
-    False joins bring groups of runs to a wrong place, and several may agree in similar places. Runs of both groups that
-    then share a place disagree. So the joins across a cut are rejected if at least as many pairs across it disagree.
-    """
+    """Remove joins that at least as many pairs of runs deny: false joins bring groups of runs to a wrong place,
+    where runs of both groups disagree."""
     left = list(joins)
     while cut := best_cut([(join.a, join.b) for join in left], denied):
         left = [join for number, join in enumerate(left) if number not in cut]

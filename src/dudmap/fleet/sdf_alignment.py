@@ -1,7 +1,7 @@
 """Refine the relative pose of two maps by registering the surface of each to the distances of the other.
 
-Surface points are aligned to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013).
-Intensities are aligned as in the tracker (thesis eq. 4.32). Both directions are used, so that neither map is preferred.
+Surface points are aligned to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013),
+intensities as in the tracker (thesis eq. 4.32), in both directions.
 """
 
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ STOP = 1e-5
 """Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
 MAD, LEAST_SHADE, LEAST_NOISE = 1.4826, 0.005, 0.05
 """Standard deviation over median absolute value; smallest standard deviations of intensity (0..1) and distance
-(voxels). Shorter steps than the latter end the alignment of visits."""
+(voxels). Shorter steps end the alignment of visits."""
 COLOR_SHARE = 0.1
-"""Factor of the standardised intensities of visits. Errors of a real camera's colours are correlated over some hundred
-points, by blur, light and timing; distances scatter independently."""
+"""Factor of the standardised intensities of visits, whose errors are correlated over some hundred points by blur,
+light and timing."""
 SCALE = 0.5
-"""Residual at which the Geman-McClure weight of a distance falls to a quarter, voxels: about a surface's standard
-deviation. Surface that only one map saw from the front is up to one truncation distance away."""
+"""Residual at which the Geman-McClure weight of a distance falls to a quarter, voxels: a surface's standard
+deviation."""
 SHRINKING = 0.5
 """Factor per step of that residual, which starts at the truncation distance."""
 MIN_POINTS = 500
 """Fewest points on the other map's surface that determine the pose."""
 MIN_STIFFNESS = 0.02
-"""Smallest stiffness of a determined pose: smallest over largest eigenvalue of the normal matrix. Angles are scaled by
-the extent of the points. A plain wall has 0."""
+"""Smallest over largest eigenvalue of the normal matrix of a determined pose, angles scaled by the extent of the
+points. A plain wall has 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,9 @@ def align_maps(
 ) -> SdfAlignment:
     """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
 
-    Its error must be below the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2``; the
-    scale ``c`` shrinks per step (graduated non-convexity, Yang et al. 2020). Intensities have the tracker's weights.
-
-    ``changed``: Things may have moved or been painted. Intensities then also have Geman-McClure weights, scaled by the
-    ratio of both noises.
+    Its error must be below the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2``, with
+    ``c`` shrinking per step (graduated non-convexity, Yang et al. 2020); intensities the tracker's weights, if
+    ``changed`` also Geman-McClure weights.
     """
     tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
     center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation

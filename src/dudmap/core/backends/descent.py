@@ -52,11 +52,9 @@ def descend(
 ) -> Descent:
     """Accelerated Levenberg-Marquardt steps; a step is accepted if it decreases the cost.
 
-    The change of the cost is estimated from the mean of the gradients before and after the step (trapezoidal rule). The
-    costs are unsuitable: pixels that enter or leave the map change their sum by half a percent, more than short steps
-    do.
-
-    The CPU has the same loop as one compiled call (``cpu/registration.py``).
+    The change is estimated from the mean of the gradients before and after the step (trapezoidal rule), because pixels
+    that enter or leave the map change costs more than short steps do. The CPU has the same loop as one compiled call
+    (``cpu/registration.py``).
 
     Args:
         linearize: Returns the normal equations at a pose (4, 4).

@@ -53,11 +53,11 @@ def make_backend(device: str) -> Backend:
 
 
 def resolve(device: str, *, adaptive: bool = False) -> str:
-    """Name of the selected device, "cpu", "warp-cpu" or "cuda:N"; "cpu" for a device that has failed in this process.
+    """Name of the selected device, "cpu", "warp-cpu" or "cuda:N"; "cpu" after a failure in this process.
 
     Args:
-        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU if one works, else
-            the CPU; "warp-cpu" for the GPU kernels on the CPU, for tests.
+        device: "cpu"; "cuda" or "cuda:1" for a GPU; "auto" for the first GPU that works, else the CPU; "warp-cpu" for
+            the GPU kernels on the CPU, for tests.
         adaptive: Whether the map has several voxel sizes, which only the CPU supports.
 
     Raises:

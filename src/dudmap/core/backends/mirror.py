@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 class Mirror:
     """Host array and the copy that a back end may attach; rows are transferred when the other side needs them.
 
-    On the CPU there is no copy.
-
     Args:
         array: The array in host memory.
 
     Attributes:
         array: The host array, without rows that only the device has written.
         used: Number of leading rows in use; the device needs no copy of the others.
-        copy: Copy on a device (``RowCopy``); None = none.
+        copy: Copy on a device (``RowCopy``); None on the CPU.
     """
 
     def __init__(self, array: NDArray) -> None:

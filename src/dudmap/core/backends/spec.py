@@ -21,11 +21,11 @@ from dudmap.core.backends.parameters import (
 
 
 class Backend(Protocol):
-    """Operations of a compute device.
+    """Operations of a compute device; the CPU prepares images, finds labels, and makes meshes and views on every
+    device.
 
-    A back end may reuse buffers between calls. Therefore each map has its own back end, and calls on one must not run
-    concurrently. Results do not depend on the number of threads. The CPU prepares images, finds labels, and makes
-    meshes and views on every device.
+    A back end may reuse buffers between calls: each map has its own, and calls on one must not run concurrently.
+    Results do not depend on the number of threads.
     """
 
     # -- integrate ---------------------------------------------------------------------------------------------------

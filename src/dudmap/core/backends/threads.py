@@ -1,7 +1,7 @@
 """Thread pool for bands of rows, and the decorators that compile kernels.
 
-Kernels are serial and release the GIL. A call is divided into bands that do not depend on the number of threads, and
-sums are added in band order. Therefore the result is bit for bit the same on one core and on sixteen.
+Kernels are serial and release the GIL. Bands do not depend on the number of threads, and sums are added in band order,
+so that results are bit for bit the same on any number of cores.
 """
 
 import atexit
@@ -93,12 +93,11 @@ exact = compiled(fastmath=False)
 exact_scalar = partial(Scalar, fastmath=False)
 """Decorator for device functions of such loops; ``py_func`` is the same formula for whole images."""
 scalar = Scalar
-"""Decorator for device functions that are always inlined, because a call ends the vectorisation of the surrounding
-loop. Without inlining a function would exist in two forms with different rounding, optimised alone and with its
-caller. The cache state would decide which one is called."""
+"""Decorator for device functions that are always inlined, because a call ends the vectorisation of the loop.
+Otherwise two forms with different rounding would exist, and the cache state would decide between them."""
 written_out = compiled(inline="always")
-"""Decorator for scalar formulas that are inlined as source, so that the compiler orders their sums and products
-together with the surrounding ones. It takes longer to compile than ``scalar``."""
+"""Decorator for formulas that are inlined as source, so that the compiler orders their sums with the surrounding
+ones; slower to compile than ``scalar``."""
 
 Result = TypeVar("Result")
 

@@ -30,8 +30,7 @@ CAMERAS = {
 }
 """Module and class of every camera by name; without a name the first connected camera is used."""
 MAX_WAIT = 0.1
-"""Longest time for which a frame may wait, seconds. At 30 Hz, one frame of triple duration delays the next ones and
-drops none."""
+"""Longest time for which a frame may wait, seconds: a frame of triple duration at 30 Hz drops none."""
 
 
 class CameraFrame(NamedTuple):

@@ -33,9 +33,9 @@ COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_f
 class Recorder:
     """Writes frames without loss to an MCAP file that ``dudmap run`` and ROS 2 read.
 
-    ``put`` never waits: if the disk is too slow for the camera, frames are dropped and counted. The file is written
-    into ``<name>.recording`` and moved to its final place when it is complete. If the process is killed or the power
-    fails, all but the last ``UNSAVED`` seconds can be read there.
+    ``put`` never waits: frames that the disk is too slow for are dropped and counted. The file is written into
+    ``<name>.recording`` and moved when it is complete; after a kill all but the last ``UNSAVED`` seconds can be read
+    there.
 
     Args:
         path: The file; it must not exist and end in .mcap.
@@ -43,8 +43,7 @@ class Recorder:
         calibration: Of the colour camera, None for registered colour.
 
     Attributes:
-        written: Number of frames in the file.
-        dropped: Number of frames for which there was no time.
+        written, dropped: Numbers of frames.
 
     Raises:
         CameraError: The file exists, has another suffix or cannot be created.

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 class ReplayCamera(LiveCamera):
     """Delivers the frames of a recording at their times; the clock starts at the first ``read``.
 
-    While a frame is read from disk, others become due. Frames due for longer than ``MAX_WAIT`` are lost, as with a
-    camera.
+    Frames due for longer than ``MAX_WAIT`` are lost, as with a camera.
 
     Args:
         recording: Path of a recording in any format that is read, or the opened sequence.

@@ -58,8 +58,8 @@ class SpaceGrid:
     def of(cls, volume: TsdfVolume, mesh: Mesh, T_grid_map: NDArray[np.float64], resolution: float) -> "SpaceGrid":
         """Grid around a surface.
 
-        A cell is occupied if it contains a vertex of the surface. Otherwise it is free if its centre was observed in
-        front of a surface or in known free space, else unknown.
+        A cell is occupied if it contains a vertex; free if its centre was observed in front of a surface or in known
+        free space; else unknown.
 
         Args:
             mesh: Surface of the map; vertices closer together than a cell.
@@ -99,11 +99,8 @@ class SpaceGrid:
             yield cells, self.origin + (numbers + 0.5) * self.resolution
 
     def distances(self, mesh: Mesh) -> NDArray[np.float32]:
-        """Euclidean signed distance (X, Y, Z) of each centre to the nearest surface vertex, metres; negative behind a
-        surface.
-
-        The vertices are at most a voxel v apart, so a distance d is at most v^2 / (4 d) too large.
-        """
+        """Euclidean signed distance (X, Y, Z) of each centre to the nearest surface vertex, metres; negative behind
+        a surface. With vertices a voxel v apart, a distance d is at most v^2 / (4 d) too large."""
         from scipy.spatial import KDTree
 
         tree = KDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
@@ -132,7 +129,7 @@ def look_up(volume: TsdfVolume, points: NDArray[np.float64]) -> tuple[NDArray[np
 
 
 def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write occupancy and Euclidean signed distances as NumPy archive.
+    """Write a NumPy archive.
 
     - ``format``: ``FORMAT``.
     - ``occupancy``: (X, Y, Z) int8, 100 = occupied, 0 = free, -1 = unknown.
@@ -177,11 +174,8 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
-    """Occupancy (X, Y) for a robot that reaches from the lower to the upper height above the floor, metres.
-
-    A column is occupied if any cell between the heights is. Otherwise it is free if its floor was seen or at least half
-    of these cells are free, else unknown.
-    """
+    """Occupancy (X, Y) between two heights above the floor, metres: occupied if any cell is; free if the floor was
+    seen or half of the cells are free; else unknown."""
     z = grid.origin[2] + (np.arange(grid.occupancy.shape[2]) + 0.5) * grid.resolution
     inside = grid.occupancy[..., (z > heights[0]) & (z < heights[1])]
     floor = grid.occupancy[..., np.abs(z) <= max(FLOOR_LAYER, grid.resolution)]

@@ -1,7 +1,6 @@
 """Mesh files: PLY, OBJ, STL, binary glTF 2.0 and USDZ; and point clouds, the vertices of the mesh: PLY, PCD, LAZ, E57.
 
-This module writes glTF itself instead of trimesh, for linear vertex colours with an unlit material. sRGB bytes would
-look pale, and viewers default to metal.
+glTF is written here for linear vertex colours with an unlit material, which trimesh lacks.
 """
 
 import json

@@ -1,7 +1,7 @@
 """ROS 2 messages from and to arrays, and MCAP files of them. Message classes come from the caller (rosbags or rclpy).
 
-Frames follow REP 105 with the optical axes of REP 103: ``map`` is the world of the map, ``camera`` has x right, y down,
-z forward. Unsupported messages raise a ``DatasetError``.
+Frames: ``map`` is the world of the map (REP 105), ``camera`` has x right, y down, z forward (REP 103). Unsupported
+messages raise a ``DatasetError``.
 """
 
 import tempfile

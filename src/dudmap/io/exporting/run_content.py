@@ -182,8 +182,8 @@ def _numbers(version: str) -> list[int]:
 
 Box = tuple[float, float, float, float, float, float]
 SPECK = 4e-4
-"""Smallest surface of a connected piece that is exported by default, square metres: a square of 2 cm. Loose pieces of a
-few voxels are depth noise."""
+"""Smallest surface of a connected piece that is exported by default, square metres: 2 cm wide; smaller pieces are
+noise."""
 MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
 """Options that change the mesh."""
 

@@ -16,18 +16,17 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.sequences.gravity import MeasuredUp, mean_direction
 
 CONTRADICTS = 20.0
-"""Two directions against gravity contradict each other beyond this angle, degrees. Ramps are less steep and stairs
-steeper. The drift of a map tilts it by a few degrees."""
+"""Angle beyond which two directions against gravity contradict each other, degrees: more than ramps and drift, less
+than stairs."""
 ACCURACY = 5.0
 """A floor within this angle of measured gravity is level, degrees: the error of IMU mounting and map drift."""
 LEVEL = np.cos(np.radians(15))
 """A surface faces a direction if its normal is within 15 degrees (cosine)."""
 UPSIDE_DOWN = 2.0
-"""Ratio of surface facing down to surface facing up from which the map may be upside down. Rooms have much more surface
-facing up, because cameras look down on furniture."""
+"""Ratio of surface facing down to up from which the map may be upside down: cameras look down on furniture."""
 TURNED, STEADY = 0.64, 0.9
-"""Singular values of the mean rotation matrix. The second one is below ``TURNED`` (sin(x) / x at a quarter turn) if the
-cameras turn by half a turn or more. The first one is above ``STEADY`` if they nod by less than about 25 degrees."""
+"""Singular values of the mean rotation matrix: the second is below ``TURNED`` (sin(x) / x at a quarter turn) if the
+cameras turn by half a turn, the first above ``STEADY`` if they nod by less than 25 degrees."""
 ASSUMED = "assumed: the camera is upright"
 
 

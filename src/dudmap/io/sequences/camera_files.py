@@ -117,11 +117,8 @@ def seen(folder: Path) -> str:
 def load(paths: Iterable[Path]) -> Intrinsics:
     """Intrinsics of JSON and YAML files: of one camera, or of a depth and a colour camera.
 
-    Every object with focal lengths and a principal point is a camera. It is a depth camera if the file name or a parent
-    key contains "depth". A depth scale below 1 is metres per unit.
-
-    Args:
-        paths: The files.
+    Every object with focal lengths and a principal point is a camera, a depth camera if the file name or a parent key
+    contains "depth". A depth scale below 1 is metres per unit.
     """
     cameras: list[tuple[str, dict[str, float]]] = []
     scale, motion, files = {}, np.eye(4), list(paths)
@@ -152,10 +149,8 @@ def load(paths: Iterable[Path]) -> Intrinsics:
 
 
 def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
-    """Numbers by dudmap's keys of one JSON object; None if it is no camera.
-
-    A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
-    """
+    """Numbers by dudmap's keys of one JSON object, or None. A matrix has 9 numbers row by row, column by column
+    (Open3D), or 3 rows."""
     values = {}
     tree = tree | {str(key).partition(".")[2]: tree[key] for key in tree if str(key).startswith(SETTINGS)}
     for key, names in NAMES.items():

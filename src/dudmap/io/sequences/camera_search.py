@@ -22,7 +22,7 @@ FOLDERS = re.compile(r"config|.*(intrin|calib).*", re.IGNORECASE)
 MOST_NAMES = 5
 """Largest number of files in a message."""
 SAME = 0.5
-"""Largest difference of the numbers of one camera in two files, pixels: it shifts an edge by less than a pixel."""
+"""Largest difference of the numbers of one camera in two files, pixels."""
 FIELD_OF_VIEW = (20.0, 130.0)
 """Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
 OFF_CENTER = 0.25

@@ -22,18 +22,16 @@ from dudmap.io.sequences.rotated_depth import Rotated
 PROBES = 30
 """Evenly spread frames that are tried until one is valid and gives the image size."""
 OFF_CENTER = 0.08
-"""Distance of the principal point from the image centre, as a share of the image, beyond which intrinsics seem to
-belong to other images."""
+"""Largest distance of a plausible principal point from the image centre, share of the image."""
 FRAME_RATE = 30.0
 """Assumed frames per second of recordings with frame numbers only: the rate of most depth cameras."""
 
 
 class ImageFolder(Recording):
-    """Base class of recordings whose frames are a colour file and a depth file each, or, without colour, a depth file.
+    """Base class of recordings whose frames are a colour file and a depth file each, or a depth file alone.
 
-    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``).
-    Optionally it defines cameras for recordings without a file of intrinsics (``published``), the ground truth
-    (``_find_ground_truth``) and the storage of an image (``_read_depth``).
+    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``); optionally
+    its cameras (``published``), its ground truth (``_find_ground_truth``) and ``_read_depth``.
 
     Args:
         path: The folder.

@@ -13,7 +13,7 @@ PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
 LARGEST_HEADER = 1 << 16
 """Largest size of a header, bytes from the start of the file."""
 LARGEST_SCANS = 100
-"""Largest number of passes over the image in a progressive JPEG file; encoders write up to 10, and each takes time."""
+"""Largest number of passes of a progressive JPEG file; encoders write up to 10, and each takes time."""
 _TIFF_TYPES = {3: "H", 4: "I"}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}
@@ -22,10 +22,8 @@ _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}
 def check_size(data: bytes, name: str) -> None:
     """Check the format and size of an image; ``name`` is used in messages.
 
-    Other formats of the decoder are rejected, because each adds code that reads untrusted files.
-
     Raises:
-        FrameError: It is in another format, too large, or its header is damaged.
+        FrameError: It is in a format that need not be supported, too large, or its header is damaged.
     """
     read = next((read for magic, read in _FORMATS.items() if data.startswith(magic)), None)
     if read is None:

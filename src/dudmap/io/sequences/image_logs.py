@@ -69,8 +69,8 @@ class _FrameLog(Recording):
 class SensRecording(_FrameLog):
     """Recording in a ``.sens`` file.
 
-    ScanNet's colour images are larger than the depth images and come from another camera, which ``calibration`` holds.
-    Frames whose times are all zero or do not increase are assumed to be 1/30 s apart.
+    Colour images are larger and come from another camera, which ``calibration`` holds. Times that are all zero or do
+    not increase become 1/30 s apart.
     """
 
     format = "ScanNet .sens"
@@ -146,8 +146,8 @@ class SensRecording(_FrameLog):
 class KlgRecording(_FrameLog):
     """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
-    Depth is in millimetres (raw or zlib), colour raw or JPEG. Intrinsics must be given, because the file has none. The
-    image size comes from them, else from the first JPEG image, else it is the logger's 640x480.
+    Depth is in millimetres (raw or zlib), colour raw or JPEG. The file has no intrinsics. The image size comes from
+    given ones, else from the first JPEG image, else it is the logger's 640x480.
     """
 
     format = "ElasticFusion .klg"
@@ -222,9 +222,9 @@ LARGEST_COMMAND = 315 + 2359
 class Record3DRecording(Recording):
     """Recording in a ``.r3d`` file.
 
-    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place. The
-    depth camera is therefore the colour camera resized, and ``calibration`` holds the colour camera. Depth of
-    confidence 0 is omitted. Poses in the file are ARKit's estimates and no ground truth.
+    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place: the
+    depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Depth of confidence 0 is
+    omitted. ARKit's poses are no ground truth.
     """
 
     format = "Record3D .r3d"
@@ -298,7 +298,7 @@ def largest_unpacked(packed: bytes) -> int:
     """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks.
 
     A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (Apple's reference
-    implementation, lzfse_internal.h). Its decoder does not stop at the declared size. Other blocks declare their size.
+    implementation, lzfse_internal.h). Its decoder does not stop at the declared size.
 
     Raises:
         ValueError: A block is cut off or of another kind.

@@ -13,7 +13,7 @@ from dudmap.core.geometry.times import time_unit
 NUMBER = r"\d+(?:\.\d+)?"
 """A number in a name; a decimal number counts as one."""
 LARGEST_NUMBER = 10**8
-"""Numbers of this size and more in a file name are times, not frame numbers: 38 days at 30 frames a second."""
+"""Numbers of this size and more are times, not frame numbers: 38 days at 30 Hz."""
 LARGEST_SECONDS = 10**11
 """Largest time since 1970 in seconds; larger numbers have a smaller unit."""
 Keys = tuple[list[float], list[float]]

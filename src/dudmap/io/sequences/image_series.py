@@ -1,8 +1,8 @@
 """Recognition of colour and depth among the numbered images of a folder, by names and by content.
 
-A series is the set of images in one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in the
-names of files and folders decide first. If they are ambiguous, or contradict the content, the content decides: one
-channel of 16 bits or floats is depth, 8-bit colours are colour.
+A series is the images of one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in names
+decide first. If they are ambiguous or contradict the content, one channel of 16 bits or floats is depth, 8-bit colours
+are colour.
 """
 
 import os
@@ -32,8 +32,8 @@ CONTENTS = {
 PROBED = 3
 """Images of a series whose headers are read."""
 LEAST_SHARE = 0.25
-"""Smallest share of the longer of two series with a partner, if content alone pairs them. Also the smallest share of
-the images of its kind in a series that replaces another one by its content."""
+"""Smallest share of the longer of two series with a partner, if content alone pairs them, and of the images of its
+kind in a series that replaces another."""
 LARGEST_LIST = 5
 """Largest number of series in a message."""
 Found = dict[str, "Series | None"]

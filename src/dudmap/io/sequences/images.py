@@ -1,7 +1,6 @@
-"""Decoding of colour, depth and mask images, with one clear error for every defect of a file.
+"""Decoding of colour, depth and mask images; every defect of a file raises a ``FrameError``.
 
-A file that is missing, cut off, damaged, too large or no such image raises a ``FrameError``. The size that a file
-declares is read before a decoder takes memory for it.
+The declared size is read before a decoder takes memory for it.
 """
 
 import struct

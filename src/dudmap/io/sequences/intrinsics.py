@@ -24,8 +24,7 @@ DEPTH_SCALE = 5000.0
 """Default depth units per metre in the TUM layout."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
 COLOR_PREFIX = "color_"
-"""Prefix of the keys of a separate colour camera: fx, fy, cx, cy, width and height (required), and its distortion
-coefficients."""
+"""Prefix of the keys of a separate colour camera: fx, fy, cx, cy, width, height, and its distortion coefficients."""
 COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 SAME_SHAPE = 0.01
 """Largest relative difference of aspect ratios at which images of two sizes may show the same view."""
@@ -89,7 +88,7 @@ def camera_values(*numbers: float) -> dict[str, float]:
 
 
 BY_NAME = ", by name"
-"""End of a source of intrinsics that are known from the name or the layout of a data set, and in no file."""
+"""End of a source of intrinsics that are known from the name or layout of a data set."""
 
 
 def by_name(name: str, values: dict[str, float]) -> Intrinsics:
@@ -195,8 +194,8 @@ def _is_number(text: str) -> bool:
 
 
 BROWN, RATIONAL, FISHEYE = "plumb_bob", "rational_polynomial", "equidistant"
-"""Distortion models by their names in ROS. Brown-Conrady and its rational extension (Brown 1971) are as in OpenCV; the
-angle polynomial is by Kannala and Brandt (2006)."""
+"""Distortion models by their names in ROS. Brown-Conrady and its rational extension (Brown 1971) are as in OpenCV;
+the angle polynomial is by Kannala and Brandt (2006)."""
 INVERSE = "inverse_brown_conrady"
 """Brown's polynomial from distorted to undistorted coordinates, which RealSense uses for colour."""
 OTHER_NAMES = {"brown_conrady": BROWN, "modified_brown_conrady": BROWN, "kannala_brandt4": FISHEYE, "": BROWN}
@@ -268,8 +267,8 @@ class Lens:
 def brown_of_inverse(camera: Camera, inverse: "tuple[float, ...]") -> tuple[float, ...]:
     """Coefficients k1 k2 p1 p2 k3 of a lens whose inverse is Brown's polynomial with the given coefficients.
 
-    Let d be distorted coordinates and u = d + B(d; inverse) undistorted ones. The coefficients c solve u + B(u; c) = d
-    by least squares over the image; B is linear in c.
+    With undistorted coordinates u = d + B(d; inverse), the coefficients c solve u + B(u; c) = d by least squares over
+    the image.
     """
     us, vs = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
     d = np.stack([(us.ravel() - camera.cx) / camera.fx, (vs.ravel() - camera.cy) / camera.fy])

@@ -27,10 +27,10 @@ POSES = ("poses.txt", "pose.txt", "poses", "pose")
 class NumberedSequence(ImageFolder):
     """Folder of numbered images, in two folders (``color/000001.png``, ``depth/000001.png``) or in one.
 
-    Words in the names of files and folders, the content, or two patterns tell which images are depth and colour
-    (``image_series``). Equal numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms.
-    Depth: 16 bit, or float metres. The ground truth is groundtruth.txt, or matrices camera to world. These are one per
-    frame in poses.txt, or numbered like the images in a folder ``pose`` or ``poses``.
+    Words in names, the content, or two patterns tell which images are depth and colour (``image_series``). Equal
+    numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms. The ground truth is
+    groundtruth.txt, or matrices camera to world: one per frame in poses.txt, or numbered like the images in a folder
+    ``pose`` or ``poses``.
 
     Args:
         path: The folder.
@@ -38,8 +38,7 @@ class NumberedSequence(ImageFolder):
         color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, for ambiguous names.
 
     Raises:
-        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the ground truth is
-            malformed.
+        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the ground truth is malformed.
     """
 
     format = "numbered images"
@@ -111,11 +110,10 @@ LARGEST_CHANGE = 0.5
 
 
 class BopSequence(NumberedSequence):
-    """Scene of BOP (Hodan et al. 2018), the benchmark for poses of objects: rgb/, depth/ and scene_camera.json.
+    """Scene of BOP (Hodan et al. 2018): rgb/, depth/ and scene_camera.json.
 
     The file holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. The optional ``cam_R_w2c`` (row
-    by row) and ``cam_t_w2c`` (mm) map points of the world to the camera and are the ground truth (bop_toolkit,
-    docs/bop_datasets_format.md).
+    by row) and ``cam_t_w2c`` (mm), world to camera, are the ground truth (bop_toolkit, docs/bop_datasets_format.md).
     """
 
     format = "BOP"

@@ -23,8 +23,7 @@ from dudmap.io.sequences.pose_matrices import read_log, read_matrix, read_upper_
 class EpflSequence(ImageFolder):
     """Folder of the EPFL RGB-D Pedestrian data set (Bagautdinov et al. 2015) with the images of a Kinect v2 at rest.
 
-    A folder such as ``epfl_lab/20140804_160621_00`` holds ``rgb000033.png`` and ``depth000033.png`` (mm). Both rooms
-    have one published camera; colour is mapped to depth.
+    ``rgb000033.png`` and ``depth000033.png`` (mm), with one published camera; colour is mapped to depth.
     """
 
     format = "EPFL RGB-D Pedestrian"
@@ -37,8 +36,8 @@ class EpflSequence(ImageFolder):
 class ReplicaSequence(ImageFolder):
     """Folder of Replica as rendered for NICE-SLAM (Zhu et al. 2022): ``results/frame000000.jpg``, ``depth000000.png``.
 
-    ``traj.txt`` has one pose per line, 16 numbers, camera to world, x right, y down. cam_params.json is in the folder
-    or its parent; without it the camera of these renderings is used.
+    ``traj.txt`` has one pose per line, 16 numbers, camera to world, x right, y down. Without cam_params.json in the
+    folder or its parent the camera of these renderings is used.
     """
 
     format = "Replica (NICE-SLAM)"
@@ -52,9 +51,8 @@ class ReplicaSequence(ImageFolder):
 class ScanNetSequence(ImageFolder):
     """Folder of ScanNet (Dai et al. 2017) as its SensReader exports it: color, depth (mm), pose and intrinsic.
 
-    Colour and depth have separate intrinsics (4x4 matrices). Exported extrinsics E map the points of a camera to a
-    common frame: ``T_color_depth = E_color^-1 E_depth``. Frames with an infinite pose were lost by the data set's own
-    system and have no ground truth.
+    Colour and depth have separate intrinsics (4x4 matrices). Extrinsics E map the points of a camera to a common frame:
+    ``T_color_depth = E_color^-1 E_depth``. Frames with an infinite pose have no ground truth.
     """
 
     format = "ScanNet export"
@@ -104,8 +102,8 @@ KINECT_COLOR_DEPTH = np.array(
         [0, 0, 0, 1],
     ]
 )
-"""Motion of points of a Kinect's depth camera into its colour camera (LIRIS), used by DSAC* for 7-Scenes. ``dudmap
-calibrate`` on 200 frames confirms position, focal length and principal point."""
+"""Motion of points of a Kinect's depth camera into its colour camera (LIRIS), used by DSAC* for 7-Scenes and
+confirmed by ``dudmap calibrate`` on 200 frames."""
 SEVEN_SCENES = r"(7|seven)[-_ ]?scenes|/(chess|fire|heads|office|pumpkin|red_?kitchen|stairs)/seq-\d+$"
 """Path of a recording of 7-Scenes: the name of the set, or of one of its scenes above ``seq-01``."""
 LOST = 65535
@@ -122,9 +120,9 @@ class FrameFiles(ImageFolder):
 class SharedFrameFiles(FrameFiles):
     """Folder of such images with pose files: 7-Scenes (Shotton et al. 2013), 3DMatch, tsdf-fusion and others.
 
-    Intrinsics are in the folder or its parent, and colour is registered to depth. 65535 means missing depth. A path
-    that names 7-Scenes has the cameras of that data set: depth is not registered to colour, and camera-intrinsics.txt
-    is the depth camera. Registered copies of 7-Scenes need an intrinsics.txt.
+    Intrinsics are in the folder or its parent, and colour is registered to depth; 65535 means missing. A path that
+    names 7-Scenes has the cameras of that data set: colour is not registered, and camera-intrinsics.txt is the depth
+    camera. Registered copies need an intrinsics.txt.
     """
 
     format = "7-Scenes, 3DMatch or tsdf-fusion"
@@ -156,8 +154,8 @@ class SharedFrameFiles(FrameFiles):
 class VolumeDeformSequence(FrameFiles):
     """Folder of VolumeDeform (Innmann et al. 2016): images with colorIntrinsics.txt and depthIntrinsics.txt.
 
-    The folder is the folder of the images (``data``) or its parent, in which poses.txt may hold a 4x4 matrix per frame.
-    Equal matrices mean registered images, as in that data set. Otherwise both cameras are assumed to be in one place.
+    It is the folder of the images (``data``) or its parent, in which poses.txt may hold a 4x4 matrix per frame. Equal
+    matrices mean registered images; otherwise both cameras are assumed to be in one place.
     """
 
     format = "VolumeDeform"
@@ -202,8 +200,7 @@ class RedwoodSequence(ImageFolder):
     """Folder with ``color`` (or rgb, image), ``depth`` (mm) and a ``*.log`` inside or next to it, or an object scan.
 
     A ``.log`` holds camera-to-world matrices by frame number, counted from the first image. ``scene/trajectory.log`` is
-    Open3D's own estimate and no ground truth. Intrinsics come from a JSON file of Open3D in the folder; for these data
-    sets they are known.
+    Open3D's own estimate and no ground truth. Intrinsics come from a JSON file of Open3D, or are known.
     """
 
     format = "Redwood or Open3D"
@@ -255,8 +252,7 @@ def _logs(path: Path) -> list[Path]:
 
 
 ICL_NUIM = camera_values(481.2, 480, 319.5, 239.5, 640, 480, 5000)
-"""Published camera of ICL-NUIM. Its fy is -480 because the renderer's y axis points up; the images are not upside down.
-"""
+"""Published camera of ICL-NUIM; its fy is -480 because the renderer's y axis points up."""
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Motion between the renderer's left-handed axes (y up) and dudmap's (y down), for world and camera alike."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -269,9 +265,8 @@ SCENE_FILE = r"scene_\d+_(\d+)"
 class IclNuimSequence(ImageFolder):
     """Folder of ICL-NUIM (Handa et al. 2014) with ``rgb/N.png``, ``depth/N.png`` and perhaps a ``*.gt.freiburg``.
 
-    Frames are numbered, without times, at 30 Hz. Published poses T use the renderer's left-handed axes. With the mirror
-    M = diag(1, -1, 1), ``M T M`` fits the images with a positive fy. The first frames have no pose. Noisy depth
-    (``traj2n``) has the same layout.
+    Published poses T use the renderer's left-handed axes: ``M T M`` with M = diag(1, -1, 1) fits the images with a
+    positive fy. The first frames have no pose.
     """
 
     format = "ICL-NUIM"
@@ -296,9 +291,9 @@ class IclNuimSequence(ImageFolder):
     def model(self) -> "PlacedModel | None":
         """The published model of the living room in the world of the ground truth; None without its file.
 
-        The model (living-room.ply or .obj) lies in the folder or the one above. Its axes are those of the renderer with
-        x mirrored. Poses in them are in ``*.gt.sim`` (three rows of four numbers per frame), a row of
-        ``*.gt.freiburg`` for each. The latter begin elsewhere: the first pose of both places the model.
+        The model (living-room.ply or .obj), in the folder or the one above, has the axes of the renderer with x
+        mirrored. ``*.gt.sim`` (three rows of four numbers per frame) has poses in them, a row of ``*.gt.freiburg`` for
+        each. The first pose of both places the model.
 
         Raises:
             DatasetError: A pose that places the model is missing.
@@ -328,7 +323,7 @@ class PlacedModel(NamedTuple):
 class IclNuimLoopSequence(ImageFolder):
     """Folder with ``scene_00_0000.png``, ``.depth`` and ``.txt``: the renderer's own layout.
 
-    A ``.depth`` file is text: the distance along the ray of every pixel in metres, row by row. A ``.txt`` file gives
+    A ``.depth`` file is text: the distance along the ray of every pixel, metres, row by row. A ``.txt`` file gives
     position, direction and right vector of the camera, left-handed with y up.
     """
 

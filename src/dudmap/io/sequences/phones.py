@@ -1,7 +1,7 @@
 """Recordings of phone applications: Stray Scanner, ARKitScenes, Polycam, exports of Record3D, nerfstudio's form.
 
-ARKit gives depth of 256x192 pixels that shows the view of the colour image, and the confidence of every pixel, 0 for
-the lowest. Pixels of confidence 0 are omitted, as Polycam's documentation advises.
+ARKit gives depth of 256x192 pixels in the view of the colour image, and a confidence of every pixel. Pixels of
+confidence 0, the lowest, are omitted, as Polycam's documentation advises.
 """
 
 import math
@@ -53,8 +53,8 @@ class StrayScannerSequence(ArkitFolder):
     """Folder of the application Stray Scanner: a video of the colour images, and depth images by frame number.
 
     Layout: https://github.com/strayrobots/scanner/blob/main/docs/format.md. ``rgb.mp4``, ``depth/000000.png`` (mm),
-    ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv``, which gives the time of each frame;
-    its poses are estimates of ARKit and no ground truth.
+    ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv`` with the times; its poses are no ground
+    truth.
     """
 
     format = "Stray Scanner"
@@ -108,8 +108,8 @@ class ArkitScenesSequence(ArkitFolder):
     """Video of ARKitScenes (Baruch et al. 2021), raw or 3dod: images of 256x192 pixels with times in their names.
 
     Layout: https://github.com/apple/ARKitScenes/blob/main/DATA.md. ``lowres_wide/ID_TIME.png``, ``lowres_depth``,
-    ``confidence``, ``lowres_wide_intrinsics/ID_TIME.pincam`` and ``lowres_wide.traj``, which has motions of the world
-    into the camera. Intrinsics per image are replaced by their median.
+    ``confidence``, ``lowres_wide_intrinsics/ID_TIME.pincam`` (the median is used) and ``lowres_wide.traj``, world to
+    camera.
     """
 
     format = "ARKitScenes"
@@ -156,8 +156,8 @@ class PolycamSequence(ArkitFolder):
 
     Layout: https://github.com/PolyCam/polyform#polycams-data-format. ``keyframes`` holds ``images/TIME.jpg``,
     ``cameras/TIME.json``, ``depth/TIME.png`` (mm) and ``confidence/TIME.png``. ``corrected_images`` and
-    ``corrected_cameras`` replace images and cameras if they exist. Corrected cameras are optimised over all images and
-    are the ground truth; the others are ARKit's estimates. Intrinsics are the median over all images.
+    ``corrected_cameras``, if they exist, replace them; these cameras, optimised over all images, are the ground truth.
+    Intrinsics are the median.
     """
 
     format = "Polycam"
@@ -217,8 +217,8 @@ class PolycamSequence(ArkitFolder):
 class Record3DFolder(ImageFolder):
     """Export of the application Record3D in images: ``rgb/N.jpg``, ``depth/N.exr`` (float metres) and metadata.json.
 
-    The metadata hold K of the colour images, column by column, and the times of the frames. Their poses are ARKit's
-    estimates and no ground truth. Depth shows the view of the colour images and is smaller.
+    The metadata hold K of the colour images, column by column, and the times; ARKit's poses are no ground truth. Depth
+    shows the view of the colour images and is smaller.
     """
 
     format = "Record3D images"
@@ -258,14 +258,12 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "")
 
 
 class NerfstudioSequence(ImageFolder):
-    """Folder in nerfstudio's form, which its converters and many applications write.
-
-    The frames of transforms.json name ``file_path``, ``depth_file_path`` and ``transform_matrix``.
+    """Folder in nerfstudio's form: transforms.json names ``file_path``, ``depth_file_path`` and ``transform_matrix``.
 
     Frames are ordered by image name, at 30 Hz, unless each has a ``timestamp``. Depth has 16 bits,
-    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file. It shows the view of
-    the colour image, often smaller. Intrinsics are the median over all frames. Matrices are camera to world with OpenGL
-    axes. Poses of structure from motion are no ground truth, because they lack metric scale.
+    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file, in the view of the
+    colour image, often smaller. Intrinsics are the median. Matrices are camera to world with OpenGL axes. Poses of
+    structure from motion are no ground truth: they lack scale.
     """
 
     format = "nerfstudio"

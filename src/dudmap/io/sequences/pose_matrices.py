@@ -55,11 +55,8 @@ def read_upper_rows(path: Path) -> NDArray[np.float64]:
 
 
 def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
-    """Poses by frame number of a ``.log`` file: a line of three integers, then four rows of T_world_camera.
-
-    The Redwood data sets and Open3D's reconstruction system use this format. The first integer is the number of the
-    frame.
-    """
+    """Poses by frame number of a ``.log`` file (Redwood, Open3D): three integers, the first the frame number, then
+    four rows of T_world_camera."""
     numbers = _numbers(path)
     if numbers.size == 0 or numbers.size % 19:
         raise DatasetError(f"{path} holds {numbers.size} numbers; expected 3 integers and a 4x4 matrix for every pose")
@@ -68,11 +65,8 @@ def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
 
 
 def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Trajectory | None:
-    """Trajectory of (timestamp, T_world_camera) pairs; frames whose pose is not a rigid motion are omitted.
-
-    Data sets mark frames without a pose by infinite numbers or zeros. Rotations are projected onto the nearest one,
-    because they were written with few digits. None if there is no pose.
-    """
+    """Trajectory of (timestamp, T_world_camera) pairs; poses that are not rigid (infinite or zero) are omitted,
+    rotations projected onto the nearest one. None without poses."""
     kept = []
     for stamp, T in poses:
         R = T[:3, :3]

@@ -1,7 +1,7 @@
 """Depth images whose 16-bit millimetres are rotated left by three bits, as SUN3D (Xiao et al. 2013) stores them.
 
-The values are ``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, and small numbers beyond. SUN RGB-D and
-the images of the Amazon Picking Challenge have them too. Values in units of 1/8 mm look and are read the same.
+``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, and small numbers beyond. Also SUN RGB-D and the
+Amazon Picking Challenge. Values in units of 1/8 mm are read the same.
 """
 
 from collections.abc import Callable
@@ -21,16 +21,15 @@ MOST = 0.95
 NEAR_SHARE = 0.8
 """Smallest share of measurements below 8.19 m; their low three bits are 0."""
 FARTHEST = 10000
-"""Largest distance that depth cameras for rooms measure, mm. Values with low bits must decode to nearer distances. Low
-bits that number persons (Microsoft's first driver) decode to farther ones. A unit is wrong if a twentieth of the
-distances is beyond this limit."""
+"""Largest distance that depth cameras for rooms measure, mm. Values with low bits must decode to nearer distances;
+low bits that number persons (Microsoft's first driver) do not. A unit is wrong if a twentieth is beyond."""
 FACTORS = (2, 3, 5, 7, 11, 13)
 """If all millimetres are multiples of one of these factors, the images have another unit."""
 PLAUSIBLE = (256, 8000)
-"""Range of the median distance, mm: from the limit of 8-bit depth times 8 to the limit of a camera for rooms."""
+"""Range of the median distance, mm: from 8-bit depth times 8 to the limit of a camera for rooms."""
 DENSE = 0.9
-"""Largest share of the millimetres in a range that occur in rotated depth. The steps of a depth camera grow with the
-distance; a coarse unit has constant steps."""
+"""Largest share of the millimetres in a range that occur in rotated depth: steps of a camera grow with distance,
+steps of a unit are constant."""
 SAMPLED = 5
 """Number of evenly spread frames in the test."""
 SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"

@@ -24,18 +24,14 @@ from dudmap.io.sequences.intrinsics import camera_values
 class TumSequence(ImageFolder):
     """Recording with rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
 
-    Without rgb.txt, and without a folder rgb/, it is a recording of depth alone.
+    Without rgb.txt and a folder rgb/ it is a recording of depth alone. associations.txt (``t_rgb rgb_file t_depth
+    depth_file``) pairs images; else they pair one to one, nearest first, at most 20 ms apart. The timestamp of a frame
+    is that of its depth image.
 
-    associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images. Without it they are
-    associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is the timestamp of its depth
-    image.
-
-    Intrinsics come from ``camera``, else from a file, else from a name with freiburg1-3. This is the name of the
-    folder, or of the bag in the header of rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``). Coefficients in
-    intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
-
-    The published distortion of freiburg1 and 2 is not used. It describes the colour lens, but the driver reprojected
-    the depth for a lens without distortion, so that undistorting both would distort correct depth.
+    Intrinsics come from ``camera``, else from a file, else from freiburg1-3 in the name of the folder, or of the bag in
+    rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``). Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are applied
+    to both images. The published distortion of freiburg1 and 2 is not used: it describes the colour lens, but the
+    driver reprojected the depth for a lens without distortion.
     """
 
     format = "TUM RGB-D"
@@ -133,10 +129,8 @@ BONN_NAME = re.compile("rgbd_bonn", re.IGNORECASE)
 
 
 def holds_bonn_markers(path: Path) -> bool:
-    """Whether a file of true poses is the one of a Bonn recording as published, by its name and its folder's.
-
-    Camera poses that dudmap writes (for runs and cleaned recordings) have a header that the published files lack.
-    """
+    """Whether true poses are a Bonn recording's as published, by the names of file and folder; files of dudmap have
+    a header."""
     inside = path.name == "groundtruth.txt" and BONN_NAME.search(path.resolve().parent.name)
     named = BONN_NAME.search(path.name) and re.search("gt|ground", path.name, re.IGNORECASE)
     return bool(inside or named) and path.is_file() and not read_text(path).startswith(TUM_HEADER)
@@ -216,8 +210,8 @@ CAMERA_FRAME, BODY_FRAME = "d400_color_optical_frame", "base_link"
 class OpenLorisSequence(ImageFolder):
     """Folder of OpenLORIS-Scene (Shi et al. 2020) in the "package" form: a RealSense D435i on a robot.
 
-    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds robot poses (``base_link``);
-    camera poses follow from the transform tree in trans_matrix.yaml.
+    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds poses of ``base_link``; camera
+    poses follow from trans_matrix.yaml.
     """
 
     format = "OpenLORIS-Scene"

@@ -1,7 +1,7 @@
 """Bags that were not closed: the recorder was killed, the power failed, or a copy was cut off.
 
-The index of an MCAP file or ROS 1 bag lies at its end. A new index is made from the complete chunks and read as if it
-followed them. The file itself is not changed. Content that violates the format raises a ``ValueError``.
+A new index, which an MCAP file or ROS 1 bag has at its end, is made from the complete chunks and read as if it followed
+them. Content that violates the format raises a ``ValueError``.
 """
 
 import io

@@ -1,7 +1,7 @@
 """Loops over points seen by two frames: intensity and depth differences, and their derivatives.
 
-Points are processed in stages, like the rows of a registration. Loads and rejection tests are separate loops. The
-remaining points fill rows without gaps, so that their arithmetic is vectorised.
+Loads and rejection tests are separate loops. The remaining points fill rows without gaps, so that their arithmetic is
+vectorised.
 """
 
 import numpy as np
@@ -255,11 +255,10 @@ def linearize_pair(
 ):  # fmt: skip
     """Normal equations of the differences between two frames at the points of the first.
 
-    Both intensities show the same texture. Therefore the texture gradient in the second image is the mean of both
-    images' gradients. With the affinity A given by the surface tangents, a step d_i in the first image is a step A d_i
-    in the second. The derivative by a parameter is g (d_j - A d_i), with the texture gradient g. The difference of the
-    separate derivatives would consist mostly of noise. It would make the normal equations too large, and steps and
-    covariances too small.
+    Both intensities show the same texture, so its gradient g in the second image is the mean of both images' gradients.
+    With the affinity A of the surface tangents, a step d_i in the first image is a step A d_i in the second, and the
+    derivative by a parameter is g (d_j - A d_i). The difference of separate derivatives would be mostly noise, which
+    makes steps and covariances too small.
 
     Args:
         points: (n, 3) float32, camera of the first depth image.
@@ -278,10 +277,10 @@ def linearize_pair(
         gain, bias: The second intensity is gain times the first plus bias.
         step: Depth differences beyond this share of the depth belong to another surface.
         noise: SensorNoise, of float32.
-        by_color: Reciprocal standard deviation of the intensity difference.
-        by_depth: Reciprocal standard deviation of the depth difference in units of ``noise``.
+        by_color, by_depth: Reciprocal standard deviations of the intensity difference, and of the depth difference in
+            units of ``noise``.
         huber: Constant of the robust weight, standard deviations.
-        begin: First unknown to compute: 0, or SHARED for a known calibration; earlier ones stay 0.
+        begin: First unknown to compute: 0, or SHARED for a known calibration.
         residuals: (2, n) float32 out: intensity difference, depth difference over ``noise``; NaN = none.
         H: (UNKNOWNS, UNKNOWNS) float64 out.
         b: (UNKNOWNS,) float64 out, gradient.

@@ -18,8 +18,8 @@ ROUNDS = 2.0, 1.0, 1.0
 """Inlier thresholds of the refinement rounds, as multiples of the usual threshold. The first is wider because a
 hypothesis comes from three noisy corners."""
 REGULAR = 1e-9
-"""Added to the diagonals of linear systems: absolutely for samples with a repeated point, whose hypotheses get no
-support; relative to the trace for least squares."""
+"""Added to the diagonals of linear systems: absolutely for samples with a repeated point, relative to the trace for
+least squares."""
 
 
 class ConsensusParams(NamedTuple):
@@ -224,8 +224,8 @@ def score(start, stop, motions, found, params, scores):
     """MSAC scores (g, k) of the motions ``start`` to ``stop`` at each noise level (Torr and Zisserman 2000), times a
     prior.
 
-    The score is gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)). e_n is the
-    reprojection error and d the mean distance of the pixels from the expected ones.
+    gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)), with the reprojection
+    error e_n and the mean distance d of the pixels from the expected ones.
     """
     points, targets, expected, weights, intrinsics = found
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]

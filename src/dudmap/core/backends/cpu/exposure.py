@@ -21,15 +21,12 @@ def fit_exposure(
     weights: NDArray[np.float32],
     ceiling: float = HIGHEST,
 ) -> tuple[float, float]:
-    """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
+    """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit without
+    saturated pixels.
 
-    Auto-exposure changes all intensities at once; without this model it would look like motion. Saturated pixels are
-    excluded.
-
-    If the fit changes the median or the contrast by more than LARGE_GAIN, it is unreliable: its prior outweighs the low
-    contrast of a dark image, and misaligned pixels flatten it. A second candidate then comes from the quartiles of both
-    images, which do not depend on alignment. A second fit corrects it, if the correction is below LARGE_GAIN. The
-    candidate with the smaller median error is returned.
+    A change of the median or the contrast by more than LARGE_GAIN makes the fit unreliable: its prior outweighs a dark
+    image, and misaligned pixels flatten it. A second candidate then comes from the quartiles of both images, corrected
+    by a second fit if that correction is below LARGE_GAIN. The smaller median error wins.
 
     Args:
         intensity: (h, w) float32 of the image.

@@ -42,11 +42,10 @@ def between(z, a, b, gap):
 
 @kernel
 def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
-    """Remove flying pixels, which lie between a foreground and a background; they become 0.
+    """Remove flying pixels, which measure a depth between foreground and background; they become 0.
 
-    A pixel that receives light from two surfaces measures a depth between them. It lies behind one neighbour and in
-    front of the other, one or two pixels away in its row or column. The test requires differences above
-    ``max(noise_floor, noise z^2) + slope z``, which no measurable surface has.
+    Such a pixel lies behind one neighbour and in front of the other, one or two pixels away in its row or column, by
+    more than ``max(noise_floor, noise z^2) + slope z``, which no measurable surface does.
 
     Args:
         noise, noise_floor: Tolerance, 1/m and metres.
@@ -98,12 +97,9 @@ def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
 def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
 
-    A missing pixel is filled under two conditions:
-    1. Its run of missing pixels, in the row or the column, is at most LONGEST_RUN long and ends on one surface.
-    2. Its 5x5 neighbourhood has at least MIN_NEIGHBOURS measurements within ``max(noise_floor, slope z^2)``.
-
-    Therefore depth edges, with larger differences, are not bridged. Large holes keep their border, because their runs
-    are longer in both directions.
+    A missing pixel is filled if its run of missing pixels, in the row or the column, is at most LONGEST_RUN long and
+    ends on one surface, and its 5x5 neighbourhood has at least MIN_NEIGHBOURS measurements within ``max(noise_floor,
+    slope z^2)``. Depth edges are thus not bridged, and large holes keep their border.
 
     Args:
         slope: Largest depth range over squared depth, 1/m.

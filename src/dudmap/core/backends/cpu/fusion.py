@@ -1,7 +1,6 @@
 """Fusion of a depth image in two compiled calls: the blocks that it touches, and averaging into the blocks in view.
 
-Between the calls the map allocates voxels for the touched blocks. Threads share the bands of each step (``teams.py``);
-all steps have ``BANDS`` of them.
+Between them the map allocates voxels. Threads share the ``BANDS`` bands of each step (``teams.py``).
 """
 
 import numpy as np
@@ -47,9 +46,6 @@ def touch(
     stamps, p, depth, nearest, farthest, valid, weights, found, counts, largest,
 ):  # fmt: skip
     """Prepare an image for fusion, and find the window cells without voxels that its truncation bands touch.
-
-    The first step of the team copies the used depths and computes the depth tiles. The second computes weights and
-    marks the cells.
 
     Args:
         image: (H, W) float32, metres, 0 = none.
@@ -112,10 +108,7 @@ def fuse(
     farthest, valid, pixels, words, geometry, colors, parameters, parity, window, shape, origin, free_count,
     free_after, slots, repeats, visible, occupied, found, counts,
 ):  # fmt: skip
-    """Average an image into the blocks in view, and observe free space.
-
-    The first step of the team packs the pixels and finds the blocks in view. The second fuses into them and visits
-    every second plane of the window for empty blocks.
+    """Average an image into the blocks in view, and observe free space in every second plane of the window.
 
     Args:
         candidates, fused, turn: As for ``visible_slots``.
@@ -127,8 +120,7 @@ def fuse(
         geometry, colors, parameters: As for ``integrate_blocks``.
         parity: First visited plane; negative = none.
         window, shape, origin, free_count, free_after: As for ``observe_free``.
-        slots, repeats: (n,) int32 and float32 out, blocks in view, and number of frames that this frame stands for in
-            each.
+        slots, repeats: (n,) int32 and float32 out, blocks in view, and number of frames that this frame stands for.
         visible: (BANDS + 1,) int64 out, blocks in view per band, and their total.
         occupied: (n,) int32 out, see ``integrate_blocks``.
         found: (BANDS, n) int32 out, empty cells without an entry; ``counts`` (BANDS,) int64 out.

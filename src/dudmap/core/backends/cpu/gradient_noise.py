@@ -111,8 +111,7 @@ def noise_information(
 ):  # fmt: skip
     """Sums of ``noise_sums``, and the information (2, 6, 6) that the noise of distances and of intensities adds to H.
 
-    Returns whether H exceeds ``least`` times the noise information in every direction, that is, whether the difference
-    is positive definite.
+    Returns whether H minus ``least`` times the noise information is positive definite.
 
     Args:
         stride, depth, residuals, weights, intrinsics, parameters, sums: As for ``noise_sums``.

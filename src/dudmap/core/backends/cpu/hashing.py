@@ -1,7 +1,7 @@
 """Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
 
-Open addressing with linear probing and any table size; a cell holds an entry's number or -1. Entries are never removed:
-a block that becomes free space keeps its entry and releases its voxels.
+Open addressing with linear probing; a cell holds an entry's number or -1. Entries are never removed: free space keeps
+its entry without voxels.
 """
 
 import numpy as np

@@ -13,8 +13,8 @@ f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
 """Image rows per band of the upsampling."""
 DISTANCE_COST = np.float32(1e-4)
-"""Cost of one low-resolution pixel of image distance in the upsampling, metres of depth difference. It is below the
-resolution of depth sensors, so that image distance decides only between equal depths."""
+"""Cost of a low-resolution pixel of image distance in the upsampling, metres: below the resolution of depth, so that
+it decides between equal depths only."""
 SMALLEST = np.float64(1e-300)
 """Smallest sum of two densities; keeps the quotient finite if both vanish."""
 MISSING_COST = np.float32(64)
@@ -103,8 +103,7 @@ def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds,
         max_sigma: Largest standard deviation of the dynamic density.
 
     Returns:
-        Prior of the dynamic density, standard deviations of the static and of the dynamic density; ``start`` for an
-        empty histogram.
+        As ``start``, which is returned for an empty histogram.
     """
     total = counts.sum()
     prior, static, dynamic = start
@@ -232,8 +231,8 @@ def upsample_labels(
         low: (h, w) bool.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
-        stride: Full-resolution pixels per low-resolution pixel; low-resolution pixel k covers columns (and rows) k *
-            stride to (k + 1) * stride - 1.
+        stride: Full-resolution pixels per low-resolution pixel k, which covers columns (and rows) k * stride to (k + 1)
+            * stride - 1.
 
     Returns:
         (H, W) bool.

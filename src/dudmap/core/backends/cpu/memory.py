@@ -8,8 +8,7 @@ from numba.extending import intrinsic
 from dudmap.core.backends.threads import scalar
 
 LINES = 16
-"""Cache lines per call of ``prefetch_quarter``, a quarter of a block of 512 words. Most cores can have this many
-loads pending; more would delay the following loads."""
+"""Cache lines per call of ``prefetch_quarter``: a quarter of a block. Most cores can have this many loads pending."""
 LINE = 64
 """Bytes of a cache line of most processors."""
 

@@ -1,10 +1,9 @@
 """Marching cubes over voxel blocks with shared vertices (Lorensen & Cline 1987; thesis section 4.5).
 
-A vertex belongs to its lattice edge, and an edge to the voxel at its lower end, so that every vertex exists once, even
-between blocks. There are four passes over the blocks: cases of the cells, vertices owned by each voxel, and then, with
-the block offsets known, vertices and triangles.
+A vertex belongs to its lattice edge, and an edge to the voxel at its lower end, so that every vertex exists once.
+Passes over the blocks: cases of the cells, vertices of each voxel, vertices, triangles.
 
-The tables are arguments, because a global array is frozen into compiled code and Numba's cache ignores its changes.
+The tables are arguments, because Numba freezes global arrays and its cache ignores their changes.
 """
 
 import numpy as np

@@ -1,8 +1,7 @@
 """The eight voxels around points of the map, for trilinear interpolation.
 
-For two thirds of all points one block holds all eight voxels, and four loads of two words fetch them. A branch on this
-would be mispredicted for every third point. Therefore the other third of a row is listed without a branch, and looked
-up separately afterwards. The voxels of later points in the row are prefetched.
+Two thirds of all points have their voxels in one block: four loads of two words. A branch would be mispredicted, so the
+other third of a row is listed and looked up afterwards. The voxels of later points are prefetched.
 """
 
 import numpy as np
@@ -19,8 +18,8 @@ def load_corners(window, geometry, cell, voxel, size_y, size_z, corners, u):
     """Load the words of the eight voxels around a point into ``corners[:, u]``, int32, corner 4 dx + 2 dy + dz; 0 =
     unknown.
 
-    ``cell`` and ``voxel`` identify the voxel at the lower corner. ``corners`` has two axes, because eight consecutive
-    words would be read by one vector load, which waits for all stores.
+    ``cell`` and ``voxel`` identify the lower corner. Two axes, because one vector load of eight words would wait for
+    all stores.
     """
     # 1 along the axes whose next voxel lies in the next block
     x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3
@@ -71,8 +70,6 @@ def locate(x, y, z, last, size_y, size_z):
 @scalar
 def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
-
-    The third of the points with voxels in several blocks is looked up separately.
 
     Args:
         window, shape, geometry: See ``VoxelGrid``; ``geometry`` is flat.

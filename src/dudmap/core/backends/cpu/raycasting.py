@@ -1,7 +1,7 @@
 """Rendering of the map at a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
 
-Blocks are first splatted into an image of tiles with the depth range in which a surface can lie (Prisacariu et al.
-2017). A ray then starts just before the first block and ends behind the last one.
+Blocks are first splatted into tiles with the depth range of possible surfaces (Prisacariu et al. 2017), which bounds
+each ray.
 """
 
 import numpy as np
@@ -274,9 +274,9 @@ def raycast(
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface at each pixel of an image (H, W).
 
-    A surface is a change of the signed distance from positive to negative between trusted voxels. A ray that enters the
-    inside directly from unknown space hits no surface. With several voxel sizes, ``grid`` holds the largest voxels, and
-    the smallest known ones are used.
+    A surface is a change of the signed distance from positive to negative between trusted voxels; a ray from unknown
+    space into the inside hits none. ``grid`` holds the largest of several voxel sizes; the smallest known voxels are
+    used.
     """
     grid = grid.on_host()
     shape = grid.shape

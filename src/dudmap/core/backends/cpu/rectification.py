@@ -49,9 +49,8 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
 def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, words, out, colors, sources):
     """Depth, and colours, of each pixel at the time of the middle row, for a team of threads (``teams.py``).
 
-    A pixel of the rectified image shows the recorded pixel to which its point moves until that row is read out. The
-    point takes the depth recorded at the rectified pixel's own position. This matters if the camera moves along a depth
-    edge.
+    A rectified pixel shows the recorded pixel to which its point moves until that row is read out. The point takes the
+    depth recorded at its own position.
 
     Args:
         rows: Rows of a band.
@@ -78,11 +77,8 @@ def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, wo
 
 @kernel
 def recorded_mask(mask, sources, out):
-    """Mask (H, W) bool of a rectified image in the geometry of the recorded one, into ``out``.
-
-    The displacement of a recorded pixel is approximated by the negative displacement at the same rectified pixel. The
-    displacement changes by less than a pixel over its own length.
-    """
+    """Mask (H, W) bool of a rectified image in the geometry of the recorded one, into ``out``. A displacement is
+    approximated by the negative one at the same rectified pixel, which differs by less than a pixel."""
     h, w = np.int32(mask.shape[0]), np.int32(mask.shape[1])
     flat, by_width, places = mask.reshape(-1), 1 / np.float64(w), np.empty(w, np.int32)
     for v in range(np.int32(0), h):

@@ -1,8 +1,7 @@
 """Direct SDF and intensity registration (thesis eq. 4.27-4.47): one linearisation, and the descent of a level.
 
-A row of pixels is processed in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
-vector arithmetic for residuals and sums. No stage mixes loads and branches, so that LLVM vectorises the first and the
-last on every CPU.
+A row is processed in three stages: arithmetic for addresses, loads of eight voxels into buffers, arithmetic for
+residuals and sums. No stage mixes loads and branches, so that LLVM vectorises the first and the last.
 """
 
 import numpy as np

@@ -1,8 +1,7 @@
 """Lossless compression of depth images by run lengths and variable-length differences (RVL; Wilson 2017).
 
-An image is a sequence of runs: number of zeros, number of other values, and the values as differences to the previous
-value. All numbers are written as groups of three bits, lowest first, with a fourth bit for continuation. Eight groups
-make a word of 32 bits, highest first. RVL takes a fifth of the time of PNG.
+Runs: number of zeros, number of other values, and these as differences to the previous value. Numbers are groups of
+three bits, lowest first, with a fourth bit for continuation; eight groups make a word of 32 bits, highest first.
 """
 
 import struct

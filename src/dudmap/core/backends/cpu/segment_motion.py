@@ -10,8 +10,8 @@ from dudmap.core.backends.parameters import SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar
 
 MAX_SHARE = 0.15
-"""Largest share of the image covered by a movable segment. Larger segments belong to the room; they are dynamic only
-if nearly all of their pixels are."""
+"""Largest share of the image of a movable segment. Larger ones belong to the room: dynamic only if nearly all of
+their pixels are."""
 MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
 """Smallest share of dynamic pixels for a dynamic segment: with evidence that the other pixels moved as well, and
 without."""
@@ -22,8 +22,7 @@ DISTANCE_SCALE = 1.0
 MISMATCH_SCALE = 1 / 3
 """Intensity mismatch of a segment that has moved, pixels of motion at REFERENCE_WIDTH."""
 COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
-"""Upper quartiles of both over the static segments of a well registered frame. If the quartiles of a frame are
-larger, the scales grow in proportion."""
+"""Upper quartiles of both over the static segments of a well registered frame; larger ones scale the limits."""
 GRADIENT_NOISE = 0.03
 """Intensity gradient of noise, per pixel at REFERENCE_WIDTH; smaller gradients give no evidence."""
 SETTLED_SIGMAS = 4
@@ -168,17 +167,18 @@ def upper_quartile(values):
 def classify_segments(evidence, before, min_pixels):
     """Segments that move as a whole, (count + 1,) bool.
 
-    A segment of at least ``min_pixels`` is dynamic in two cases:
-    - At least NEARLY_ALL of its pixels are dynamic.
-    - It covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and its static pixels
+    A segment of at least ``min_pixels`` is dynamic
+
+    - if at least NEARLY_ALL of its pixels are dynamic, or
+    - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and its static pixels
       have moved as well.
 
     With the mean distance s and the intensity mismatch m, static pixels have moved if
 
         (s / S)^2 + (m / M)^2 >= 1,    or 1/2 if most of the segment was dynamic in the last frame.
 
-    The scales are S = DISTANCE_SCALE and M = MISMATCH_SCALE. They grow in a badly registered frame, if the upper
-    quartile of |s| or m over its static segments exceeds COMMON_DISTANCE or COMMON_MISMATCH, in proportion to it.
+    S = DISTANCE_SCALE and M = MISMATCH_SCALE grow in proportion if the upper quartile of |s| or m over the static
+    segments exceeds COMMON_DISTANCE or COMMON_MISMATCH.
 
     Args:
         evidence: (count + 1, 5) of each segment.

@@ -3,11 +3,9 @@
 Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz). Bit k of a case is set if corner k is inside (sdf <
 0). An edge is a pair (corner, axis) of its lower end and its direction.
 
-On each face of the cell the surface consists of one or two segments between crossed edges. They depend only on the four
-signs of that face; on an ambiguous face each inside corner gets its own segment. Therefore neighbouring cells agree on
-their common face, and the mesh has no cracks. The segments form closed loops, which are triangulated without diagonals
-inside a face. Such a diagonal could coincide with a diagonal of the neighbour, so that an edge would have four
-triangles.
+On each face the surface is one or two segments between crossed edges, which depend on the signs of that face only; on
+an ambiguous face each inside corner gets its own. Neighbours therefore agree, and the mesh has no cracks. The segments
+form closed loops, triangulated without diagonals inside a face: these could coincide with the neighbour's.
 """
 
 import itertools

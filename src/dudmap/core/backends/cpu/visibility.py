@@ -21,11 +21,8 @@ def mark_blocks(
 ):  # fmt: skip
     """Window cells of blocks without voxels that the truncation bands of a depth image touch.
 
-    A known free block gets voxels only within the fixed part of the band. In the part that grows with the noise, blocks
-    would appear and vanish with every frame.
-
-    A row of pixels advances along its rays step by step: addresses are computed for the whole row before cells are
-    read.
+    A known free block gets voxels only within the fixed part of the band: in the part that grows with the noise, blocks
+    would appear and vanish. Addresses of a whole row are computed before cells are read.
 
     Args:
         row_start, row_stop, stride: Rows of the band, and the step between pixels.
@@ -119,9 +116,8 @@ def visible_slots(
 ):  # fmt: skip
     """Slots of the blocks that a depth image can change and that are updated in this frame.
 
-    A block alternates if the sensor noise is wider than the band and SETTLED frames, enough for a stable mean, have
-    been fused into it. It is updated in every second frame with double weight. Half of these blocks are updated in even
-    frames, the other half in odd ones.
+    A block alternates if the sensor noise is wider than the band and SETTLED frames have been fused into it: it is
+    updated in every second frame with double weight, half of these blocks in even frames.
 
     Args:
         slots: (n,) int32 candidates.
@@ -182,10 +178,9 @@ def observe_free(
     x_start, x_stop, x_step, window, shape, origin, T, intrinsics, size, block_size, nearest, valid, band, depth_max,
     counts, repeats, free_after, found,
 ):  # fmt: skip
-    """Add observations of emptiness to window cells without voxels that lie entirely in front of all surfaces of a
-    depth image. Cells without an entry are listed instead.
+    """Add observations of emptiness to window cells without voxels in front of all surfaces of a depth image.
 
-    Works on columns of the window, so that only the view frustum is visited.
+    Cells without an entry are listed instead. Columns outside of the view frustum are skipped.
 
     Args:
         x_start, x_stop, x_step: Window planes of this call.

@@ -1,8 +1,8 @@
 """The scalar formulas of the CPU kernels (``dudmap/core/backends/cpu``), compiled by Warp from the same source.
 
-A function for Numba is plain Python on float32 and int32 numbers. ``warp_function`` replaces the globals of its code
-object by their Warp counterparts and passes it to ``wp.func``. This file defines the operations that Warp lacks: ``&``
-and ``|`` of two booleans, and parts of a packed word.
+``warp_function`` replaces the globals of the code object of a plain function on float32 and int32 by their Warp
+counterparts and passes it to ``wp.func``. This file defines the operations that Warp lacks: ``&`` and ``|`` of two
+booleans, and parts of a packed word.
 """
 
 import inspect
