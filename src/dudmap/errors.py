@@ -4,7 +4,7 @@ A message is one sentence that states the finding, the expectation and the remed
 """
 
 LARGEST_MESSAGE = 2000
-"""Most characters of a message, because messages quote lines of damaged files, which may have a hundred megabytes."""
+"""Most characters of a message: messages quote lines of damaged files."""
 
 
 def printable(text: object) -> str:

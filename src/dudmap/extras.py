@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from dudmap.errors import MissingExtraError
 
 STUDY = ("pyDOE3", "statsmodels", "optuna", "pandas", "threadpoolctl")
-"""Modules of the extra ``study``."""
 
 
 @contextmanager

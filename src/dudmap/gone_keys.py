@@ -64,7 +64,7 @@ LENGTHS = {
     "loops.min_distance": 1, "movers.merge_distance": 1, "movers.max_jump": 1, "tracker.tukey": 1,
     "dynamics.threshold": 1, "tracker.stop": 1, "tracker.stop_coarse": 1,
 }  # fmt: skip
-"""Exponent of the size of the scene in such a value, which earlier versions scaled (``dudmap.ranges``)."""
+"""Exponent of the size of the scene in such a value (``dudmap.ranges``)."""
 
 
 def without_gone(tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -31,11 +31,11 @@ from numpy.typing import NDArray
 from dudmap.errors import DudmapError
 
 LARGEST_TEXT = 2**28
-"""Largest text file, bytes: poses of 100 hours at 30 frames a second have 1 GB, an hour has 10 MB."""
+"""Largest text file, bytes: poses of 100 hours at 30 Hz have 1 GB."""
 LARGEST_TREE = 2**26
 """Largest JSON file, bytes; transforms.json with 10 000 frames has 5 MB."""
 LARGEST_TOML = 2**20
-"""Largest TOML file, bytes: all parameters with their meanings have 30 kB; this size takes 1 s to parse."""
+"""Largest TOML file, bytes: all parameters have 30 kB; this takes 1 s to parse."""
 LARGEST_COUNT = 2**23
 """Largest number of values of a JSON text, less than 1 GB. transforms.json with 10 000 frames has 200 000."""
 DEEPEST = 64
@@ -45,8 +45,7 @@ LARGEST_FILE = 2**28
 LARGEST_ARCHIVE = 2**36
 """Largest content of a NumPy archive, bytes. A map of 16 million voxel blocks has 64 GiB."""
 LARGEST_RATIO = 100
-"""Largest unpacked over packed size of an archive. Images hardly shrink, maps and depth as text shrink to a tenth;
-deflate reaches 1000."""
+"""Largest unpacked over packed size of an archive: maps shrink to a tenth; deflate reaches 1000."""
 RATIO_FREE_BYTES = 2**26
 """Unpacked size below which the ratio does not matter."""
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
@@ -59,8 +58,8 @@ DAMAGE = (
     ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RecursionError, struct.error,
     zlib.error, lzma.LZMAError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, OSError,
 )  # fmt: skip
-"""Errors of the standard library and NumPy for content that violates its format. ``MemoryError`` is excluded, because
-sizes are limited before memory is allocated."""
+"""Errors of the standard library and NumPy for content that violates its format; sizes are limited before memory is
+allocated."""
 
 
 def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:

@@ -13,8 +13,8 @@ from types import FrameType
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 SECOND = 1.0
-"""Seconds after which another request counts as a second one. Sooner it is a repetition: ``timeout`` sends SIGTERM
-twice, and shell and kernel each send a SIGHUP."""
+"""Seconds after which another request counts as a second one; sooner it is a repetition by ``timeout``, shell or
+kernel."""
 
 
 class _Request:

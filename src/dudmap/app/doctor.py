@@ -17,14 +17,13 @@ from dudmap.extras import install
 from dudmap.version import __version__
 
 COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
-"""Message before a first frame without compiled kernels."""
 
 PYTHON = ((3, 11), (3, 14))
 """First supported version of Python, and first unsupported one."""
 PORT = 8080
 """Port of the page of --view."""
 FEATURES = ("avx2", "fma")
-"""Instruction sets of Intel and AMD processors since 2013 that speed up the kernels."""
+"""Instruction sets of x86-64 processors since 2013 that speed up the kernels."""
 FREE_BYTES = 2**31
 """Smallest free space of a folder: a map and the results of a long run."""
 State = Literal["good", "note", "bad"]

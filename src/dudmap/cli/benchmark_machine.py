@@ -12,7 +12,6 @@ from dudmap.cli.output import answer
 from dudmap.errors import InternalError
 
 RUNS = Path("runs/benchmark")
-"""Folder of the output folders, unless another one is named."""
 
 QuickOption = Annotated[bool, Option("--quick", help="Reduced version for a quick check.")]
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from dudmap.evaluation.trajectory import Align
 
 Figures = dict[str, Any]
-"""Metrics by name and unit; None for a metric that could not be computed."""
 
 
 app = typer.Typer(

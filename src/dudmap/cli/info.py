@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 
 SHOWN_GAPS = 5
-"""Most gaps in the times that are printed one by one."""
 
 
 def info(

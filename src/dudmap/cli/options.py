@@ -33,13 +33,11 @@ GROUPS = {
     "Experiment": "--seed --count --changes --min-size --only --quick --systems --score --keep --max-runs",
     "Advanced": "--system --config --range --set --device --jobs --resume --checkpoint-every --help",
 }
-"""Shared options by their group in the help pages; options of a single command come before all groups."""
 
 METAVARS = {
     "--out": "PATH", "--max-frames": "N", "--jobs": "N", "--seeds": "N", "--count": "N", "--only": "NAMES",
     "--systems": "NAMES", "--width": "PIXELS", "--max-runs": "N",
 }  # fmt: skip
-"""Placeholder values in the help pages for options whose help text differs between commands."""
 
 
 def arranged(command: Any) -> Any:  # noqa: ANN401 - Typer's own types moved between versions

@@ -23,11 +23,9 @@ from dudmap.core.shipped_kernels import KernelCacheWarning as KernelCacheWarning
 _KINDS: dict[str, Any] = {
     kind.__name__.lstrip("_").removesuffix("CacheLocator"): kind for kind in caching.CacheImpl._locator_classes
 }
-"""Numba's locators of a folder, by name; before Numba 0.62 the names had an underscore."""
 
 
 _DAMAGED: type[Exception] = vars(caching)["pickle"].UnpicklingError
-"""Numba's error for a damaged file."""
 
 
 counts = Counter[str]()

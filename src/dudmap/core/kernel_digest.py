@@ -11,7 +11,7 @@ import numpy as np
 from numba.core import types
 
 LIBRARIES = {"builtins", "llvmlite", "math", "numba", "numpy"}
-"""Packages whose functions contribute only their names to a digest."""
+"""Packages whose functions enter a digest by name."""
 PLAIN = (bool, int, float, complex, str, bytes, np.generic, type(None))
 
 

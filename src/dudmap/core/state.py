@@ -11,7 +11,6 @@ from typing import Annotated, Any, TypeVar, get_origin, get_type_hints
 _Type = TypeVar("_Type")
 _MARK = "remembered"
 Remembered = Annotated[_Type, _MARK]
-"""Annotation of an attribute that is part of the state."""
 CACHE = {"state": False}
 """Metadata of a dataclass field that is derived from other fields and not part of the state."""
 

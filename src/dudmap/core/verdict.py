@@ -74,4 +74,3 @@ class Verdict:
 
 
 ACCEPTED = Verdict()
-"""Verdict without checks."""

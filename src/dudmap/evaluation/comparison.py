@@ -36,7 +36,6 @@ COLUMNS = (
     Column("time_offset_s", "time offset, s", 1, 3),
     Column("scale", "scale", 1, 4),
 )
-"""Columns of the table of several estimates."""
 
 
 class Named(NamedTuple):

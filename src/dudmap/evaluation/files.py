@@ -71,7 +71,6 @@ class Clock(NamedTuple):
 
 
 BONN = "bonn"
-"""Name of the format of Bonn's groundtruth.txt, in addition to ``pose_files.FORMATS``."""
 
 
 def load_reference(path: Path) -> Trajectory:

@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
 COLORS = ESTIMATE, SECOND, "#2e8b57", "#d98a00", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5"
-"""Colours of several estimates."""
 LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2, "frameon": False}
-"""Place of a legend: above the axes on the right, off the curves; titles are on the left."""
+"""Above the axes on the right; titles are on the left."""
 
 
 def plot_trajectories(path: Path, scores: list[Score]) -> None:

@@ -21,7 +21,6 @@ from dudmap.evaluation.trajectory import Statistics
 Distances = NDArray[np.float32]
 
 THRESHOLDS = (0.01, 0.02, 0.05)
-"""Default distances of precision and recall, metres."""
 GHOST_DISTANCE = 0.05
 """Distance from the true surface beyond which estimated surface is a ghost, metres: more than noise and a band of a
 few voxels, less than an arm."""

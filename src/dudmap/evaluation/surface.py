@@ -17,11 +17,9 @@ if TYPE_CHECKING:
 Points = NDArray[np.float32]
 
 CANDIDATES = 4
-"""Number of nearest anchors whose triangles are measured exactly."""
 ANCHORS = 400_000
 """Number of additional anchors on large triangles, over the whole surface."""
 BATCH = 200_000
-"""Points measured at a time; bounds the memory."""
 OVERLAP, REACH, ITERATIONS = 0.8, 0.3, 60
 """Registration: share of the estimate with a counterpart, largest distance of a pair (m), largest number of
 iterations."""

@@ -8,13 +8,10 @@ from typing import Any, NamedTuple
 from dudmap.errors import ConfigError
 
 FORMATS = {"md": "md", "csv": "csv", "latex": "tex"}
-"""Ending of a file by the format of its table."""
 
 Cells = list[str] | tuple[str, ...]
-"""Texts of one line of a table."""
 
 Row = dict[str, Any]
-"""One row of a table: sequence, system and metrics by name, or ``error`` with a sentence."""
 
 
 class Column(NamedTuple):

@@ -17,13 +17,13 @@ STEP = LARGEST_STEP / 3
 GRID = STEP / 5
 """Step between the times of the reference's rotations, seconds: the rate of motion capture."""
 WINDOW = 2 * LARGEST_STEP
-"""Time over which rotations are compared, seconds: two times of steady motion."""
+"""Time over which rotations are compared, seconds."""
 SAMPLES = 300
 """Largest number of compared poses of the estimate; temporal neighbours are not independent."""
 SMALLEST_OVERLAP = 0.5
 """Smallest share of the estimate within the time of the reference; short parts agree by chance."""
 CHUNK = 1000
-"""Number of offsets that are compared at a time; bounds the memory to 30 MB."""
+"""Offsets compared at a time: 30 MB."""
 LARGEST_HINT = CHUNK * STEP / 2
 """Largest offset searched for a hint, seconds: the search takes 0.2 s."""
 

@@ -30,13 +30,12 @@ SMALLEST_SPREAD = 1e-3
 """Smallest spread of positions across their principal direction (metres, and share of the spread along it) that
 determines a rotation."""
 LONGEST_STEP = 3.0
-"""Number of median time steps between consecutive poses beyond which they enclose a gap of lost frames."""
+"""Median time steps between consecutive poses beyond which frames were lost."""
 PATH_TOLERANCE = 0.1
 """Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
 
 STATISTICS = "rmse", "mean", "median", "max"
-"""Statistics of trajectory errors in metrics."""
 
 
 class Statistics(NamedTuple):
@@ -323,7 +322,6 @@ def path_figures(estimate: Trajectory) -> dict[str, float]:
 
 
 RUN_FIGURES = "ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
-"""Trajectory metrics in a run's metrics.json."""
 
 
 def accuracy(

@@ -33,9 +33,7 @@ from dudmap.lab.synthetic.visits import TrueChange, visits
 SCENES = {"room": 0.5, "corridor": 0.2, "desk": 0.3}
 THINGS = {"box": 0.35, "bin": 0.15, "ball": 0.1, "chair": 0.15, "shelf": 0.08, "poster": 0.1, "door": 0.07}
 LARGE = ("chair", "shelf", "door")
-"""Things that do not fit on a desk."""
 ONCE = ("door", "poster")
-"""Things that occur at most once in a scene."""
 KINDS = {"moved": 0.45, "appeared": 0.275, "disappeared": 0.275}
 PATHS = ("handheld", "pan", "orbit", "dolly")
 NONE, PEOPLE, LIGHT = 0.2, 0.2, 0.3
@@ -49,7 +47,6 @@ LEAST_SHARE = 0.5
 IOU_CELL = 0.04
 """Edge of the cells that compare found and true surface, metres."""
 SMALL = 0.15
-"""Longest edge of a small thing, metres."""
 FRAMES, FPS, SIZE = 60, 12.0, (320, 240)
 
 

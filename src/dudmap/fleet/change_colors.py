@@ -17,7 +17,7 @@ CELL, CELL_VOXELS = 0.05, 4
 AROUND = 0.6
 """Radius of constant light, metres; a poster fills less than half of it."""
 LEAST_POINTS, LEAST_AROUND = 6, 12
-"""Fewest vertices of a compared cell, and fewest cells around it that determine the light."""
+"""Fewest vertices of a compared cell, and fewest cells that determine the light."""
 LEAST_DIFFERENCE = 20.0
 """Smallest difference of changed cell colours, grey levels; the limit of agreeing cells in a merge."""
 CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0

@@ -23,11 +23,11 @@ from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS = 20_000, 1000
-"""Random pairs of points; start motions taken from the pairs of similar colour and slope."""
+"""Random pairs of points; start motions taken from them."""
 RANKED, COARSE, FINE = 60, 300, 1500
 """Surface points for ranking starts, for the coarse registration, and for the fine registration and its score."""
 TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
-"""Starts registered coarsely; motions registered finely; motions closer than this are one motion (m, degrees)."""
+"""Starts registered coarsely; motions registered finely; distance of one motion (m, degrees)."""
 ICP_ROUNDS, STOP = 20, 1e-3
 """Steps of a registration, and the twist (m, rad) that ends it."""
 TILT = np.radians(0.3)
@@ -40,7 +40,6 @@ PATCH, DEVIATIONS_APART = 0.05, 2.0
 COLOR_LENGTH = 0.3
 """Length equivalent to black minus white in the neighbour search (Johnson and Kang 1997), share of the size."""
 COLOR_GATE = 50.0
-"""Largest colour difference of matched points, grey levels."""
 COLOR_SCALE = 15.0
 """Colour difference at which the Cauchy weight of a match falls to one half, grey levels."""
 PULL = 0.05

@@ -18,13 +18,10 @@ from dudmap.fleet.changes import Change
 TINTS = {
     "appeared": (60, 200, 90), "disappeared": (230, 60, 60), "moved": (60, 130, 255), "recoloured": (220, 120, 230),
 }  # fmt: skip
-"""Colour of each kind; unknown surface keeps its own."""
 STRENGTH = 0.65
 """Share of the tint in the colour of changed surface."""
 TRIANGLES = 120_000
-"""Most triangles of each map in the page."""
 PICTURES = 40
-"""Most changes with pictures."""
 
 
 def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:

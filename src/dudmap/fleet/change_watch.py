@@ -28,7 +28,7 @@ CELL = 0.05
 COLUMNS = 80
 """Pixels per image row that are compared."""
 FRAMES, SECONDS = 6, 0.75
-"""Frames for a change, minus frames against it, and the time they must span. The time excludes passers-by."""
+"""Frames for a change, minus frames against it, and the time they must span, seconds, to exclude passers-by."""
 LEAST_CELLS = 3.0
 """Smallest reported change in cells, in multiples of the cells on a face of the smallest size."""
 KINDS = ("appeared", "disappeared")

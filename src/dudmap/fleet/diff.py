@@ -22,9 +22,8 @@ from dudmap.own_folder import make_folder, remove_files
 
 CHANGES_FILE, REPORT = "changes.json", "report.html"
 WRITTEN = {"": r"changes\.json|report\.html", "changes": r"\d+\.ply"}
-"""Regular expressions of all file names of a comparison, by sub-folder; the next comparison removes these files."""
+"""Regular expressions of all file names of a comparison, by sub-folder."""
 BEST_FRAMES = 3
-"""Frames of each visit that are named per change."""
 
 
 def diff_runs(

@@ -38,7 +38,6 @@ CELL_BITS = 12
 RANGE_BLOCKS = 6000
 """Blocks with voxels per range: 110 MB of sums, and half as many again for the surrounding blocks."""
 MAP_FOLDER = "map"
-"""Folder of the map files of the ranges."""
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 

@@ -28,10 +28,8 @@ SAME_DISTANCE, SAME_ANGLE_DEG = 0.1, 4.0
 """Keyframe pairs vote for one relative pose within this distance (m, deg) of either camera; a pair is accurate to
 centimetres and a degree."""
 MAX_HYPOTHESES = 5
-"""Most relative poses returned."""
 
 SURFACE_POINTS = 20_000
-"""Surface points of each map for the alignment and the checks."""
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
 """Keyframes that must be recognised at one relative pose; a single one needs this many features. Look-alike places
 reach 200."""

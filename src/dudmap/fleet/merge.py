@@ -51,7 +51,7 @@ WRITTEN = {
     "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
     MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
 }  # fmt: skip
-"""Regular expressions of all file names of a world, by sub-folder. The next merge removes these files."""
+"""Regular expressions of all file names of a world, by sub-folder."""
 
 
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:

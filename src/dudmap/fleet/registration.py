@@ -33,22 +33,21 @@ WORDS = 16
 TRAINING = 50_000
 """Most features that train the words: 3000 per word."""
 COMPONENTS, WHITENING = 256, 0.25
-"""Principal components kept, and the exponent of their variances in the whitening; 0.5 would also amplify noise."""
+"""Principal components kept, and the exponent of their variances in the whitening; 0.5 would amplify noise."""
 LEAST_VARIANCE = 1e-6
-"""Added to each variance because copies of one run have none; all variances sum to at most 1."""
+"""Added to each variance because copies of one run have none."""
 NEIGHBOURS, LEAST_VOTE = 20, 1e-4
 """Runs that a keyframe votes for, more if equally similar, and its vote for the last of them."""
 PARTNERS = 8
-"""Runs that each run is compared with; several, because similar places compete with the run's neighbours."""
+"""Runs that each run is compared with; similar places compete with neighbours."""
 
 ALL_PAIRS = PARTNERS
-"""Number of runs up to which all pairs are compared, because the index would exclude hardly any."""
+"""Number of runs up to which all pairs are compared."""
 Guesses = dict[tuple[int, int], NDArray[np.float64]]
-"""Relative pose from the graph at which a pair was compared."""
 ROUNDS = 4
 """Most rounds; the third and fourth are small."""
 MIN_PREDICTED = 0.3
-"""Smallest predicted overlap for a comparison, as a share of the smaller map."""
+"""Smallest predicted overlap for a comparison, share of the smaller map."""
 CELL = 0.3
 """Edge of the cells in which overlap is counted, metres: many times the error of a pose."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
@@ -115,7 +114,6 @@ def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 Pairs = dict[tuple[int, int], MapPair]
-"""Results of comparing pairs (a, b) of runs, a < b."""
 
 
 def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:

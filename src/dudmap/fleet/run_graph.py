@@ -113,7 +113,6 @@ class Join:
 
 
 Cycle = list[tuple[Join, int]]
-"""Joins around a cycle, each with the run that it starts at."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,9 @@ from types import TracebackType
 from dudmap.core.objects.moving_objects import MOST_WAITING
 
 WAITING = 2
-"""Most jobs that wait for the other thread; each holds the images of a frame."""
+"""Most waiting jobs; each holds the images of a frame."""
 POSTPONED = MOST_WAITING
-"""Most jobs that wait for an idle moment: one second of frames. A live run without idle moments discards moving objects
-of older frames (``MovingObjects``), not frames."""
+"""Most jobs that wait for an idle moment: one second of frames. Live runs discard older moving objects, not frames."""
 
 
 class Background:

@@ -33,16 +33,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 START_FRAMES, MIN_FRAMES = 300, 90
-"""Frames at the start of a recording that calibrate a run, and fewest such frames. The estimator compares pairs of
-keyframes from both halves."""
+"""Frames at the start of a recording that calibrate a run, and fewest such frames."""
 WIDTH, INTERVAL = 320, 1 / 30
-"""Width (pixels) and largest interval (s) of the tracked images. Compared depth images are 160 and colour images at
-most 320 wide. A keyframe's velocity is the mean over two intervals: longer ones reduce pose noise and add shake."""
+"""Width (pixels) and largest interval (s) of the tracked images. A keyframe's velocity is the mean over two
+intervals: longer ones reduce pose noise and add shake."""
 SPACING, SHORT = 0.2, 5.0
-"""Time between two keyframes, seconds, in recordings longer than ``SHORT``. Only keyframes and their neighbours are
-read, for the velocity. From a shorter recording every frame is read."""
+"""Time between keyframes, seconds, in recordings longer than ``SHORT``; only keyframes and their neighbours are
+read."""
 GAP = 2.5
-"""Largest time between the neighbours of a keyframe, usual intervals; above it, frames are missing."""
+"""Largest time between the neighbours of a keyframe, usual intervals."""
 VOXEL_SIZE = 0.02
 """Smallest voxel size of the map that tracks these frames, reference depths."""
 

@@ -18,13 +18,11 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 RECORDING = "recording"
-"""Name of the recording's own poses."""
 SAME_TIME = 1e-4
-"""Stamps that differ by less are equal, seconds: files give them with four digits or more."""
+"""Stamps that differ by less are equal, seconds: files have four digits."""
 LARGEST_GAP = 0.05
-"""Largest time from a frame to the poses before and after it for interpolation, seconds."""
+"""Largest time from a frame to the neighbouring poses for interpolation, seconds."""
 POSES = "given_poses.txt"
-"""Copy in the run folder of the given poses at the times of the frames."""
 
 
 @dataclass(frozen=True, eq=False)

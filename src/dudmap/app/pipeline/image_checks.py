@@ -19,48 +19,39 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PAIRS, GAP = 12, 10
-"""Frame pairs compared, and frames between the two: a third of a second, in which a hand-held camera turns 5 to 20
-degrees."""
+"""Frame pairs compared, and frames between the two: a third of a second, 5 to 20 degrees by hand."""
 NEAR = 0.015
-"""Largest distance of a matched point from the affine motion, as a share of the depth: 3 sigma of a Kinect."""
+"""Largest distance of a matched point from the affine motion, share of the depth: 3 sigma of a Kinect."""
 POINTS = 500
-"""Features of an image of half the size."""
 LEAST_POINTS, LEAST_PAIRS = 20, 6
-"""Fewest matches of a pair, and fewest agreeing pairs."""
 AGREEMENT, SHARE = 0.15, 0.6
-"""Largest deviation of an agreeing pair from the median, as a share of the median, and smallest share of agreeing
-pairs."""
+"""Largest deviation of an agreeing pair from the median, share of it; smallest share of agreeing pairs."""
 WRONG = 0.2
-"""Smallest reported error of a focal length, relative. Correct focal lengths of five recordings erred by up to 0.12."""
+"""Smallest reported relative error of a focal length; correct ones of five recordings erred by up to 0.12."""
 DISTANCES = 4000
-"""Random pairs of points whose distances are compared."""
 
 WIDTH = 160
-"""Width of the images whose edges are compared, pixels."""
 STEP, STEEPEST = 0.08, 4.0
-"""Smallest depth edge, as a share of the depth, and largest colour edge, as a multiple of the mean gradient."""
+"""Smallest depth edge, share of the depth; largest colour edge, multiple of the mean gradient."""
 NEIGHBOURHOOD = 41
-"""Width of the neighbourhood whose mean is subtracted from both edge images, pixels."""
+"""Width of the neighbourhood whose mean is subtracted, pixels."""
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
 """Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, MAYBE, SIGNIFICANT = 0.04, 3.5, 5.0
 """Limits for a turn of depth against colour: smallest gain in edge correlation; smallest correlations for a possible
-and a certain turn. The latter are in standard deviations of accidental correlations; the correlation must also be the
-largest. Of 360 unrelated pairs of depth and colour, 3 exceed the limit for possible turns and none the limit for
-certain ones. Of 261 turned excerpts, 257 and 243 do."""
+and a certain turn, standard deviations of accidental ones. Of 360 unrelated pairs 3 exceed the first and none the
+second; of 261 turned excerpts 257 and 243 do."""
 APART = 12
 """Shift beyond which edges coincide only by accident, pixels of ``WIDTH``."""
 FEWEST = 4
-"""Fewest frames for a judgement."""
 MAGNIFICATIONS = np.exp(np.arange(-12, 13) / 20)
-"""Compared ratios of the colour camera's focal length to the given one. If the depth camera's is given, colour cameras
-have up to 1.7 times its focal length."""
+"""Compared ratios of the colour camera's focal length to the given one, up to 1.7 for the depth camera's."""
 REGISTERED = np.abs(np.log(MAGNIFICATIONS)) < 0.16
 """Magnifications that a calibration finds by itself."""
 SHIFT = 3
-"""Largest shift of the colours by the baseline of both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
+"""Largest shift by the baseline of both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
 LOOKS = 12, 48
-"""Frames that search another magnification, and frames that must prove it."""
+"""Frames that search another magnification, and that must prove it."""
 PROVEN = 4.0
 """Smallest gain of another magnification in standard errors over the frames."""
 MAGNIFIED_GAIN = 0.01
@@ -68,10 +59,10 @@ MAGNIFIED_GAIN = 0.01
 FLAT = 0.01
 """Largest standard deviation from a plane, as a share of the depth, of a depth image without relief."""
 STILL = 0.2
-"""Largest spread of the distance of a resting plane over the frames, in standard deviations of a measurement. Planes of
-moving cameras spread more; means of thousands of independent measurements spread less."""
+"""Largest spread of the distance of a resting plane over the frames, standard deviations of a measurement; moving
+cameras spread more."""
 CHANGED = 0.05
-"""Smallest mean difference of intensities, as a share of their mean, that exposure does not explain."""
+"""Smallest mean difference of intensities, share of their mean, that exposure does not explain."""
 
 
 def focal_error(sequence: "Sequence") -> float | None:

@@ -24,17 +24,16 @@ if TYPE_CHECKING:
 
 DEPTH_ALONE = "there are no colour images: the camera is tracked by distances alone, and the mesh has no colours"
 SAMPLES = 12
-"""Evenly spread frames that are read."""
 NEAR, FAR = 0.1, 8.0
 """Median depths, metres, outside of which an assumed depth unit is doubted."""
 LEAST, LARGEST = 0.05, 25.0
-"""Median depths, metres, outside of which any depth unit is doubted. Wrist and desk cameras begin at 0.07 m; outdoor
-stereo cameras end at 20 to 40 m."""
+"""Median depths, metres, outside of which any unit is doubted: wrist cameras begin at 0.07 m, outdoor stereo ends at
+20 to 40 m."""
 LEFT_OUT = 0.1
 """Share of measurements outside of the depth range that causes a warning."""
 NEAREST, FARTHEST = 0.2, 10.0
 """Smallest plausible 5th and largest plausible 95th percentile of depths, metres, if the median lies outside of
-``SEEN``. Few depth cameras measure below 0.2 m; indoor cameras hardly exceed 10 m."""
+``SEEN``."""
 SEEN = (0.4, 4.0)
 """Median depths, metres, at which the scale is not doubted."""
 FEW_READINGS = 0.2
@@ -48,9 +47,8 @@ SLOW, FAST = 1.0, 0.001
 LATE = 0.015
 """Median time between a frame's colour and depth image, seconds, that causes a warning: half a frame."""
 RUN = 6
-"""Consecutive frames that are compared at every sampled place."""
 TUM_ENDED = 1356998400.0
-"""The year 2013, seconds since 1970. Later recordings with names as in TUM RGB-D are of another camera."""
+"""The year 2013, seconds since 1970; later recordings named as in TUM RGB-D are of another camera."""
 SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
 """Depth scales in use, units per metre; the first that fits replaces an implausible one."""
 USUAL = (0.4, 8.0)

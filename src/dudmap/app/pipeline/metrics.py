@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from dudmap.errors import FrameError
 
 STRIDE = 4
-"""Step in rows and columns between counted measurements."""
 COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
-"""Attributes of ``FrameResult`` whose frames are counted."""
 
 
 @dataclass

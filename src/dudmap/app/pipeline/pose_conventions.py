@@ -18,7 +18,7 @@ AXES = {
     "opengl": np.diag([1.0, -1, -1, 1]),
     "ros": np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
 }
-"""Camera axes of other conventions (x right, y up, z back; x forward, y left, z up) in the axes used here."""
+"""Camera axes (x right, y up, z back; x forward, y left, z up) in the axes used here."""
 WORDS = {
     "world-to-camera": "inverse poses",
     "opengl": "camera x right, y up, z back",
@@ -26,25 +26,23 @@ WORDS = {
     "wxyz": "quaternions with w in the other place",
     "millimetres": "positions in millimetres",
 }
-"""Words of ``--poses-as`` by their difference from camera-to-world, camera x right, y down, z forward, metres."""
+"""Words of ``--poses-as`` by their difference from the default."""
 PAIRS = 12
-"""Pairs of images that are compared."""
 TURN, STEP = 8.0, 0.15
-"""Least motion from one image of a pair to the other, degrees or metres: far more than the noise of odometry."""
+"""Least motion between the images of a pair, degrees or metres: far more than odometry noise."""
 FURTHEST = 90
-"""Largest number of frames between the images of a pair: later the view has changed."""
+"""Largest number of frames between the images of a pair."""
 FARTHEST = 50.0
 """Extent of the positions in metres beyond which they may be millimetres: a desk would be 500 wide."""
 STRIDE = 6
-"""Step between compared pixels, across and down."""
 TOLERANCE = 0.03
 """Largest difference of depths that agree, metres at 1 m and in proportion beyond."""
 CLEARLY = 0.12
-"""Mean share of the pixels by which another convention must fit better: three times its spread over pairs."""
+"""Mean share of the pixels by which another convention must fit better: three times its spread."""
 MOSTLY = 0.8
 """Share of the pairs in which the other convention must fit better."""
 HARDLY = 0.15
-"""Smallest share of pixels with agreeing depth. Below it the poses do not belong to the images."""
+"""Smallest share of pixels with agreeing depth of poses that belong to the images."""
 
 
 class Convention(NamedTuple):

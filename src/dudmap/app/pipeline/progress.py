@@ -34,7 +34,6 @@ FIGURES = (
     ("RPE RMSE, rotation", "rpe_rot_rmse_deg_per_s", "{:.2f} deg/s", 1),
     ("mask IoU", "mask_iou_mean", "{:.3f}", 1),
 )
-"""Label, key of metrics.json, format and factor of the printed metrics; missing ones are skipped."""
 
 NOT_FUSED = {
     "skipped_similar": "redundant view",

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PREVIEW = 3
-"""Frames that compile or load the kernels before the stream of a camera begins."""
 
 
 def run(

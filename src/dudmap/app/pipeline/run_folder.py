@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 LOCKED_BYTE = 1 << 20
-"""Position of the locked byte on Windows, behind the text that other processes must be able to read."""
+"""Position of the locked byte on Windows, behind the text that others read."""
 
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
@@ -48,22 +48,20 @@ FILES = (
     "merge.json", "report.html", "changes.jsonl", "ignored.png", "given_poses.txt",
 )  # fmt: skip
 IGNORED = "ignored.png"
-"""Copy of the mask of unused pixels."""
 FACES = 20_000
-"""Most triangles for the direction against gravity, as in ``diff``: a tenth of a second."""
+"""Most triangles for the direction against gravity: a tenth of a second."""
 SCORES = (
     "evaluation.json", "evaluation.md", "evaluation.csv", "evaluation.tex", "mesh.evaluation.json",
     "masks.evaluation.json", "timings.evaluation.json", "timings.tex", "trajectory.png", "error.png", "path.png",
     "rpe.png", "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
 )  # fmt: skip
-"""Files of `dudmap evaluate` in a run folder."""
 WRITTEN = {
     "": "|".join((
         *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
     )),
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
 }  # fmt: skip
-"""Regular expressions of all file names of a run, by sub-folder; a run removes only these files first."""
+"""Regular expressions of all file names of a run, by sub-folder."""
 
 
 @contextmanager

@@ -45,13 +45,10 @@ if TYPE_CHECKING:
 DATABASE = "state.db"
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 SHARE = 0.02
-"""Largest share of elapsed time that checkpoints take in processor time, unless an interval is given.
-
-Snapshots and writing count. The rest of the allowed 3 % is for the writing thread's use of memory bandwidth and caches,
-which is not measured.
-"""
+"""Largest share of elapsed time that checkpoints take in processor time. The rest of the allowed 3 % is for memory
+bandwidth and caches, which is not measured."""
 FIRST = 5.0
-"""Seconds before the first checkpoint; repeating a shorter run takes no longer than continuing it."""
+"""Seconds before the first checkpoint; repeating a shorter run takes no longer."""
 
 
 @dataclass(frozen=True)

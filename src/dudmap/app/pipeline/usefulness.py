@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 LEAST_SHARE = 0.1
-"""Smallest share of the frames in the largest map of a useful run: below it nine tenths are not in the map."""
+"""Smallest share of the frames in the largest map of a useful run."""
 MOST = 0.5
 """Share of the measurements outside of the depth range that explains a useless run."""
 

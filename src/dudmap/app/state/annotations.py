@@ -14,9 +14,7 @@ NUMBERS = {
     int: (int, np.integer, np.bool_),
     float: (int, float, np.integer, np.floating),
 }
-"""Accepted types per type of number."""
 RECORD = dict[str, Any]
-"""Annotation of plain JSON values by name."""
 
 
 @cache

@@ -15,7 +15,7 @@ from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords
 from dudmap.core.places.frame_store import EncodedFrame, FrameStore
 
 VOXELS = 2 * BLOCK**3
-"""32-bit words of a block: the geometry of its voxels, then their colours, as in memory."""
+"""32-bit words of a block: geometry of its voxels, then colours."""
 
 
 class MapSettings(NamedTuple):

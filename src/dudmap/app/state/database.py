@@ -46,15 +46,13 @@ from dudmap.input_files import (
 from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
-"""Application number in the file header that marks these databases: the letters DUDS."""
+"""Application number in the file header: the letters DUDS."""
 SCHEMA = 6
 CHUNK = 1 << 16
 """Bytes of an array per chunk; unchanged chunks are not written again."""
 STEPS, LIMIT = 10_000, 100_000
-"""SQLite instructions between two checks for ctrl-C, and checks until a statement is ended. A row takes 10 to 50
-instructions."""
+"""SQLite instructions (10 to 50 per row) between two checks for ctrl-C, and checks until a statement is ended."""
 ROWS = 4096
-"""Blocks read at once."""
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);

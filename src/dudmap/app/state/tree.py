@@ -35,11 +35,10 @@ if TYPE_CHECKING:
     from dudmap.app.state.database import StateDatabase, StateReader
 
 Node = Any
-"""A tree of plain JSON values."""
 LONG = 32
-"""Shortest list of equal things that is stored as one array."""
+"""Shortest list of equal things stored as one array."""
 LARGEST_COUNT = 2**23
-"""Largest number of equal things that are stored as one array."""
+"""Largest number of equal things stored as one array."""
 
 
 @dataclass(eq=False)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 PERIOD = 0.1
 """Shortest time between two updates of the page, seconds."""
 TRIANGLES = 1_000_000
-"""Most triangles of a stored mesh sent to the browser: 40 MB, which it loads within seconds."""
+"""Most triangles sent to the browser: 40 MB."""
 
 
 @dataclass

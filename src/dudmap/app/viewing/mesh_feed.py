@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 BUDGET_MS = 1.0
 """Mean time per frame for copying the map, milliseconds: a third of the allowed cost of a viewer."""
 BLOCKS = 512
-"""Most blocks per copy: 2 MB, about a millisecond, so that no frame is delayed for long."""
+"""Most blocks per copy: 2 MB, a millisecond."""
 LONGEST_WAIT = 15
-"""Frames after which another copy is allowed in any case: half a second of a camera."""
+"""Frames after which another copy is allowed in any case."""
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 Table = list[tuple[str, list[tuple[str, str]]]]
-"""Groups of a table: heading, and rows of name and value with unit."""
 
 
 class Named(NamedTuple):

@@ -38,7 +38,7 @@ NUMBER = 36
 """Frames that are kept: about 1.5 MB of JPEG files."""
 
 STEPS = 65535
-"""Steps of a coordinate over the extent of the mesh: 0.15 mm in a map of 10 m."""
+"""Steps of a coordinate over the mesh: 0.15 mm in a map of 10 m."""
 REPORT = "report.html"
 TRIANGLES = 200_000
 """Most triangles of the mesh in the page: about 1.5 MB, fluent without a graphics card."""
@@ -47,9 +47,8 @@ POSES = 5000
 POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
 """Content security policy: only the page's own scripts (by hash), styles and pictures."""
 NOT_INCLUDED = "preprocess", "movers"
-"""Stages outside of the time to the result: the first runs in the reader's thread, the second after the result."""
+"""Stages outside of the time to the result: in the reader's thread, and after the result."""
 COLORS = "#2f6fb5", "#d98a00", "#2e8b57", "#c8322d", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5", "#9aa7b6"
-"""Colours of the stages; the last one is for all further ones together."""
 LISTED = 200
 """Most lost or unreadable frames that are listed one by one."""
 CARDS = {
@@ -61,7 +60,7 @@ CARDS = {
     "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
     "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
 }
-"""Key of metrics.json to label, factor and format of the metrics at the top of the page."""
+"""Key of metrics.json to label, factor and format of the metrics at the top."""
 
 
 class Thumbnails(RunObserver):

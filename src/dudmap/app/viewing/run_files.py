@@ -19,9 +19,7 @@ from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 FOLDER = "thumbnails"
-"""Folder of the thumbnails."""
 NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency")
-"""Columns of timings.csv that are not the time of a stage."""
 MAX_TRIANGLES = 5_000_000
 """Most triangles of a mesh in a page or window; a larger mesh is simplified."""
 LARGEST_THUMBNAIL = 2**22

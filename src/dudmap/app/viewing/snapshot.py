@@ -21,17 +21,15 @@ if TYPE_CHECKING:
 WIDTH = 320
 """Largest width of the shown images, pixels."""
 DEPTH_RANGE = 5.0
-"""Depth at the end of the colour scale, metres: about the range of structured-light sensors."""
+"""Depth at the end of the colour scale, metres: the range of structured light."""
 RESIDUAL_RANGE = 0.05
 """Residual at the ends of the colour scale, metres."""
 KINDS = ("color", "depth", "mask", "residuals")
-"""Images of a frame."""
 _NO_READING = np.array([40, 40, 40], dtype=np.uint8)
 
 LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
 """Unit vector towards the light of the shaded view, camera frame."""
 TITLE = 28
-"""Height of the text above a picture, pixels."""
 
 
 @dataclass(frozen=True, eq=False)

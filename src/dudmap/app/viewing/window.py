@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 MAX_IMAGES = 300
 """Frames whose images are kept for the time slider: about 20 MB; more are thinned evenly."""
 PLOT_POINTS = 500
-"""Points of a plot over time."""
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
 CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
 PATH_COLOR, CAMERA_COLOR, KEYFRAME_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (120, 90, 200), (255, 200, 0)

@@ -16,8 +16,8 @@ SAMPLES = 5
 TRIES = 24
 """Most other frames, nearest first, that are searched for a pixel."""
 TOLERANCE = 0.03
-"""Largest relative difference of depths of one surface: two standard deviations of a depth camera at 4 m (0.8 %), and
-as much for the map."""
+"""Largest relative difference of depths of one surface: two standard deviations at 4 m (0.8 %), and as much for the
+map."""
 ANGLE_LENGTH = 2.0
 """Length equivalent to a rotation by one radian, metres: the depth of a room."""
 LEAST_PIXELS = 500

@@ -20,22 +20,19 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 MARGIN = 6 / 640
-"""Width by which masks grow, as a share of the image width: blur, mixed pixels and the sensor's disparity window."""
+"""Width by which masks grow, share of the image width: blur, mixed pixels and disparity window."""
 REACH = 24 / 640
-"""Largest distance from a mask, as a share of the width, of added pixels in front of the map. Only dynamic objects lie
-in front of a finished map."""
+"""Largest distance from a mask, share of the width, of added pixels in front of the map."""
 IN_FRONT = 0.04
-"""A measurement is in front of the map if nearer by this share: 2.5 standard deviations of a Kinect at 5 m (0.0012 m +
-0.0019 (z - 0.4)^2)."""
+"""Share by which a measurement is in front of the map: 2.5 standard deviations of a Kinect at 5 m (0.0012 m + 0.0019
+(z - 0.4)^2)."""
 SHADOW = 48 / 640
-"""Largest width of the projector's shadow next to a near object, as a share of the image width. It is baseline times
-focal length over distance: 0.075 m * 525 / 0.8 m for a Kinect."""
+"""Largest width of the projector's shadow, share of the image width: 0.075 m * 525 / 0.8 m for a Kinect."""
 LEFT_OVER = 5.0
-"""A pixel near a mask is dynamic if its colour differs from the background by this many standard deviations. They are
-1.48 median absolute deviations of all such pixels of the frame. This finds feet on the floor, which depth does not
-separate."""
+"""A pixel near a mask is dynamic if its colour differs by this many standard deviations (1.48 median absolute
+deviations), such as feet on the floor."""
 LEAST_DIFFERENCE = 40.0
-"""Smallest such difference, of 255. Smaller ones are hardly visible; shadows and exposure also cause them."""
+"""Smallest such difference, of 255; shadows and exposure cause smaller ones."""
 SOURCES = 150
 """Most frames that provide colours, evenly spread; one of 640x480 pixels takes 2 MB."""
 

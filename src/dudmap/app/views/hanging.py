@@ -8,9 +8,9 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.io.exporting.mesh_editing import face_areas
 
 LARGEST = 25e-4
-"""Surface of the largest removed piece, square metres: a square of 5 cm. Larger ones may be lamps."""
+"""Surface of the largest removed piece, square metres; larger ones may be lamps."""
 GAP = 0.02
-"""Least distance from any larger piece, metres. Nearer pieces are parts cut off by a gap of a voxel or two."""
+"""Least distance from any larger piece, metres; nearer pieces are cut off by a voxel or two."""
 
 
 def remove_hanging_pieces(volume: TsdfVolume, mesh: Mesh) -> None:

@@ -31,7 +31,6 @@ share of the surface beyond each side of a picture, so that a picture holds 98 %
 SAMPLES = 20_000
 """Points that stand for the surface: 100 of them lie beyond each side of a picture."""
 EMPTY = 32
-"""Grey value of pixels without surface."""
 
 
 class TumFolder:

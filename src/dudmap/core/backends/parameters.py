@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from dudmap.core.backends.mirror import Mirror, on_host
 
 BLOCK = 8
-"""Voxels along the edge of a block."""
 UNKNOWN, SURFACE, FREE = 0, 1, 2
 """Occupancy of a point: unknown, near a surface, in known free space."""
 

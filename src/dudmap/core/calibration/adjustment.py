@@ -16,7 +16,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 
 MAX_ANGLE, MIN_ANGLE = np.radians(30), np.radians(2)
-"""Limits of the rotation between the frames of a pair, radians: enough to separate both cameras, and enough overlap."""
+"""Limits of the rotation between the frames of a pair, radians: it separates both cameras and leaves overlap."""
 MIN_FASTER = 0.2
 """Smallest velocity difference (m/s, rad/s) of a pair without rotation or translation."""
 MAX_SHIFT = 0.35
@@ -116,19 +116,18 @@ def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> f
 
 
 PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
-"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share of
-the width. Colour cameras are mounted 15 to 32 mm from depth cameras, mostly sideways. Uncorrected focal lengths differ
-by up to 10 %, uncorrected lenses bend by some per cent, and a frame at 30 Hz takes 33 ms."""
+"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share
+of the width. Colour cameras are 15 to 32 mm from depth cameras, mostly sideways; focal lengths differ by up to 10 %;
+a frame at 30 Hz takes 33 ms."""
 POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
-"""Standard deviation of a tracked pose, metres and radians; it constrains only directions that the images do not
-observe."""
+"""Standard deviation of a tracked pose, metres and radians, for directions that the images do not observe."""
 LIGHT_SIGMA = np.array([0.3, 0.1])
 """Standard deviations of gain and offset between two images."""
 CORRELATED = 50.0
-"""Number of neighbouring points with correlated errors, which count as one point against the priors."""
+"""Neighbouring points with correlated errors that count as one against the priors."""
 COST_SCALES = (0.01, 1.0)
-"""Standard deviations of intensity (0..1) and depth differences (over sigma(z)) in the cost of a pair. They are fixed
-so that costs are comparable; 0.01 is the noise of common colour cameras."""
+"""Fixed standard deviations of intensity (0..1) and depth differences (over sigma(z)) in the cost of a pair; 0.01 is
+the noise of common cameras."""
 FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
 """Initial standard deviations of an adjustment, which estimates them, and the lower bound of both."""
 HUBER = 1.345
@@ -136,11 +135,11 @@ HUBER = 1.345
 ITERATIONS, COARSE_ITERATIONS = 6, 4
 """Largest number of Gauss-Newton steps at the largest image size, and at each smaller one."""
 STEADY = 2
-"""Number of consecutive small steps for convergence; a single step may be small before the poses have followed."""
+"""Consecutive small steps for convergence: poses follow later."""
 FIT_ITERATIONS = 3
 """Steps per image size that fit poses to a known calibration."""
 CONVERGED, CONVERGED_COARSE = 0.01, 0.1
-"""Convergence: step of every parameter in prior standard deviations, at the largest image size and at smaller ones."""
+"""Step of every parameter in prior standard deviations at convergence, at the largest image size and smaller ones."""
 
 
 @dataclass(frozen=True, eq=False)

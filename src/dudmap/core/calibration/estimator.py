@@ -28,15 +28,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "center": ("center_x", "center_y"),
     "geometry": (*PARAMETERS[:6], "log_focal", "center_x", "center_y"),
 }
-"""Parameters that leave their given values together. A translation resembles a rotation, but only both together explain
-near and far colours. The principal point, which a crop displaces, is also tested alone, because a few seconds determine
-two parameters but not nine."""
+"""Parameters that leave their given values together. A translation resembles a rotation, but only both explain near
+and far colours. The principal point is also tested alone: a few seconds determine two parameters but not nine."""
 TESTED = GROUPS | {"vignetting": ("vignetting",)}
 """All tested and reported groups; vignetting moves no pixel, and is estimated after the others."""
 MIN_PAIRS = 14
 """Smallest number of pairs in each half of the time: one more than parameters."""
 PAIRS = 80
-"""Number of pairs that decide which groups are estimated; the result uses half as many more, across the halves."""
+"""Pairs that decide which groups are estimated; the result uses half as many more."""
 SHUTTER_PAIRS = 160
 """Number of pairs that decide on the depth readout, which only turning cameras show clearly."""
 STRIDE = 2
@@ -44,12 +43,11 @@ STRIDE = 2
 SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
 """Group of the depth readout, which is estimated before all others, and the name of its parameter."""
 MATERIAL = {"timing": 0.01, "lens": 0.01, "center": 0.01, "geometry": 0.1, SHUTTER: 0.01}
-"""Smallest relative decrease of the cost per group; below it the given values stay, even if the decrease is
-significant. A depth image bent by one or two per cent, as of a Kinect, is partly confused with a displaced colour
-camera. Measured: such depth lets the geometry gain up to 7 %, a colour camera 25 mm away 19 to 30 %."""
+"""Smallest relative decrease of the cost per group. A bent depth image, as of a Kinect, resembles a displaced colour
+camera. Measured: it lets the geometry gain up to 7 %, a camera 25 mm away 19 to 30 %."""
 EVIDENCE = 3.0
-"""Smallest decrease of the cost for a group, standard errors. The group is estimated on each half of the time and
-tested on the pairs of the other half; both are summed. Chance exceeds it once in 700 times."""
+"""Smallest decrease of the cost for a group, standard errors, of estimates on each half of the time tested on the
+other; chance exceeds it once in 700 times."""
 
 
 @dataclass(frozen=True, eq=False)

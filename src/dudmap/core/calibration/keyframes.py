@@ -17,9 +17,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import Remembered, Stateful
 
 GEOMETRY_WIDTH = 160
-"""Width of the compared depth images, pixels."""
 COLOR_WIDTHS = (80, 160, 320)
-"""Widths of the compared colour images, coarse to fine, pixels."""
 POINT_STRIDE = 3
 """Step between the compared points, across and down, pixels."""
 SAME_SURFACE = 0.03
@@ -28,14 +26,13 @@ SAME_SURFACE = 0.03
 
 BAND = 1.0, 4.0
 """Standard deviations of the two Gaussians of the intensity filter (difference of Gaussians), pixels. Vignetting,
-shading and exposure vary slowly and stay with the camera, which resembles a displacement of the colours. Noise and
-single-pixel detail differ between views and spoil the derivatives."""
+shading and exposure stay with the camera like a displacement; single-pixel detail spoils derivatives."""
 BESIDE = 2
 """Dilation of moving pixels, because their outline is uncertain, pixels."""
 INTERVAL = 0.1
 """Initial time between two keyframes, seconds."""
 MAX_KEYFRAMES = 60
-"""Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
+"""Largest number of keyframes; beyond it every second one is dropped."""
 MAX_GAP = 0.45
 """Largest time between the neighbours of a keyframe for a known velocity, seconds: two intervals at 5 Hz."""
 

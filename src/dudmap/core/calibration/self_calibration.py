@@ -24,10 +24,9 @@ from dudmap.core.tracking.frame_view import FrameView
 log = logging.getLogger(__name__)
 
 ATTEMPTS = (120, 240, 480, 960)
-"""Numbers of tracked frames after which the calibration is estimated. Four seconds of hand-held motion show every
-error; later estimates use twice as many frames each."""
+"""Tracked frames after which the calibration is estimated: four seconds by hand show every error."""
 USED_AFTER = 60
-"""Tracked frames between start and use of an estimate: two seconds at 30 Hz, enough for a process on a second core."""
+"""Tracked frames between start and use of an estimate: two seconds at 30 Hz."""
 
 
 class SelfCalibration(Stateful):

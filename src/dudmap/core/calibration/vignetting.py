@@ -12,11 +12,11 @@ from dudmap.core.geometry.camera import Camera
 
 Values = NDArray[np.float64]
 EXPOSED = 0.06, 0.94
-"""Range of compared intensities: darker ones have an unknown black level, brighter ones are saturated."""
+"""Compared intensities: darker ones have an unknown black level, brighter ones are saturated."""
 SCALE = 0.02
 """Scale of the robust weights: the noise of common colour cameras, 0.01, at half of the full brightness."""
 ITERATIONS = 8
-"""Iterations of the reweighted least squares, after which the result changes by less than a thousandth."""
+"""Iterations after which the result changes by less than a thousandth."""
 
 
 @dataclass(frozen=True, eq=False)

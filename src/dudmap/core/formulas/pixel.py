@@ -11,8 +11,8 @@ from dudmap.core.backends.threads import scalar, written_out
 
 f32, sqrt = np.float32, np.sqrt
 STEEPEST = f32(7.9)
-"""Tangent of 83 degrees, the largest angle between surface and image plane at which neighbours define the normal.
-Steeper surfaces are depth edges. Sensors return no measurement beyond 84 degrees."""
+"""Tangent of 83 degrees, the largest angle between surface and image plane at which neighbours define the normal;
+sensors measure up to 84."""
 UNKNOWN_COSINE = f32(0.3)
 """Cosine of the angle of incidence assumed at depth edges."""
 

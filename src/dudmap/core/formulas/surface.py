@@ -5,8 +5,7 @@ import numpy as np
 from dudmap.core.backends.threads import written_out
 
 MIN_OFFSET = np.float32(1e-3)
-"""Smallest distance of a vertex from a voxel, as a share of the edge. Vertices of different edges stay distinct at a
-voxel with sdf 0, so that no triangle degenerates."""
+"""Smallest distance of a vertex from a voxel, share of the edge, so that no triangle degenerates."""
 
 
 @written_out

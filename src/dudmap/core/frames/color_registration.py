@@ -18,9 +18,7 @@ from dudmap.core.geometry.se3 import hat
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 MEDIAN_STRIDE = 8
-"""Stride in rows and columns of the pixels that enter the median depth."""
 BAND_ROWS = 60
-"""Rows that a thread registers at a time."""
 
 
 def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:

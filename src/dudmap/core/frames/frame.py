@@ -21,7 +21,6 @@ NO_COLOR = (
     "{} has the shape {} and the type {}; expected (H, W, 3) uint8, red green blue; 16-bit values are depth, which "
     "needs no colour"
 )
-"""Message for an array that is not a colour image."""
 GREY = 192
 """Grey value of all pixels of a frame without colour: light, so that shading is visible."""
 

@@ -10,8 +10,8 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 
 DISTANCES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
-"""Distances at which pixels of one camera are projected into the other image, metres. They start at the nearest
-measurable surface and double, because each doubling halves the shift by the baseline."""
+"""Distances at which pixels are projected into the other image, metres: each doubling halves the shift by the
+baseline."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,17 +14,16 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
 CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
-"""Stride in rows and columns, and quantile, for the saturation limit. The limit is this quantile of the intensities
-of pixels with a saturated channel."""
+"""Stride in rows and columns of the saturation limit, and quantile of the intensities of saturated pixels."""
 HALVING_BAND = 0.02
-"""Largest distance between measurements of one surface in a 2x2 block, as a share of the depth. Below the reference
-depth it is a share of that."""
+"""Largest distance between measurements of one surface in a 2x2 block, share of the depth, at least of the reference
+depth."""
 CELLS = 40
 """Cells across the image; the strongest corner of each cell is used."""
 WINDOW = 11
 """Edge of the window for matching a corner, pixels of an image 320 wide."""
 FLOW_WIDTH = 320
-"""Image width to which windows and flow of corners refer; they grow in proportion to the image width."""
+"""Image width to which windows and flow refer; they grow in proportion."""
 
 
 @dataclass(frozen=True, eq=False)

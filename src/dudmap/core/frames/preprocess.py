@@ -24,7 +24,7 @@ FILTER_ALPHA = 0.012
 """Range standard deviation of the bilateral filter, sigma_c = FILTER_ALPHA z^2, reference depths (thesis section 4.3:
 alpha = 12, in millimetres at 1 m)."""
 BORDER = 0.02
-"""Share of its width by which the colour image is extended at its borders; depth pixels beyond have no colour."""
+"""Share of its width by which the colour image is extended; pixels beyond have no colour."""
 TYPICAL_DEPTH = 2.0
 """Distance for the test which pixels the colour camera sees, reference depths."""
 DEPTH_MIN = 1e-3

@@ -16,13 +16,12 @@ from dudmap.core.verdict import ACCEPTED, Outcome, Verdict
 INTERVALS = 30
 """Number of recent intervals between stamps; their median is the usual interval."""
 BURST_SHARE = 0.1
-"""Share of the usual interval below which two stamps cannot belong to two exposures, but to delayed frames that
-arrived at once. Late frames of real sensors leave more than a third."""
+"""Share of the usual interval below which frames were delayed and arrived at once; late frames of real sensors leave
+more than a third."""
 FURTHEST_STEP = 60.0
-"""Largest step of the stamps that is accepted at once, seconds; a longer one may be a single wrong stamp."""
+"""Largest step of the stamps that is accepted at once, seconds."""
 AGREEING = 5
-"""Number of consecutive frames with consistent stamps, contradicting the last used one, after which the clock counts
-as reset."""
+"""Consecutive frames with consistent stamps after which the clock counts as reset."""
 STRIDE = 4
 """Stride in rows and columns of the pixels compared for a change of the unit."""
 MIN_PIXELS = 100
@@ -30,9 +29,9 @@ MIN_PIXELS = 100
 SMALLEST_FACTOR = 1.5
 """Smallest change of the unit: units differ by more (0.2 mm, 1/4 mm, 1 mm, 1 m)."""
 SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
-"""A change of the unit multiplies the depth by one factor, with this relative tolerance, at this share of pixels."""
+"""Relative tolerance of one factor of the depth, and share of pixels, of a change of the unit."""
 LONGEST_MEMORY = 1.0
-"""Longest time between two compared depth images, seconds; after longer times the view may differ."""
+"""Longest time between two compared depth images, seconds."""
 
 Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 """Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""

@@ -31,9 +31,7 @@ class TimedFile(NamedTuple):
 
 
 FIELD = re.compile(r""""[^"]*"|'[^']*'|[^\s,]+""")
-"""A field of a list, including quotes; blanks and commas separate fields."""
 PLAIN = re.compile(r"""[^\s,"']+\s+[^\s,"']+""")
-"""A row of a time and a name without blanks, commas and quotes."""
 
 
 def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[int, list[str]]]:

@@ -20,12 +20,11 @@ PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
     "center_x", "center_y", "k1", "k2", "delay", "readout",
 )  # fmt: skip
-"""Parameters that can be estimated, in the order of a step (13,). Units are metres, radians, logarithm of the focal
-lengths, and pixels of the colour image. k1 and k2 are the first coefficients of radial lens distortion (thesis eq.
-3.88); times are seconds."""
+"""Parameters in the order of a step (13,): metres, radians, logarithm of the focal lengths, pixels of the colour
+image, k1 and k2 (thesis eq. 3.88), seconds."""
 NUM_PARAMETERS = len(PARAMETERS)
 MAX_VIGNETTING = 2.0
-"""Largest vignetting: exp(-2) is a loss of seven eighths of the light in the corners, beyond any usable camera."""
+"""Largest vignetting: exp(-2) is a loss of seven eighths of the light in the corners."""
 
 
 @dataclass(frozen=True, eq=False)

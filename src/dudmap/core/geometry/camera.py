@@ -13,8 +13,8 @@ Scalar = TypeVar("Scalar", bound=np.floating)
 LARGEST_PIXELS = 2**26
 """Largest number of pixels of an image, 8192x8192; phone images have up to 50 million."""
 SMALLEST_FOCAL, LARGEST_COORDINATE = 1e-2, 1e6
-"""Smallest focal length, and largest focal length and principal point, pixels. They correspond to a view of almost
-180 degrees and of a thousandth of a degree. Beyond, rays have no distinct 32-bit directions."""
+"""Smallest focal length, and largest focal length and principal point, pixels: views of almost 180 and of a
+thousandth of a degree."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e9
 """Units of depth per metre, from kilometres to nanometres. 16-bit values stay finite in this range."""
 

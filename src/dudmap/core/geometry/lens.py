@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 
 BEHIND = 0.03
-"""Share by which a surface must be nearer to hide another one. It is two standard deviations of a depth camera at 4
-m, doubled for pixels of one camera that lie between pixels of the other."""
+"""Share by which a surface must be nearer to hide another one: two standard deviations of a depth camera at 4 m,
+doubled for pixels between pixels."""
 
 
 class Lens:

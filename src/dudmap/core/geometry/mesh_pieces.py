@@ -13,7 +13,6 @@ from dudmap.core.geometry.mesh_simplification import clustered, mean_edge, simpl
 from dudmap.errors import MapError
 
 FACES_AT_ONCE = 500_000
-"""Faces that are read at once."""
 
 
 def save_pieces(pieces: Iterable[Mesh], path: str | Path) -> tuple[int, int]:

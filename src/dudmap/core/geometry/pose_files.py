@@ -17,12 +17,10 @@ from dudmap.input_files import read_text
 
 NANOSECONDS = UNITS[-1]
 LARGEST_ERROR = 0.02
-"""Largest difference of a quaternion's length from 1, and of the products of a rotation's rows from 0 and 1. Numbers
-with two digits have such errors."""
+"""Largest difference of a quaternion's length from 1, and of a rotation's products: rounding to two digits."""
 
 
 SAMPLED = 1000
-"""Number of rows from which the format is recognised."""
 
 
 class PoseFormat(NamedTuple):
@@ -43,7 +41,6 @@ FORMATS = {
 }
 """Formats by the names that options and ``Trajectory.load`` take."""
 ORDERS = {"xyzxyzw": "tum", "xyzwxyz": "euroc"}
-"""Formats by the last letters of the names of seven columns after the time."""
 
 
 class PoseFile(NamedTuple):

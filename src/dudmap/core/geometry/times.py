@@ -10,8 +10,7 @@ CENTURY = (1e9, 4.1e9)
 LONGEST_STEP = 1000.0
 """Largest plausible median time between two rows, seconds."""
 SLOWEST_COUNT = 10.0
-"""Largest median step of stamps in seconds or of frame counters. In milliseconds such a step would be 100 images a
-second, more than depth cameras deliver at full size."""
+"""Largest median step of stamps in seconds or of counters; milliseconds would be 100 images a second."""
 
 
 class TimeUnit(NamedTuple):

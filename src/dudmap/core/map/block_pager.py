@@ -22,9 +22,9 @@ REGION_BITS = 4
 REGION = 1 << REGION_BITS
 """Blocks along the edge of a region, and its base-2 logarithm."""
 MARGIN = 4
-"""Blocks around the view that stay in memory, so that all neighbours of a changed mesh chunk are present."""
+"""Blocks around the view that stay in memory: the neighbours of a changed chunk."""
 ROOM = 0.85
-"""Share of the allowed blocks that remain after paging out, so that the index is not rebuilt for every region."""
+"""Share of the allowed blocks that remains after paging out."""
 RETRY_AFTER = 100
 """Window moves before a failed store is tried again."""
 Region = tuple[int, int, int]

@@ -14,8 +14,8 @@ MARGIN = 3
 """Blocks that the view may move before the window follows; the window has this margin on each side."""
 
 LOCAL_GRID = 4096
-"""Spacing of the local origins, blocks. With blocks of 8 cm a camera is at most 164 m from a local origin along each
-axis. There the spacing of float32 numbers is 15 micrometres."""
+"""Spacing of the local origins, blocks: with blocks of 8 cm at most 164 m away, where float32 resolves 15
+micrometres."""
 
 
 class BlockWindow(Stateful):

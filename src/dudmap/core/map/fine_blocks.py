@@ -15,7 +15,6 @@ from dudmap.core.state import Remembered, Stateful
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
-"""Arrays that replace a level that the map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
 """Offset (8, 3) of each child in its parent, in units of the child's size; number 4 dx + 2 dy + dz."""
 

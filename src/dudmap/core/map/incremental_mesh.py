@@ -11,7 +11,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks, grown
 
 GROWTH = 4
-"""Capacity as a multiple of the volume's: growing copies all blocks, while spare capacity is only address space."""
+"""Capacity as a multiple of the volume's: spare capacity is only address space."""
 
 
 class VolumeMirror:

@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 FORMAT = "dudmap map 1"
 VOXELS = "geometry", "colors"
-"""Arrays of the voxels (n, 512) of a level."""
 LARGEST_DEPTH = 1000.0
-"""Largest depth range of a map file, metres, because the steps of a ray cast grow with it. Depth cameras reach 100
-m.
-"""
+"""Largest depth range of a map file, metres: the steps of a ray cast grow with it."""
 
 
 def write_map(path: str | Path, volume: "TsdfVolume") -> None:

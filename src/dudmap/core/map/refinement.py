@@ -20,8 +20,7 @@ HYSTERESIS = 0.5
 MAX_CALM = 3
 """Successive examinations below this share after which the smaller voxels are dropped."""
 FILTERED = 0.5
-"""Standard deviation of filtered depth relative to raw depth: assumed, because part of the sensor noise is constant
-over the filter window."""
+"""Standard deviation of filtered depth relative to raw depth: assumed."""
 BEND_NOISE = np.sqrt(6) / 4
 """Standard deviation of the bend along one axis for distances with the standard deviation 1."""
 SIGNIFICANT = 2.0

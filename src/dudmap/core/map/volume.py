@@ -74,10 +74,9 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 NO_WEIGHTS = np.empty((0, 0), np.float32)
-"""Empty weights of an image that is only sampled."""
 MAX_JUMP = 5.0
-"""Largest change of the distance within one cell that is still a surface, voxels. A projective distance grows with
-one over the cosine of the angle of incidence. A steeper change is the border between a band and free space."""
+"""Largest change of the distance within one cell that is still a surface, voxels. A projective distance grows with 1
+/ cosine of incidence; a steeper change borders free space."""
 MAX_WINDOW = 288
 """Largest number of blocks along the edge of the window; its cells then take 96 MB."""
 

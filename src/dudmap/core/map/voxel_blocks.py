@@ -15,7 +15,7 @@ from dudmap.core.state import Remembered, Stateful
 __all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
 COORDINATE_BITS = 18
-"""Bits of a block coordinate: three coordinates and the number of one of 512 maps form a key of the database."""
+"""Bits of a block coordinate: three, and one of 512 maps, form a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
 NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
@@ -25,7 +25,7 @@ INTENSITY = 0xFF
 LARGEST_TABLE = 2**26
 """Largest number of places in the hash table of a stored map, enough for 50 million blocks."""
 MAX_LOAD = 0.8
-"""Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
+"""Largest load factor: an insertion takes 16 ns then, 9 ns in a larger table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,6 @@ class BlockRecords:
 
 
 COLUMNS = tuple(field.name for field in fields(BlockRecords) if field.name != "finer")
-"""Arrays of a stored row: the blocks of one level (0 = coarsest) of a region."""
 _TYPES = {
     "coords": (np.int32, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
     "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),

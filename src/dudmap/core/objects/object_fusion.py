@@ -24,24 +24,24 @@ from dudmap.core.tracking.checks import RegistrationRules
 from dudmap.core.tracking.tracker import Tracker, TrackingResult
 
 RULES = RegistrationRules(damping=1e-4, min_overlap=0.1, min_condition=1e-6, min_information=0.0)
-"""Rules of an object's registration: it fills a small part of the view and may turn about an axis of symmetry."""
+"""Rules for an object: it fills a small part of the view and may turn about an axis of symmetry."""
 MAX_OBJECTS = 4
 """Largest number of objects registered in one frame; each costs a few milliseconds and some megabytes."""
 MAX_MESHES = 50
 """Largest number of meshes of objects that are no longer tracked."""
 MAX_SEEN_THROUGH = 0.08
-"""Largest share of a rigid object's surface that a frame may see through, because of mask edges and pose errors."""
+"""Largest share of a rigid object's surface that a frame may see through."""
 MAX_OFF_SURFACE = 0.25
 """Largest share of a rigid object's depth measurements that may contradict its map."""
 YOUNG_FRAMES = 10
-"""Number of fused frames after which a misfit counts against rigidity. Younger maps restart
-instead. They also restart if much more of the object comes into view: maps started on a narrow strip are distorted."""
+"""Fused frames after which a misfit counts against rigidity; younger maps restart, also if much more of the object
+comes into view."""
 GROWN = 1.5
 """Visible surface, relative to the start of the map, that restarts a young map."""
 MAX_RESTARTS = 20
 """Largest number of restarts of a map."""
 COLOR_SHARE = 0.3
-"""Weight of intensity residuals relative to camera registration; low, because shading changes on a rotating object."""
+"""Weight of intensity relative to camera registration: shading changes on a rotating object."""
 MAX_POINTS = 2000
 """Number of surface points of an object in the check for being seen through."""
 MIN_PIXELS = 60
@@ -51,8 +51,7 @@ MAX_PIXELS = 16000
 MIN_SIZE = 16 << 3
 """Smallest width and height of the crop, pixels: three halvings leave at least 16 pixels."""
 RIM = 0.05
-"""Width of the excluded mask border, as a share of the mask's size, because measurements at grazing angles are
-noisy."""
+"""Width of the excluded mask border, share of the mask's size: grazing angles are noisy."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from dudmap.core.objects.scene_flow import InstanceFrame, displacements
 from dudmap.core.state import Remembered, Stateful
 
 OUTLIER_SPEED = 0.7
-"""Largest deviation of a displacement's velocity from the median, reference depths per second; a larger one is a change
-of the mask."""
+"""Largest deviation of a displacement's velocity from the median, reference depths per second; beyond, the mask
+changed."""
 MERGE_DISTANCE = 0.3
 """Distance below which a small region is merged with a larger one, reference depths."""
 MAX_JUMP = 0.4

@@ -20,8 +20,7 @@ from dudmap.core.scratch_store import ScratchStore
 from dudmap.core.state import Remembered, Stateful
 
 DEPTH_UNIT = 0.0005
-"""Step of the stored depth, reference depths. Its rounding error, 0.29 steps rms, is 0.14 mm in a room, a seventh of
-``sigma_base``."""
+"""Step of the stored depth, reference depths: 0.14 mm rms in a room, a seventh of ``sigma_base``."""
 JPEG_QUALITY = 95
 KEEP_ANGLE_DEG = 5.0
 """Rotation since the last stored frame at which a fused frame is stored, degrees."""
@@ -30,7 +29,6 @@ MAX_PENDING = 3
 CELLS = 8, 6
 """Cells of an image, across and down; ``KeptFrame.cells`` tells which of them were mostly fused."""
 EncodedFrame = tuple[bytes, bytes, bytes]
-"""Compressed depth, colour and mask of a stored frame."""
 
 
 @dataclass(frozen=True)

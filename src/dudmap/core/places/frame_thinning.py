@@ -18,7 +18,7 @@ from dudmap.core.state import Remembered, Stateful
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
 """Largest distance (reference depths) and angle (deg) between equal views: half the spacing of keyframes."""
 MIN_KEPT = 256
-"""Number of frames that always keep their images: 50 MB at 640x480. Recordings of some minutes store fewer."""
+"""Frames that always keep their images: 50 MB at 640x480."""
 
 
 class FrameThinning(Stateful):

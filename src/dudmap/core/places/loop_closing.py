@@ -30,7 +30,7 @@ NO_DRIFT, NO_DRIFT_DEG = 0.02, 0.7
 MAX_VERIFIED = 2
 """Largest number of matches of one frame that are verified by registration."""
 MAX_BACKOFF = 4
-"""Largest factor of the linear back-off: after n failed searches in a row the next one waits n ``loops.gap`` frames."""
+"""Largest factor of the linear back-off: after n failed searches the next waits n ``loops.gap`` frames."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,8 @@ LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a motion measured at a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
 """Largest misfit of the new pass to the map of the old pass: the ratio times its misfit to its own map, plus the
-offset.
-
-A correction with a larger misfit is rejected. The offset of distances is the noise of the measured motion, reference
-depths; the offset of intensities is in units of the range 0..1. Measured: a correct correction in a corridor has the
-ratio 1.1. Errors of 5 cm, or of 2 cm and 1 degree, have more than 2.
-"""
+offset (reference depths; intensities 0..1). Measured: a correct correction has the ratio 1.1, errors of 5 cm, or of
+2 cm and 1 degree, more than 2."""
 
 
 class LoopCorrector(Stateful):

@@ -16,21 +16,18 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
 MAX_IMMEDIATE = 24
-"""Largest number of stored frames of a map that is rebuilt at once. Of more frames, the nearest to the present view are
-fused at once."""
+"""Largest number of stored frames that are fused at once, the nearest to the view first."""
 PER_FRAME = 2
-"""Stored frames that are fused with every later frame, one of them into the provisional map if it is near. At most one
-is stored per frame, so that the rebuilding ends."""
+"""Stored frames that are fused with every later frame. At most one is stored per frame, so that the rebuilding ends."""
 MAX_ADDED = 8
-"""Stored frames that are added to the provisional map at once around the candidate pose of a lost camera."""
+"""Stored frames added to the provisional map at once around the candidate pose of a lost camera."""
 VIEW_DEPTH = 2.0
 """Depth of the point for comparing views, reference depths: the middle of an indoor view."""
 NEAR = 3.0
-"""Largest distance between the view points of the camera and of a stored frame, reference depths. Nearer frames are
-added to the provisional map; farther ones show surface out of view until the camera approaches."""
+"""Largest distance between the view points of the camera and of a stored frame added to the provisional map,
+reference depths."""
 SPACING = 0.3
-"""Smallest distance between the view points of two added frames, reference depths; nearer frames show the same
-surface."""
+"""Smallest distance between the view points of two added frames, reference depths."""
 
 
 @dataclass(eq=False)

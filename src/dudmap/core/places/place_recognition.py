@@ -38,10 +38,8 @@ COARSE_FEATURES = 64
 MAX_MATCHED = 5
 """Number of keyframes per frame whose features are all matched; it bounds the time of a query."""
 POSITION_ERROR = 0.01
-"""Largest error of a feature's position beyond the sensor's noise, metres per metre of depth.
-
-It equals 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
-"""
+"""Largest error of a feature's position beyond sensor noise, metres per metre of depth: 2.6 pixels at a width of 320
+and 63 degrees."""
 DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
 """Matches in one submap whose poses differ by less (reference depths, deg) are duplicates."""
 
@@ -63,7 +61,6 @@ class PlacedFeatures:
 
 
 NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
-"""Features of an image without texture."""
 
 
 @dataclass(eq=False)

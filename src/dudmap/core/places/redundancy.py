@@ -19,8 +19,7 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MAX_ROTATION_DEG = 0.3
-"""Rotation since the last fused frame above which a view counts as new without the test, degrees: 0.7 pixels at the
-resolution of the labels."""
+"""Rotation since the last fused frame above which a view counts as new, degrees: 0.7 label pixels."""
 
 
 @dataclass(eq=False)

@@ -16,9 +16,8 @@ from dudmap.errors import ConfigError, MapError
 from dudmap.input_files import DAMAGE, open_arrays
 
 MAP_FILE, KEYFRAME_FILE = "map.npz", "keyframes.npz"
-"""Files of a run folder that hold its map."""
 KIND, VERSION = "dudmap keyframes", 1
-"""Content and version of a keyframe file. The version increases when older programs cannot read the file."""
+"""Content and version of a keyframe file; the version increases when older programs cannot read it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 WIDTH, HEIGHT, RATE = 640, 480, 30
 """Mode of both streams of a RealSense camera, supported by all of the D400 and L500 series."""
 OAK_SIZE = (640, 400)
-"""Size of all images of an OAK: the mono cameras halved, in the aspect ratio of all OAK cameras."""
+"""Size of all images of an OAK: the mono cameras halved."""
 PATIENCE_MS = 200
 """Interval of checks for a closed camera or the end of a recording, milliseconds."""
 LONGEST_SILENCE = 5.0

@@ -56,7 +56,6 @@ EXPORTERS: dict[str, Exporter] = {
     ".csv": Exporter("trajectory, EuRoC", "exporters:write_euroc", _UPRIGHT),
     ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "ros_messages:write"),
 }
-"""Exporters by the name of the file, or its suffix."""
 
 
 def find_exporter(name: str) -> Exporter:

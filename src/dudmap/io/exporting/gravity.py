@@ -14,7 +14,6 @@ CONE = np.cos(np.radians(45))
 PARALLEL = np.cos(np.radians(5))
 """Cosine of the largest angle within one direction: the noise of a plane's triangles at 1 cm voxels."""
 CANDIDATES = 500
-"""Candidate directions, spread evenly over the surface."""
 LEAST_SHARE = 0.02
 """Smallest share of the whole surface that must face up."""
 LAYER = 0.05

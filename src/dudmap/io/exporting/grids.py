@@ -24,9 +24,7 @@ OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 LARGEST = 20_000_000
 """Largest number of cells; distances then take about a minute and 1 GB."""
 BORDER = 2
-"""Cells around the surface on every side."""
 CHUNK = 1_000_000
-"""Cells per look-up, to bound memory."""
 FORMAT = "dudmap grid 1"
 PIXELS = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 """Grey values of the cells in nav2's map saver."""

@@ -14,7 +14,6 @@ from dudmap.extras import extra
 from dudmap.io.exporting.run_content import SPECK, Box, ExportOptions
 
 PART = 65536
-"""Triangles whose corners are in memory at a time to find their surface."""
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:

@@ -24,14 +24,13 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.exporting.up import up_of
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
-"""Component types of accessors."""
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 MATERIAL = {
     "name": "recorded colours",
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "extensions": {"KHR_materials_unlit": {}},
 }
-"""Colours already contain the light of the recording; a program without the extension shows a matt surface."""
+"""Colours already contain the light; a program without the extension shows a matt surface."""
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:

@@ -27,7 +27,7 @@ MAP_FRAME, CAMERA_FRAME = "map", "camera"
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 """A point of a cloud: metres, and colour as 0x00RRGGBB, which RViz and Foxglove read from a field ``rgb``."""
 FLOAT32 = 7
-"""``sensor_msgs/PointField.FLOAT32``, the type that by convention also the packed colour has."""
+"""``sensor_msgs/PointField.FLOAT32``, also of the packed colour by convention."""
 TRIANGLE_LIST, CUBE, ADD, DELETE_ALL = 11, 1, 0, 3
 """Constants of ``visualization_msgs/Marker``."""
 
@@ -248,7 +248,7 @@ def camera_of(message: Any) -> Camera:  # noqa: ANN401
 
 
 MESH_TRIANGLES = 50_000
-"""Triangles of the mesh marker, because viewers treat every corner as a message. The point cloud has all vertices."""
+"""Triangles of the mesh marker: viewers treat every corner as a message."""
 
 
 class McapWriter:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 NEAR = 0.001
-"""Largest time difference between a frame and its pose or mask, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +184,6 @@ SPECK = 4e-4
 """Smallest surface of a connected piece that is exported by default, square metres: 2 cm wide; smaller pieces are
 noise."""
 MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
-"""Options that change the mesh."""
 
 
 @dataclass(frozen=True)

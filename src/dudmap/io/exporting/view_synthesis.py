@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PIXEL = 0.5
-"""Offset between pixel conventions: the origin is the corner of the first pixel in these programs, its centre in
-dudmap."""
+"""Offset between pixel conventions: these programs begin at the corner of the first pixel, dudmap at its centre."""
 
 
 class View(NamedTuple):

@@ -185,9 +185,7 @@ READERS = (
 """Module and class of every reader in the order of the attempts: specific layouts first."""
 NUMBERED = READERS.index("numbered:NumberedSequence")
 MOST_NAMES = 5
-"""Most recordings named in a message."""
 DEPTH_OF_SEARCH = 3
-"""Levels of folders that are searched for a recording."""
 
 
 @cache

@@ -32,11 +32,9 @@ LARGEST_DICTIONARY = 2**27
 CHUNK = 2**20
 NAME_FOLDER = "name a folder that you can write in the environment variable DUDMAP_CACHE"
 ORIGIN = "origin.txt"
-"""File next to the unpacked folder that names the archive."""
 
 
 Member = tuple[str, str, Callable[[], IO[bytes] | None]]
-"""Name of a member, its kind (file, folder or something else), and a function that opens it."""
 
 
 def is_archive(path: Path) -> bool:

@@ -28,7 +28,6 @@ DEPTH_MODES = {
 """Size of depth images to size of the sensor image, which the calibration refers to, and offset of the crop (Azure
 Kinect Sensor SDK, src/transformation/mode_specific_calibration.c)."""
 RAW_COLORS = {"nv12": "COLOR_YUV2RGB_NV12", "yuyv422": "COLOR_YUV2RGB_YUY2", "bgra": "COLOR_BGRA2RGB"}
-"""Conversion of uncompressed colour images."""
 
 
 class _Track(NamedTuple):

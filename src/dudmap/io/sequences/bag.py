@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 MAGIC = {".bag": b"#ROSBAG V2.0", ".active": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
-"""First bytes of the files by their suffix."""
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
@@ -280,9 +279,7 @@ def _equal(one: Lens, other: Lens) -> bool:
 
 
 TOPICS = b"/device_0/sensor_"
-"""Start of the topics of the first camera's streams."""
 HEAD = 1 << 18
-"""Bytes at the start of a file that are searched for the topics."""
 
 
 class RealSenseRecording(RosBag):

@@ -30,19 +30,16 @@ if TYPE_CHECKING:
 LARGEST_METADATA = 2**19
 """Largest metadata.yaml, bytes. With 100 topics it has 60 kB; parsing takes 20 seconds per megabyte."""
 SAMPLES = 30
-"""First messages that estimate the recording delay."""
 CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 """Encapsulation, seconds and nanoseconds at the start of a ROS 2 message, by byte order."""
 ROS1_STAMP = struct.Struct("<4xII")
 """Sequence number, seconds and nanoseconds at the start of a ROS 1 message."""
 HEAD = 12
-"""Bytes of either header start."""
 MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
 """Bytes before four kinds of MCAP content: of a record, of the entries in a message index, of a message, of an
 uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
-"""Name of the same type before tf2."""
 
 
 class MessageTimes(NamedTuple):

@@ -26,17 +26,14 @@ ALIASES = {
     "width": ("width", "image_width", "img_width", "w"), "height": ("height", "image_height", "img_height", "h"),
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
 }  # fmt: skip
-"""dudmap's keys and their names in other programs."""
 PAIRS = {
     ("fx", "fy"): ("focal_length", "focal"), ("cx", "cy"): ("principal_point", "optical_center"),
     ("width", "height"): ("resolution", "image_size", "img_size", "size"),
 }  # fmt: skip
-"""Pairs of keys whose numbers form one list, and its names."""
 LENSES = (
     "coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "dist_coeff",
     "dist", "d",
 )  # fmt: skip
-"""Names of the coefficients of a lens."""
 ROWS = re.compile(r"intrin|calib|cam|param|^k$|^data$|^$")
 """Names of a list ``fx fy cx cy`` that continues with a size or a lens."""
 KNOWN = sorted((name for names in ALIASES.values() for name in names), key=len, reverse=True)
@@ -52,9 +49,7 @@ LEAST = 8.0
 LEAST_SCALE = 100.0
 """Smallest scale of depth, units per metre (a centimetre)."""
 LARGEST_CONTENT = LARGEST_TOML
-"""Largest file of intrinsics, bytes."""
 NO_NAMES = ("px", "pixel", "pixels")
-"""Units behind a number."""
 
 
 def cameras_in(file: Path) -> list[tuple[str, Values]]:

@@ -39,23 +39,19 @@ TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intr
 """Files of one or two cameras. In the folder itself, also any JSON or YAML file with such a name (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
 SETTINGS = "Camera.", "Camera1."
-"""Prefixes of camera keys in settings files of ORB-SLAM. These have any name and hold "Camera.fx: "."""
+"""Prefixes of camera keys in settings files of ORB-SLAM, of any name."""
 LARGEST_SETTINGS = 1 << 16
-"""Characters of such a file that are searched for them."""
 LARGEST_LIST = 5
-"""Most kinds of files listed in a message."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".webp")
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
     "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"),
     "height": ("height", "h", "image_height"), **{key: (key,) for key in DISTORTION_KEYS},
 }  # fmt: skip
-"""dudmap's keys and their names in JSON and YAML files."""
 SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor", "DepthMapFactor", "RGBD.DepthMapFactor")
 MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
 LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs",
           "dist_coeff", "dist", "D", "d")  # fmt: skip
-"""Names of the intrinsic matrix and of the lens coefficients: a list, or OpenCV's ``data`` list."""
 OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
 MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
 """Names of a 4x4 matrix that maps points of the depth camera to the colour camera."""

@@ -15,22 +15,18 @@ from dudmap.io.sequences.camera_content import LARGEST_CONTENT, Values, cameras_
 from dudmap.io.sequences.intrinsics import SAME_SHAPE, Intrinsics
 
 NAMED = re.compile(r".*(cam|intrin|calib|param).*|k([._-].*)?", re.IGNORECASE)
-"""Names of files, without their suffix, that may hold intrinsics."""
 SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".csv", ".npy", ".npz", ".cfg", ".ini", ".conf", ".toml", "")
 FOLDERS = re.compile(r"config|.*(intrin|calib).*", re.IGNORECASE)
-"""Names of folders that are searched for such files of any name."""
 MOST_NAMES = 5
-"""Largest number of files in a message."""
 SAME = 0.5
 """Largest difference of the numbers of one camera in two files, pixels."""
 FIELD_OF_VIEW = (20.0, 130.0)
-"""Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
+"""Plausible fields of view, degrees: from tele lenses to the widest depth mode."""
 OFF_CENTER = 0.25
 """Largest plausible distance of the principal point from the middle of the image, share of its size."""
 UNEQUAL_FOCAL = 0.1
 """Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
 SCALED = ", scaled from "
-"""Text in a source of intrinsics before the size in its file."""
 COLOR_WORDS, OTHER_WORDS = r"colou?r|rgb(?!_?d)|left", r"right|infra"
 
 Size = tuple[int, int]

@@ -20,7 +20,6 @@ NOT_ONE_PART_IN_LINES = 0x02 | 0x08 | 0x10
 LINES = {0: 1, 2: 1, 3: 16}
 """Lines of a block by the number of the compression: none, ZIPS and ZIP."""
 KINDS = ("<u4", "<f2", "<f4")
-"""Types of the values of a channel, by their number."""
 DEPTH_CHANNELS = "RYVZ"
 """Last letter of depth channel names, by increasing certainty."""
 

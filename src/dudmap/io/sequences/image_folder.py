@@ -20,7 +20,6 @@ from dudmap.io.sequences.pose_matrices import read_matrices, read_matrix, rigid_
 from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
-"""Evenly spread frames that are tried until one is valid and gives the image size."""
 OFF_CENTER = 0.08
 """Largest distance of a plausible principal point from the image centre, share of the image."""
 FRAME_RATE = 30.0

@@ -11,7 +11,6 @@ from dudmap.io.sequences import exr
 
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
 LARGEST_HEADER = 1 << 16
-"""Largest size of a header, bytes from the start of the file."""
 LARGEST_SCANS = 100
 """Largest number of passes of a progressive JPEG file; encoders write up to 10, and each takes time."""
 _TIFF_TYPES = {3: "H", 4: "I"}

@@ -22,7 +22,6 @@ from dudmap.io.sequences import Recording, images, intrinsics
 from dudmap.io.sequences.phones import record3d_times
 
 SENS_VERSION = 4
-"""The version of the format that ScanNet publishes."""
 SENS_FRAME = struct.Struct("<16f4Q")
 """Pose camera to world row by row, colour and depth time in microseconds, bytes of the colour and depth image."""
 KLG_FRAME = struct.Struct("<qii")

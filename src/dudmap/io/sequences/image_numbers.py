@@ -17,7 +17,6 @@ LARGEST_NUMBER = 10**8
 LARGEST_SECONDS = 10**11
 """Largest time since 1970 in seconds; larger numbers have a smaller unit."""
 Keys = tuple[list[float], list[float]]
-"""Numbers of the colour images and of the depth images."""
 
 
 def last_number(file: Path) -> float:

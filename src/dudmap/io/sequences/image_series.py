@@ -21,23 +21,18 @@ from dudmap.io.sequences.image_headers import kind_of
 from dudmap.io.sequences.image_numbers import NUMBER, count_pairs, last_number
 
 WORDS = {"color": ("color", "colour", "rgb", "left", "image", "img", "mono"), "depth": ("depth",)}
-"""Words in names of files and folders of each kind, the surest first."""
 NEITHER = {"right", "vis", "ir", "seg", "flow"}
 NEITHER_STARTS = "confid", "mask", "normal", "label", "instance", "semantic", "segment", "dispar", "infra", "thermal"
-"""Words, and beginnings of words, in names of images that are neither depth nor colour."""
 CONTENTS = {
     "depth": "one channel of 16 bits or floats", "color": "8-bit colours", "gray": "8-bit intensities",
     "other": "palettes or other values", "": "content that differs or cannot be read",
 }  # fmt: skip
 PROBED = 3
-"""Images of a series whose headers are read."""
 LEAST_SHARE = 0.25
 """Smallest share of the longer of two series with a partner, if content alone pairs them, and of the images of its
 kind in a series that replaces another."""
 LARGEST_LIST = 5
-"""Largest number of series in a message."""
 Found = dict[str, "Series | None"]
-"""The series of each kind, None if there is none."""
 
 
 @dataclass

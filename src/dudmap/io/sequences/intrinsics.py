@@ -27,7 +27,7 @@ COLOR_PREFIX = "color_"
 """Prefix of the keys of a separate colour camera: fx, fy, cx, cy, width, height, and its distortion coefficients."""
 COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 SAME_SHAPE = 0.01
-"""Largest relative difference of aspect ratios at which images of two sizes may show the same view."""
+"""Largest relative difference of aspect ratios of one view."""
 MOTION_KEY = "T_depth_color"
 """Key of the motion from the colour camera to the depth camera: 12 or 16 numbers, row by row."""
 
@@ -199,7 +199,6 @@ the angle polynomial is by Kannala and Brandt (2006)."""
 INVERSE = "inverse_brown_conrady"
 """Brown's polynomial from distorted to undistorted coordinates, which RealSense uses for colour."""
 OTHER_NAMES = {"brown_conrady": BROWN, "modified_brown_conrady": BROWN, "kannala_brandt4": FISHEYE, "": BROWN}
-"""Names of the same models in librealsense."""
 GRID = 24
 """Points across and down the image to which an inverse model is fitted."""
 

@@ -15,9 +15,7 @@ from dudmap.io.sequences.image_numbers import LARGEST_NUMBER, NUMBER
 from dudmap.io.sequences.images import read_mask
 
 WORDS = re.compile(r"[\W_]*(?:masks?|colou?r|rgb|depth|image|img|frame|left)[\W_]*", re.IGNORECASE)
-"""Words in names of images and masks that do not identify the frame."""
 Images = Sequence[tuple[Path, Path]]
-"""Files of the colour and the depth image of every frame; empty if the recording is one file."""
 
 
 class MaskFolder:

@@ -21,7 +21,6 @@ from dudmap.io.sequences.image_numbers import are_times, keys, last_number
 from dudmap.io.sequences.pose_matrices import read_matrices, rigid_trajectory
 
 POSES = ("poses.txt", "pose.txt", "poses", "pose")
-"""Files and folders of true poses."""
 
 
 class NumberedSequence(ImageFolder):

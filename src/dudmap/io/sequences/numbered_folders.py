@@ -107,7 +107,6 @@ confirmed by ``dudmap calibrate`` on 200 frames."""
 SEVEN_SCENES = r"(7|seven)[-_ ]?scenes|/(chess|fire|heads|office|pumpkin|red_?kitchen|stairs)/seq-\d+$"
 """Path of a recording of 7-Scenes: the name of the set, or of one of its scenes above ``seq-01``."""
 LOST = 65535
-"""Value of a missing depth pixel in 7-Scenes."""
 
 
 class FrameFiles(ImageFolder):
@@ -191,7 +190,6 @@ class VolumeDeformSequence(FrameFiles):
 REDWOOD_NAMES = r"redwood|/(burghers|cactusgarden|copyroom|lounge|readingroom|stonewall|totempole)(_png)?$"
 """Path of a recording of these data sets; object scans are recognised by their file names."""
 COLORS = ("color", "rgb", "image", "image_2d")
-"""Names of the colour folder in Open3D's reconstruction system."""
 OBJECT_SCAN = r"(\d{7})-\d{12}\.(?:jpe?g|png)"
 """File names of the Redwood object scans: frame number and microseconds."""
 
@@ -258,7 +256,6 @@ MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
 """Between the renderer's axes and the axes of the published model of the living room."""
 NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
-"""A number in the renderer's text files."""
 SCENE_FILE = r"scene_\d+_(\d+)"
 
 

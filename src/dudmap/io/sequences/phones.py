@@ -28,7 +28,7 @@ from dudmap.io.sequences.pose_matrices import OPENGL_AXES, read_matrix, rigid_tr
 from dudmap.io.sequences.video import Video
 
 Y_UP, Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-"""Directions against gravity in worlds of ARKit, which aligns them to it, and in worlds that were turned later."""
+"""Directions against gravity in worlds of ARKit, and in worlds that were turned later."""
 
 
 def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:

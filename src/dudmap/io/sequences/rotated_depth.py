@@ -17,7 +17,7 @@ UNITS_PER_METRE = 8000.0
 LEAST_READINGS, LEAST_VALUES = 1000, 32
 """Smallest number of measurements, and of different values, for a decision."""
 MOST = 0.95
-"""Smallest share of the measurements with a property of the images: the others may be damaged."""
+"""Smallest share of the measurements with a property of the images."""
 NEAR_SHARE = 0.8
 """Smallest share of measurements below 8.19 m; their low three bits are 0."""
 FARTHEST = 10000
@@ -31,7 +31,6 @@ DENSE = 0.9
 """Largest share of the millimetres in a range that occur in rotated depth: steps of a camera grow with distance,
 steps of a unit are constant."""
 SAMPLED = 5
-"""Number of evenly spread frames in the test."""
 SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"
 
 

@@ -101,8 +101,7 @@ MCAP, BAG = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
 """Operation codes of MCAP records (MCAP specification, section Records)."""
 LARGEST_CHUNK = 2**28
-"""Largest chunk or message of a bag after decompression, bytes. Recorders write chunks of up to 4 MB. A raw image of
-``LARGEST_PIXELS`` has 200 MB."""
+"""Largest chunk or message of a bag after decompression, bytes: recorders write 4 MB, a raw image has 200 MB."""
 
 
 @dataclass
@@ -236,9 +235,7 @@ def _read(file: IO[bytes], start: int, length: int) -> bytes:
 
 
 Fields = dict[str, bytes]
-"""Header of a record of a ROS 1 bag, in its order."""
 Entry = tuple[int, int, int]
-"""Seconds, nanoseconds and position in its chunk of a message."""
 
 
 @dataclass

@@ -11,11 +11,11 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import open_plain
 
 MARK = b"ftyp"
-"""Bytes 4 to 8 of an MP4 file. Without this check the decoder guesses the format, and playlists name other files."""
+"""Bytes 4 to 8 of an MP4 file; without this check the decoder guesses, and playlists name other files."""
 
 
 EXACT = 1e-5
-"""Largest error of a frame number computed from a time. One missing frame in an hour changes the mean rate more."""
+"""Largest error of a frame number computed from a time."""
 FAR = 60
 """Frames ahead up to which decoding all frames costs less than a search."""
 

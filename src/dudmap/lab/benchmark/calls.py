@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 CORE = str(Path(slam_module.__file__).parent)
-"""Folder of the algorithm."""
 COUNTED_FROM = 40
 """Frames before the counted ones: a map of the first second knows little."""
 BYTES_PER_PIXEL = 12 + 8 * 4 + 8

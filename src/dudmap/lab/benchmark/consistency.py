@@ -38,18 +38,17 @@ PAIRS = 100
 TERMS = {"depth": "mm at 1 m", "intensity": "of 255"}
 """Compared quantities and their units."""
 WORST_DEPTH, WORST_INTENSITY = 0.05, 0.2
-"""Largest counted differences: of depth over the squared depth (1/m), and of intensity (0..1). A pixel whose depth
-differs by more for every trajectory is occluded or dynamic, and is excluded."""
+"""Largest counted differences: of depth over the squared depth (1/m), and of intensity (0..1). A pixel beyond for
+every trajectory is excluded as occluded or dynamic."""
 SMOOTH = 0.05
 """Largest relative step of the depth to a neighbour at which a surface is interpolated."""
 TEXTURED = 0.02
 """Smallest gradient of the intensity (0..1) per pixel."""
 BLUR = 1.0
-"""Standard deviation of the Gaussian that smooths the intensities, pixels. Without it, interpolation would reduce the
-noise of calibrated colours only."""
+"""Standard deviation of the Gaussian that smooths the intensities, pixels; else interpolation would reduce noise of
+calibrated colours only."""
 ROW_STEPS = 3
-"""Iterations of the fixed point that gives the row, and so the time, at which a point was recorded. Each reduces the
-error by readout times image speed over the height, at most to a tenth."""
+"""Iterations for the row at which a point was recorded; each reduces the error at least to a tenth."""
 FEWEST = 200
 """Fewest common pixels of a pair; with fewer, the pair or its intensities are excluded."""
 ROUNDING = 1e-4

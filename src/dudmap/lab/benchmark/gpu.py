@@ -14,7 +14,7 @@ from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 
 KERNELS_EVERY = 4
-"""Every fourth frame measures kernels, the others the frame and its stages, because events around kernels take time."""
+"""Every fourth frame measures kernels, the others stages: events around kernels take time."""
 
 
 def measure_devices(

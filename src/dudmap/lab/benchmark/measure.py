@@ -37,13 +37,12 @@ SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
 COMPLETE_WITHIN = 0.02
 """Largest distance to the mesh of a reconstructed point of the true surface, metres."""
 SAMPLES = 100_000
-"""Points sampled on each surface; shares then vary by at most 0.03 %, a third of the gate's smallest margin."""
+"""Points sampled on each surface; shares vary by 0.03 %, a third of the gate's smallest margin."""
 FEWER_SAMPLES = 40_000
-"""The same for comparisons of many runs; the standard error of a share of 1 % is then at most 0.05 %."""
+"""The same for comparisons of many runs: 0.05 %."""
 
 
 DIED: Row = {"error": "its process died without a result, as when it crashes or runs out of memory"}
-"""Row of a measurement whose process died."""
 
 
 class Job(NamedTuple):
@@ -284,7 +283,6 @@ COLUMNS = (
     Column("cpu_s", "CPU s", 1, 1),
     Column("peak_rss_mb", "peak MB"),
 )
-"""Columns of a suite; those without any value are omitted."""
 
 
 def markdown(rows: list[Row]) -> str:

@@ -18,7 +18,6 @@ SILENT_ATE, SILENT_LOST = 0.05, 0.2
 NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
 """Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
 DRAWN = tables("benchmark/random_worlds.toml")
-"""Drawn parameters, with their probabilities or ranges."""
 
 
 def _drawn(fault: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - a number or a tuple of numbers

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 WARM_UP = 10
-"""Frames at the start of a run that are not timed."""
 FRAME_TARGETS = {0.01: 20.0, 0.02: 14.0, 0.005: 40.0}
 """Largest acceptable median time per frame, milliseconds, by voxel size, metres."""
 

@@ -109,15 +109,10 @@ class Excerpt:
 
 DATA = tables("benchmark/suites.toml")
 SUITES: dict[str, str] = DATA["suites"]
-"""Description of each suite, by name."""
 WORLDS: dict[str, dict[str, dict[str, Any]]] = DATA["worlds"]
-"""Parameters of the synthetic worlds of a suite, by name."""
 PARTS: dict[str, dict[str, Box]] = DATA["parts"]
-"""Boxes whose completeness a suite measures as well, by name."""
 SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
-"""Differences from the default configuration, by name."""
 PASSES = {"two-passes": 2}
-"""Systems that process a recording several times, and how often."""
 UNCALIBRATED = ("colour-as-given",)
 """Systems that use the recording's colour camera; the others calibrate it first."""
 USUAL = {

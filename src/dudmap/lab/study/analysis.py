@@ -17,13 +17,10 @@ if TYPE_CHECKING:
     from dudmap.lab.study.plan import Plan
 
 MOST_FAILURES = 10
-"""Most failed runs listed one by one in a report."""
 ENOUGH_TRACKED = 0.9
 """Share of tracked frames below which a run is listed as having lost frames."""
 MOST_POINTS = 100
-"""Most points of a design whose means a report lists; runs.csv holds all."""
 MOST_INTERACTION_FACTORS = 6
-"""Most factors whose interactions are drawn; 36 plots fill a page."""
 
 
 def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> Table | None:

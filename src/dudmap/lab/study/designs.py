@@ -17,7 +17,6 @@ from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
 
 Value = float | int | bool | str | list[Any]
-"""Value of a configuration key."""
 Table = Any
 """A pandas DataFrame or Series. Type checkers cannot follow which of its many types an expression of pandas has."""
 
@@ -131,7 +130,6 @@ def coded_points(factors: Sequence[Factor], points: Table) -> NDArray[np.float64
 
 Coded = NDArray[np.float64]
 Point = dict[str, Value]
-"""Values of all factors by key."""
 Kind = Literal[
     "full-factorial", "plackett-burman", "central-composite", "latin-hypercube",
 ]  # fmt: skip

@@ -83,7 +83,6 @@ def shown(value: object) -> str:
 
 
 COLORS = 64
-"""Colours of the palette of a figure."""
 
 
 def png(figure: "Figure") -> bytes:

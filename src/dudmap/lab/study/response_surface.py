@@ -15,7 +15,7 @@ from dudmap.lab.study.responses import Scale
 Numbers = NDArray[np.float64]
 
 STARTS = 50
-"""Starting points of the search for the optimum. A quadratic in a box has few local optima."""
+"""Starting points of the search for the optimum."""
 
 
 @dataclass(frozen=True, eq=False)

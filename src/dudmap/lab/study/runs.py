@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence as Recording
 
 Conduct = Callable[[Sequence[Run]], list[Row]]
-"""Does runs, equal ones once, and returns the metrics of each in their order."""
 CACHED_BYTES = 300e6
 """Most bytes of frames of a recording that a worker keeps between runs."""
 PIXEL_BYTES = 8

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 FALSE_SHARE = 0.05
 """Share of the effects called significant that may be due to chance (Benjamini and Hochberg 1995)."""
 MOST_SHOWN = 16
-"""Most keys in a figure."""
 
 
 def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:

@@ -37,9 +37,9 @@ SIGNIFICANT = 0.05
 FEWEST_JUDGES = 3
 """Fewest recordings of the second set; a t test of two ratios finds hardly anything."""
 BATCH = 4
-"""Configurations proposed at a time. A constant, so that the proposals do not depend on the number of workers."""
+"""Configurations proposed at a time, independent of the number of workers."""
 MOST_JUDGED = 5
-"""Most configurations of the training front that are judged; each additional one weakens all tests."""
+"""Most configurations of the training front that are judged; each weakens all tests."""
 
 
 def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:

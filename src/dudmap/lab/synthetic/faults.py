@@ -14,9 +14,8 @@ from dudmap.errors import ConfigError
 from dudmap.lab.data import find
 
 BAND_ROWS, MOST_BANDS = 16, 24
-"""Rows per band of a rolling shutter image (at least), and bands (at most); a band is rendered at one time. The time of
-a row errs by at most 1/30 of the readout at 240 rows, and 1/48 at 384 rows or more. Blurred images need fewer bands:
-half the step between two moments of the exposure bounds their error."""
+"""Rows per band of a rolling shutter image (at least), and bands (at most), each rendered at one time. The time of a
+row errs by at most 1/30 of the readout at 240 rows, 1/48 from 384 rows."""
 
 
 def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a number or a tuple of numbers

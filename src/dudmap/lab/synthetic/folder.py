@@ -15,7 +15,6 @@ from dudmap.lab.synthetic.recording import SyntheticSequence
 from dudmap.version import __version__
 
 PENDING = 8
-"""Largest number of frames waiting to be written."""
 
 
 def write_folder(

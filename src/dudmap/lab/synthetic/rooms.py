@@ -31,11 +31,9 @@ DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
 METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
 CARDBOARD = Material("cardboard", (1.6, 1.6))
 MATERIALS = {"wood": WOOD, "dark wood": DARK_WOOD, "metal": METAL, "cardboard": CARDBOARD}
-"""Materials that every scene knows by name."""
 
 
 SOLIDS = tables("synthetic/solids.toml")
-"""Rows of furniture and of movers."""
 
 
 def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
@@ -97,11 +95,9 @@ MAKERS: dict[str, Any] = {
     "box": box, "ellipsoid": ellipsoid, "capsule": capsule, "cylinder": cylinder, "torus": torus,
     "table": table, "chair": chair, "poster": poster, "shelf": shelf, "plant": plant,
 }  # fmt: skip
-"""Functions that make a solid, or a list of them, from the values of a row."""
 
 
 SCENES = tables("synthetic/scenes.toml")
-"""Rows of the scenes by name."""
 
 
 def build_scene(name: str) -> Scene:

@@ -186,4 +186,3 @@ CAMERAS: dict[str, CameraModel] = {
     name: CameraModel(**row | {"faults": SensorFaults(**row["faults"])})
     for name, row in tables("synthetic/sensors.toml")["cameras"].items()
 }
-"""Cameras by name."""

@@ -15,7 +15,6 @@ from dudmap.io.sequences import Sequence
 from dudmap.lab.data import find
 
 Alteration = Callable[[Frame], Frame]
-"""Changes a frame, or raises FrameError if the fault leaves none."""
 SPAN = 0.4, 0.6
 """Part of the recording with altered or missing frames, as shares of its frames."""
 LONG_GAP, CLOCK_STEP = 10.0, 3600.0
@@ -35,7 +34,6 @@ class Delivery(NamedTuple):
 
 
 Schedule = Callable[[NDArray[np.float64]], list[Delivery]]
-"""Deliveries of a recording from its stamps (N,), seconds."""
 
 
 class StreamFault(NamedTuple):
@@ -204,4 +202,3 @@ FAULTS: dict[str, StreamFault] = {
     "depth x 5": StreamFault("unit of 1 mm for 0.2 mm", partial(_altered, alter=partial(scaled, factor=5.0))),
     "depth / 5": StreamFault("unit of 0.2 mm for 1 mm", partial(_altered, alter=partial(scaled, factor=0.2))),
 }  # fmt: skip
-"""All faults by name; the first is a stream without faults."""

@@ -19,8 +19,7 @@ MARGIN = f32(8)
 NEAREST = f32(0.05)
 """Smallest depth in the colour camera at which a point is visible, metres."""
 POINTS, PADDED = 1040, 16
-"""Points processed together, whose rows begin at different cache positions, and size of a portion. The rest of the
-last portion contains no points."""
+"""Points processed together, whose rows begin at different cache positions, and size of a portion."""
 
 
 @scalar

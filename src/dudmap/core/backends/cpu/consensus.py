@@ -15,8 +15,8 @@ BANDS = 12
 REFINED = 5
 """Refined hypotheses per noise level, because three noisy corners seldom give the best motion directly."""
 ROUNDS = 2.0, 1.0, 1.0
-"""Inlier thresholds of the refinement rounds, as multiples of the usual threshold. The first is wider because a
-hypothesis comes from three noisy corners."""
+"""Inlier thresholds of the refinement rounds, multiples of the usual one; the first is wider because three corners
+are noisy."""
 REGULAR = 1e-9
 """Added to the diagonals of linear systems: absolutely for samples with a repeated point, relative to the trace for
 least squares."""

@@ -13,13 +13,10 @@ from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar, written_out
 
 BINS = 128
-"""Bins of the histogram of normalised residuals."""
 MAX_RESIDUAL = 16.0
-"""Upper edge of the histogram, standard deviations of the depth; larger residuals count in the last bin."""
+"""Upper edge of the histogram, standard deviations of the depth."""
 EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
-"""Edges of the bins."""
 CENTERS = (EDGES[:-1] + EDGES[1:]) / 2
-"""Centres of the bins."""
 LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
 """Value to which larger residuals are clipped."""
 BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
@@ -77,7 +74,7 @@ class RegionRules(NamedTuple):
 
 
 exact_sigma = written_out(reading_sigma)
-"""Standard deviation of the depth, rounded like the surrounding kernel."""
+"""``reading_sigma``, rounded like the surrounding kernel."""
 
 
 @exact_scalar

@@ -21,7 +21,6 @@ LONGEST_RUN = 3
 MIN_NEIGHBOURS = 8
 """Smallest number of measurements in the 5x5 neighbourhood of a filled pixel."""
 FILTER_ROWS = 120
-"""Image rows of one band of the filter."""
 
 
 @kernel

@@ -14,12 +14,11 @@ from dudmap.core.backends.parameters import BLOCK, SensorNoise, single
 from dudmap.core.backends.threads import kernel, scalar
 
 BANDS = 16
-"""Bands of a step; the load varies much less between them than between one band per thread."""
+"""Bands of a step; their load varies less than with one band per thread."""
 MAX_FOUND = 1 << 16
 """Largest number of cells that one band may find."""
 FRONTAL_WEIGHT = np.float32(4)
-"""Weight at normal incidence and the reference depth, if weighted by angle and noise. It leaves four steps down to
-the smallest weight 1."""
+"""Weight at normal incidence and the reference depth, if weighted by angle and noise: four steps down to 1."""
 LEAST_DEPTH = 0.05
 """Smallest value of the largest depth in ``pixel_step``, metres."""
 

@@ -9,7 +9,6 @@ import numpy as np
 from dudmap.core.backends.threads import kernel, scalar
 
 EMPTY = -1
-"""Content of a free cell of the table."""
 
 
 @scalar

@@ -11,7 +11,6 @@ from dudmap.core.backends.threads import kernel, scalar
 
 f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
-"""Image rows per band of the upsampling."""
 DISTANCE_COST = np.float32(1e-4)
 """Cost of a low-resolution pixel of image distance in the upsampling, metres: below the resolution of depth, so that
 it decides between equal depths only."""

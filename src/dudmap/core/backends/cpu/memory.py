@@ -10,7 +10,6 @@ from dudmap.core.backends.threads import scalar
 LINES = 16
 """Cache lines per call of ``prefetch_quarter``: a quarter of a block. Most cores can have this many loads pending."""
 LINE = 64
-"""Bytes of a cache line of most processors."""
 
 
 @intrinsic

@@ -17,7 +17,6 @@ from dudmap.core.formulas.surface import crossing, mixed_channel, slope
 from dudmap.core.geometry.mesh import Mesh
 
 BAND = 256
-"""Blocks of one band."""
 
 
 @scalar

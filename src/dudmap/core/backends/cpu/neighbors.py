@@ -10,7 +10,6 @@ from dudmap.core.backends.cpu.memory import load_pair, prefetch
 from dudmap.core.backends.threads import kernel, scalar
 
 AHEAD = 16
-"""Distance between the point that is loaded and the point that is prefetched."""
 
 
 @kernel

@@ -14,12 +14,10 @@ from dudmap.core.formulas.pixel import project, ray
 from dudmap.core.formulas.voxel import sdf_steps
 
 TILE = 8
-"""Pixels along the edge of a tile."""
 BAND = 16
-"""Image rows of one band."""
 INFINITE = np.float32(1e9)
 FAR = np.float32(2)
-"""Distance from the surface, voxels, beyond which the nearest voxel's value replaces the interpolated one."""
+"""Distance from the surface, voxels, beyond which the nearest voxel's value is used."""
 
 
 @kernel

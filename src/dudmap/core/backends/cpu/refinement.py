@@ -11,18 +11,14 @@ from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.voxel import intensity_of, pack_color, pack_voxel, sdf_steps
 
 PAD = 2
-"""Voxels around a block that are read."""
 SIZE = 8 + 2 * PAD
-"""Edge of a block including these voxels."""
 NEAR = np.float32(1)
-"""Largest distance from the surface, voxels, at which the field is examined; farther away it bends at remote edges."""
+"""Largest distance from the surface, voxels, at which the field is examined."""
 SATURATED = np.float32(0.85)
-"""Share of the truncation band beyond which a distance may be truncated and has no shape information."""
+"""Share of the truncation band beyond which a distance may be truncated."""
 PRIOR = 8
-"""Largest weight that a voxel inherits: two frontal measurements at one metre. The next measurements should replace
-the inherited coarse surface."""
+"""Largest weight that a voxel inherits: two frontal measurements at one metre."""
 BAND = 64
-"""Blocks of one band."""
 
 
 @scalar

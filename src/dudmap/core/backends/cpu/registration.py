@@ -26,7 +26,6 @@ SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
 SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 
 COST = 27
-"""Index of the cost among the sums."""
 
 
 @scalar

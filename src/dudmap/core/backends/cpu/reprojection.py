@@ -14,9 +14,8 @@ from dudmap.core.backends.threads import exact, kernel, scalar
 NEAREST = np.float32(0.05)
 """Smallest depth of a projected point, metres."""
 LEAST_WEIGHT = np.float32(0.25)
-"""Smallest sum of the bilinear weights of the pixels with depth: a quarter, the weight of each at equal distance."""
+"""Smallest sum of the bilinear weights of the pixels with depth: the weight of each at equal distance."""
 PARTS = 2
-"""Bands of rows of each older frame."""
 
 
 class Reprojection(NamedTuple):

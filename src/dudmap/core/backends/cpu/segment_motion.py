@@ -13,8 +13,7 @@ MAX_SHARE = 0.15
 """Largest share of the image of a movable segment. Larger ones belong to the room: dynamic only if nearly all of
 their pixels are."""
 MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
-"""Smallest share of dynamic pixels for a dynamic segment: with evidence that the other pixels moved as well, and
-without."""
+"""Smallest share of dynamic pixels for a dynamic segment: with evidence that the others moved, and without."""
 STARTED_SHARE = 0.1
 """Smallest share of seeds in a segment whose pixels in unknown space move, and in a region grown from seeds."""
 DISTANCE_SCALE = 1.0
@@ -30,15 +29,12 @@ SETTLED_SIGMAS = 4
 LEAST_SHARE = np.float32(1e-3)
 """Smallest share of compared pixels in a window; keeps a quotient finite."""
 SIZE, COMPARED, DYNAMIC, DISTANCE, MISMATCH = range(5)
-"""Columns of the evidence of a segment:
-- number of pixels;
-- share of compared pixels, which have a surface of the map (or of an older frame) near;
-- share of dynamic pixels;
-- mean of distance / sigma over the static compared pixels;
-- intensity mismatch over the same pixels, pixels of motion.
+"""Columns of the evidence of a segment: number of pixels; share of compared pixels (a surface of map or older frame is
+near); share of dynamic pixels; mean of distance / sigma over the static compared pixels; their intensity mismatch,
+pixels of motion.
 
-The mismatch is D G / (G + noise)^2. D is the mean absolute deviation of the intensity difference from its mean, G the
-mean gradient. The denominator damps gradients that are not larger than noise.
+The mismatch is D G / (G + noise)^2, with the mean absolute deviation D of the intensity difference and the mean
+gradient G.
 """
 MEAN_DEVIATION = 1.183
 """Mean absolute deviation over median absolute deviation, for normally distributed values."""

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel, scalar
 
 PLANE_STEP = np.float32(0.35)
-"""Largest distance of a pixel from the plane of its neighbour in the same segment, as a share of the largest depth
-step."""
+"""Largest distance of a pixel from the plane of its neighbour, share of the largest depth step."""
 
 
 def segment_surface(

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 CORNERS = tuple(itertools.product((0, 1), repeat=3))
 EDGES = tuple((corner, axis) for axis in range(3) for corner in range(8) if CORNERS[corner][axis] == 0)
-"""The twelve edges as (lower corner, axis)."""
 
 
 def _edge_between(a: int, b: int) -> int:
@@ -45,7 +44,6 @@ EDGE_FACES = tuple(
     )
     for c, axis in EDGES
 )
-"""The two faces that each edge borders."""
 
 
 def _segments(case: int) -> dict[int, int]:

@@ -19,7 +19,7 @@ FINISHED = -(1 << 62)
 """Ticket after the last step."""
 NO_BAND = -1
 PATIENCE = 4096
-"""Number of times that an idle thread yields its core before it leaves, about a millisecond."""
+"""Times that an idle thread yields its core before it leaves, about a millisecond."""
 
 if sys.platform == "win32":
     _yield_core = njit(lambda: None, cache=False)

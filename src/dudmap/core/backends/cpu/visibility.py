@@ -7,7 +7,6 @@ from dudmap.core.backends.threads import scalar
 from dudmap.core.formulas.pixel import band_behind, band_front, elements, project, ray, sigma, transform
 
 TILE = 8
-"""Edge of a tile of the depth image, pixels."""
 SETTLED = 8
 """Fused frames after which a far block is updated in every second frame only."""
 REACH = np.float32(0.8661)

@@ -38,9 +38,7 @@ from dudmap.core.backends.warp.kernels.structs import Lattice, camera_of, struct
 from dudmap.core.backends.warp.memory import down, in_warp, resident, up, wrote
 
 GROUPS = 64
-"""Partial sums after the first level of a sum."""
 PER_THREAD = 8
-"""Pixels that one thread adds up in a linearisation."""
 
 
 class WarpBackend(CpuBackend):

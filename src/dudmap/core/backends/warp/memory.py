@@ -14,7 +14,6 @@ from dudmap.core.backends.warp import faults
 from dudmap.core.backends.warp.kernels import rows as kernels
 
 GROWTH = 1.5
-"""Allocated rows on the device, as a multiple of the used ones."""
 WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.int32): wp.int32, np.dtype(np.uint8): wp.uint8,
 }  # fmt: skip

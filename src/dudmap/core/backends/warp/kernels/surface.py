@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 NUM_SUMS = wp.constant(registration.NUM_SUMS)
 UNKNOWN, SURFACE, FREE = (wp.constant(wp.uint8(state)) for state in (states.UNKNOWN, states.SURFACE, states.FREE))
 LANES = wp.constant(128)
-"""Distance between the pixels of one partial sum, so that neighbouring threads read neighbouring pixels."""
+"""Distance between the pixels of one partial sum: neighbouring threads read neighbouring pixels."""
 Sums = wp.types.vector(registration.NUM_SUMS, wp.float32)
 Corners = wp.types.vector(8, wp.int32)
 
