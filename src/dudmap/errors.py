@@ -41,7 +41,6 @@ class FrameError(DatasetError):
     """One frame of a recording cannot be read or used; the other frames may be valid.
 
     Args:
-        message: The sentence.
         kind: Key under which such frames are counted.
     """
 

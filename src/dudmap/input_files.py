@@ -66,7 +66,6 @@ def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
     """Open a plain file for reading; links are followed.
 
     Args:
-        path: The file.
         pointers: Whether a Git LFS pointer is opened like any text.
     """
     try:

@@ -23,7 +23,6 @@ class OwnFolder:
     """An open folder; names are single ones, without a separator.
 
     Args:
-        path: The folder.
         linked: The folder itself may be a link, such as one named on the command line; its content may not.
 
     Raises:

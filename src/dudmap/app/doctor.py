@@ -34,10 +34,7 @@ class Check:
     """Result of a check.
 
     Attributes:
-        name: Checked thing.
         state: "good"; "note" limits a part of the program; "bad" stops it.
-        found: Finding.
-        mend: Remedy, empty if none is needed.
     """
 
     name: str

@@ -14,7 +14,6 @@ def copied(
     """Copy of an array or of an array-like object.
 
     Args:
-        values: The caller's array, list or number.
         what: Name in messages.
         dtype: Type of the copy; None keeps the type of ``values``.
         shape: Required shape; None allows all.

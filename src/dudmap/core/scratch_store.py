@@ -14,7 +14,6 @@ class ScratchStore:
     Thread-safe.
 
     Args:
-        content: Name of the content in messages.
     """
 
     def __init__(self, content: str) -> None:

@@ -11,9 +11,6 @@ class Outcome(NamedTuple):
     """Outcome of one check.
 
     Attributes:
-        name: Name of the check.
-        figure, limit: Tested metric and its limit; NaN if unknown.
-        reason: Sentence for a figure beyond its limit, else empty.
         at_least: The limit is a lower bound instead of an upper bound.
         overruled_by: Evidence that accepts a figure beyond its limit; empty if there is none.
     """

@@ -58,12 +58,7 @@ class Manner(NamedTuple):
     """Comparison of estimates with the reference: options of ``dudmap evaluate trajectory``.
 
     Attributes:
-        formats: Formats of estimate and reference; None: recognised.
-        clock: Times of poses without times.
-        align: As for ``ate``.
-        max_difference: Largest time difference of associated poses, seconds.
         seconds: Offset added to the times of the estimate; None: the best agreement.
-        scale: Whether to fit the scale of the estimate first.
     """
 
     formats: tuple[str | None, str | None] = (None, None)
@@ -79,14 +74,7 @@ class Score:
     """An estimate and its errors.
 
     Attributes:
-        name: Name of its method.
-        file: Its trajectory.
-        run: Its run folder; None if the trajectory was named directly.
-        figures: Metrics by name and unit, for tables and JSON.
         found: The estimate after correction of time offset and scale.
-        true: The reference, or None.
-        manner: Options of the comparison.
-        remarks: Sentences on how the files were read.
     """
 
     name: str

@@ -94,10 +94,7 @@ def load_trajectories(
     trajectory, if the numbers match.
 
     Args:
-        estimate: A file.
-        reference: A file or a recording, or None.
         formats: Names of both formats, of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
-        clock: Times of poses without times.
 
     Raises:
         ConfigError: The name of a format is unknown, or ``clock`` has two sources or is not needed.
@@ -200,10 +197,6 @@ class TrueSurface(NamedTuple):
     """True static surface of a recording in the world frame of its ground truth.
 
     Attributes:
-        path: Its file.
-        whole: The surface.
-        observed: The part that the camera saw, None if it is not known.
-        observed_path: The file of this part.
     """
 
     path: Path

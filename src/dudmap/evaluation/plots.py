@@ -153,7 +153,6 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
     """Histogram of the registration residuals with the fitted mixture.
 
     Args:
-        axes: Axes for the plot.
         residuals: NPZ file: ``edges`` (B + 1,) in standard deviations of the measurement, ``counts`` (B,), and a
             mixture of two half-normal densities (static, dynamic): ``prior`` (2,), ``sigma`` (2,).
     """

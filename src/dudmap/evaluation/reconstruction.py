@@ -35,9 +35,6 @@ class ThresholdScore(NamedTuple):
 
     Attributes:
         distance: Metres.
-        precision: Share of the estimate within the distance of the reference.
-        recall: Share of the reference within the distance of the estimate.
-        f_score: Harmonic mean of precision and recall.
     """
 
     distance: float
@@ -51,17 +48,11 @@ class SurfaceResult:
     """Comparison of an estimated surface with the true one. Areas of a point cloud are None.
 
     Attributes:
-        accuracy: Distances from the estimate to the reference.
-        completeness: Distances from the reference to the estimate.
-        scores: Precision, recall and F-score per distance.
         area_m2, reference_area_m2, ghost_area_m2: Area of the estimate, of the reference for completeness, and of the
             ghosts.
         ghost_distance: Distance from the reference beyond which the estimate is a ghost, metres.
-        ghost_share: Share of the ghosts in the area of the estimate.
-        missing_share: Share of the reference farther than the ghost distance from the estimate.
         histogram_edges: (B + 1,) metres; the last bin also counts everything beyond.
         accuracy_histogram, completeness_histogram: (B,) share of the estimate, and of the reference, per bin.
-        num_samples: Number of points sampled on each surface.
     """
 
     accuracy: Statistics

@@ -41,11 +41,8 @@ class MaskResult:
         precision: (N,) share of the estimated mask that is in the true mask.
         recall: (N,) share of the true mask that is in the estimated mask.
         iou: (N,) intersection over union.
-        overall_precision, overall_recall, overall_iou: The same over the pixels of all frames.
         mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``SCORED_COVERAGE``.
-        num_scored: Number of those frames.
         false_alarm_share: Mean ``found_share`` over the frames with an empty true mask.
-        num_missing: Number of true masks without an estimated one.
     """
 
     timestamps: Numbers

@@ -30,8 +30,6 @@ class Surface:
 
     Args:
         mesh: The mesh; faces without area are ignored.
-        name: Name of the surface in error messages.
-        points: Accept a mesh without faces as a point cloud.
 
     Attributes:
         area: Square metres; None for a point cloud.
@@ -152,7 +150,6 @@ class SurfaceAlignment:
     Attributes:
         T_reference_estimate: (4, 4) rigid motion of the estimate onto the reference.
         rmse: Root mean square of the point-to-plane distances of the inliers in the last iteration, metres.
-        num_iterations: Number of iterations.
         free_directions: Number of the six degrees of freedom that the surfaces do not determine; they stay fixed.
     """
 
@@ -169,12 +166,6 @@ def register(
 
     Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``, so
     that ghosts and missing parts have no influence.
-
-    Args:
-        estimate: Mesh to be moved.
-        reference: Triangle mesh, the target.
-        T_reference_estimate: (4, 4) initial motion; None is the identity.
-        samples: Number of points sampled on the estimate.
 
     Raises:
         MapError: A mesh has no faces, or too few points lie within ``REACH``.

@@ -93,7 +93,6 @@ class Visit:
     """A map placed in the common frame.
 
     Attributes:
-        volume: The map.
         T_common_map: (4, 4).
         mesh: Its surface in the common frame.
         keyframes: (k, 4, 4) poses of its keyframes in the common frame.

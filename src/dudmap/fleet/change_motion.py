@@ -189,8 +189,6 @@ class _Meeting:
     """Matched points of two bodies under a motion from the first to the second.
 
     Args:
-        there: Visits into which the motion, and its inverse, move the surfaces.
-        bodies: The bodies.
         up: (3,) axis about which things turn.
         count: Most points of each denied surface that are matched.
     """

@@ -80,7 +80,6 @@ class ChangeWatch(RunObserver):
 
     Args:
         before: Map of the earlier visit; it must not be the map that the run updates.
-        others: Observers that receive the events.
         min_size: Edge of the smallest thing, metres.
     """
 

@@ -53,12 +53,7 @@ class Comparison:
     """Comparison of two runs.
 
     Attributes:
-        maps: Of both runs.
         visits: The maps in the world of the first.
-        changes: Changes between the visits.
-        evidence: On the surface of both.
-        alignment, notes: Metrics of the alignment, and messages for the user.
-        min_size: Edge of the smallest reported thing, metres.
     """
 
     maps: tuple[SavedMap, SavedMap]

@@ -46,11 +46,8 @@ class Tile:
     """A written tile.
 
     Attributes:
-        name: Its file is tiles/<name>.glb.
         height: Levels below it, 0 for a leaf.
         low, high: (3,) corners of its surface, metres, world frame.
-        triangles: Number of triangles.
-        children: Tiles that replace it.
     """
 
     name: str

@@ -75,7 +75,6 @@ class SurfacePoints:
         intensity: (n,) float32, 0..1, 0 = unknown.
         color: (n, 3) float32, red green blue, 0..255.
         near: (n,) bool, whether a camera was near enough for its noise to fit into the truncation band.
-        area_each: Surface per point, square metres.
     """
 
     points: NDArray[np.float64]

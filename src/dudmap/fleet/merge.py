@@ -124,7 +124,6 @@ class FleetReport:
 
     Attributes:
         out: Folder of the largest world; it holds the others as part-2, part-3, ...
-        tree: Content of its world.json.
         sentences: Messages for the user: runs that were not joined, joins that contradict others.
     """
 

@@ -144,8 +144,6 @@ class Workers:
     """Processes with one thread each; a single one is this process.
 
     Attributes:
-        peak_rss_mb: Peak memory by process id; empty on Windows.
-        cpu_s: Processor time of all jobs.
     """
 
     def __init__(self, count: int) -> None:

@@ -35,7 +35,6 @@ def bilateral(D: NDArray[np.float32], alpha: float, sigma_s: float, radius: int)
     Reading: eq. 4.8 has D(u) before the sum, and is then the identity; the sum is over D(u_k).
 
     Args:
-        D: Depth.
         alpha: 1/m.
         sigma_s: Pixels.
         radius: Half width of the square window N(u_k), pixels.

@@ -103,8 +103,6 @@ class Registration:
         """Pose (4, 4) that minimises the error, coarse to fine, and the residuals of the finest level there.
 
         Args:
-            volume: The map.
-            levels: Images, finest first.
             T: Initial pose (4, 4), camera to world.
             labels: (h, w) bool, dynamic pixels of the finest level, which do not count. None for none.
         """

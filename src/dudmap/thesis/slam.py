@@ -44,8 +44,6 @@ class ThesisSlam:
     """Dense SLAM as chapter 4 of the thesis describes it. A failed registration is neither detected nor recovered.
 
     Args:
-        camera: Depth camera.
-        config: All parameters; None for the values of the thesis.
         calibration: Of the colour camera; None for colour that is registered to depth, which the thesis assumes.
 
     Attributes:

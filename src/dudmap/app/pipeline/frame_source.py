@@ -32,11 +32,9 @@ class FrameRead(NamedTuple):
     """Result of reading one frame; an image that cannot be read is replaced by its error.
 
     Attributes:
-        frame: The frame.
         true_mask: (H, W) true dynamic mask, None if unknown.
         ms: Reading time of the frame, milliseconds; 0 for a camera.
         given_mask: (H, W) external dynamic mask, None if there is none.
-        prepared: The preprocessed frame, None unless the reader prepares frames.
     """
 
     frame: Frame | FrameError
@@ -51,8 +49,6 @@ class SourceFrame(NamedTuple):
 
     Attributes:
         number: Number of the frame in the recording.
-        read: Result of reading it.
-        dropped: Number of frames dropped since the previous one.
         arrival: Time of arrival in a live run, seconds of ``time.perf_counter``; 0 otherwise.
     """
 

@@ -58,7 +58,6 @@ def given_poses(name: str, sequence: "Sequence", convention: str | None = None, 
 
     Args:
         name: ``recording`` for its own poses, else a file of poses, or a folder with one file per frame.
-        sequence: The recording.
         convention: Format (``pose_files.FORMATS``) and convention (``pose_conventions.WORDS``), separated by commas.
             None recognises the format. The default is camera-to-world, x right, y down, z forward, metres.
         refine: Whether registration starts from the poses.

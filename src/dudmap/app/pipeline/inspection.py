@@ -72,11 +72,9 @@ class Inspection:
         valid_depth: Share of pixels with depth.
         depth_range, voxel_size: Given, or chosen from the depth, metres.
         too_near, too_far: Shares of the measurements below and above ``depth_range``.
-        unreadable: Errors of the sampled frames that cannot be read.
         ground_truth: Number of ground truth poses, 0 without.
         repeats: Shares of frames that repeat the previous one: both images (``frame``), only ``depth`` or only
             ``color``; empty if not compared.
-        warnings: Sentences on suspected faults.
     """
 
     name: str

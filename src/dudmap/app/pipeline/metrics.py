@@ -33,7 +33,6 @@ class RunRecord:
 
     Attributes:
         rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
-        lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read or had another size.
         checks: Figure and limit of all checks per registered frame (``core/tracking/checks.py``).
         repeated: Number of frames that repeat the previous frame, its depth or its colour, by the repeated part.
@@ -46,10 +45,6 @@ class RunRecord:
         depth_limits: Used depths, metres.
         counts: Numbers of frames by attribute of ``FrameResult``, and of ``degenerate`` frames, in which not all
             directions of motion are observable.
-        warnings: Sentences on suspected faults of the recording.
-        masked: Number of frames with an external mask, None without external masks.
-        fused_at_end: Number of frames that a young map held back until the end and then fused.
-        dropped: Number of frames dropped by a live run, None otherwise.
         spent: Seconds, and seconds of processor time, of the run before this process or pass.
     """
 

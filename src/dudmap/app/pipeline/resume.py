@@ -37,11 +37,8 @@ def resume(
     to a run without interruption. A run that ended during the calibration of the colour camera starts again.
 
     Args:
-        out: The run folder.
         sequence: The recording; None opens the recording of the run.
         device: Another device to continue on; the results then differ by rounding.
-        progress: Show a progress bar on a terminal.
-        observers: As for ``run``.
 
     Raises:
         StateError: The folder has no state, the run is finished, its recording has changed, or the state is damaged or

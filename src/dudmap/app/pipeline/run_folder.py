@@ -128,9 +128,6 @@ class RunReport:
     """Result of a run.
 
     Attributes:
-        out: The run folder.
-        metrics: Content of metrics.json.
-        trajectory: Poses of all tracked frames.
     """
 
     out: Path

@@ -56,9 +56,7 @@ class Storing:
     """How a run is stored.
 
     Attributes:
-        recording: Arguments of ``open_sequence``: path, and camera and options as texts.
         every: Seconds between checkpoints; None chooses by their cost.
-        report: Whether a report is made.
     """
 
     recording: dict[str, Any]
@@ -90,10 +88,6 @@ class StoredRun(BaseModel):
     """Description of a run in its database.
 
     Attributes:
-        options: Arguments of the run.
-        recording: Fingerprint of the recording.
-        number: Number of the current pass, None before the first frame.
-        next, frame: Number of the next frame, and fingerprint of the previous one.
     """
 
     options: RunOptions
@@ -108,11 +102,7 @@ class RunState:
     """State of a run.
 
     Attributes:
-        slam, record: System and metrics of the current pass.
-        calibration: Of the camera, as given.
         number: Number of the pass, from 0.
-        next: Number of the next frame.
-        first_record: Metrics of the previous pass, whose system is ``slam.first_pass``.
     """
 
     slam: "Slam"
@@ -147,7 +137,6 @@ class RunStore:
     its content.
 
     Args:
-        out: The run folder, locked by this process.
         every: Seconds between checkpoints; None chooses by their cost.
         notice: Receives messages on failed checkpoints.
 

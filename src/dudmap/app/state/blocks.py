@@ -39,13 +39,7 @@ class MapSnapshot:
     """Changes of a map since the last checkpoint.
 
     Attributes:
-        number: Number of the map in the database.
-        map_id, frame: The map in this process, and its number of fused frames.
         slots, coords, voxels: (n,), (n, 3), (n, VOXELS) int32 of the changed blocks.
-        released: Slots that no longer hold a block.
-        num_slots: Number of slots in use.
-        away: Content number of each region that has left the memory.
-        regions: Regions that the database lacks.
     """
 
     number: int
@@ -115,11 +109,6 @@ class FrameSnapshot:
     """Changes of a frame store since the last checkpoint.
 
     Attributes:
-        number: Number of the store in the database.
-        frames: Frames that the database lacks, by number: depth, colour and mask as files.
-        gone: Numbers of frames in the database that the store no longer holds.
-        kept: Numbers of the frames in the store.
-        store: The store.
     """
 
     number: int

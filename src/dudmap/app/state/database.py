@@ -73,9 +73,6 @@ class StateDatabase:
     Args:
         path: The file; created with its tables if it does not exist.
 
-    Attributes:
-        maps, frames: Track the content of the database.
-
     Raises:
         OSError: The file is a link or anything but a plain file.
         sqlite3.Error: It cannot be created or opened.
@@ -198,9 +195,6 @@ class StateDatabase:
 
 class StateReader:
     """Reads one checkpoint from the database of a run, also during the run.
-
-    Args:
-        path: The file.
 
     Raises:
         StateError: The file is missing or of another version; all methods: it is damaged, or a row is missing.

@@ -46,10 +46,7 @@ class Snapshot:
     """Immutable state of a system at one moment.
 
     Attributes:
-        tree: The parts by name; arrays are referenced by number.
         arrays: Copies of arrays, constant arrays themselves, or lists of plain values.
-        constant: Numbers of the arrays that never change, from frozen dataclasses and named tuples.
-        maps, frames: Changes of maps and stored frames since the last checkpoint.
     """
 
     tree: dict[str, Node] = field(default_factory=dict)
@@ -176,10 +173,6 @@ class TreeReader:
 
     Args:
         reader: Open database; it must stay open while the system lives, because stored frames are read on demand.
-        database: Database that continues the run, None otherwise; it records the restored content.
-
-    Attributes:
-        device: Device of the maps to create.
 
     Raises:
         StateError: There is no state yet; all methods: it is damaged or of another version.

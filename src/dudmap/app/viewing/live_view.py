@@ -49,7 +49,6 @@ class LiveView(RunObserver):
     that is still in the slot, so that the run never waits for the page.
 
     Attributes:
-        costs: Milliseconds per frame in the thread of the run.
     """
 
     def __init__(self, window: Window) -> None:

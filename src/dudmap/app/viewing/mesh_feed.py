@@ -25,7 +25,6 @@ class MeshChanges:
 
     Attributes:
         chunks: Mesh of each changed part; None if its surface is gone.
-        reset: Whether all earlier parts are void, because the map is another one.
     """
 
     chunks: dict[Chunk, Mesh | None] = field(default_factory=dict)

@@ -27,8 +27,6 @@ class PageAccess:
       browser.
 
     Args:
-        host: Address to serve at.
-        port: Port to serve at.
         token: Secret part of the address; None generates one if ``host`` admits other machines.
 
     Attributes:

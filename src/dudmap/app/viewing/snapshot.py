@@ -37,7 +37,6 @@ class MoverBox:
     """A moving object in one frame.
 
     Attributes:
-        id: Number of the object.
         box: (2, 3) metres, world frame, smallest and largest coordinates.
         speed: m/s.
     """
@@ -54,11 +53,8 @@ class FrameFigures:
     Attributes:
         timestamp: Seconds.
         T_world_camera: (4, 4), None if lost.
-        lost_reason: Empty for a tracked frame.
-        movers: The moving objects.
         ms: Processing time, milliseconds.
         residual: Root mean square of the distance residuals at 1 m depth, metres; NaN without registration.
-        dynamic_share: Share of dynamic depth pixels.
     """
 
     timestamp: float

@@ -45,9 +45,6 @@ class BackgroundRenderer:
     """Renders the static scene behind dynamic objects in the frames of a recording.
 
     Args:
-        volume: The map.
-        depth_camera: Of the recorded depth images.
-        color_camera: Of the recorded colour images.
         registered: Whether the pixels of both images correspond.
     """
 

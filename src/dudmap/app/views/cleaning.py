@@ -41,7 +41,6 @@ class Cleaned(NamedTuple):
     """A frame without dynamic objects.
 
     Attributes:
-        frame: As recorded.
         moving: (h, w) bool, replaced pixels of the colour image.
         replaced: (H, W) bool, replaced pixels of the depth image: moving pixels and their shadows.
         color: (h, w, 3) uint8; unknown pixels continue the known ones smoothly.
@@ -62,10 +61,6 @@ class CleanReport:
     """Result of ``clean``.
 
     Attributes:
-        frames: Number of frames written.
-        left_out: Numbers of the frames without a pose or a readable image.
-        replaced: Mean share of replaced pixels.
-        unknown: Mean share of pixels whose background no frame saw.
     """
 
     frames: int

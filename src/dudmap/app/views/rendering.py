@@ -181,9 +181,6 @@ def render_run(
     groundtruth.txt.
 
     Args:
-        camera: Camera of the views; None takes the recording's.
-        fps: Frames per second of a video.
-        progress: Receives the numbers of finished and of all frames.
         whole: Render to the far end of the map, not only to the depth range of the run.
 
     Raises:

@@ -37,7 +37,6 @@ class PairSet:
     Attributes:
         numbers: (P, 2) int64, first and second frame of every pair, in order of time.
         Ts_camera_world: (F, 4, 4) tracked poses.
-        camera: Camera of the depth images.
         depths: (F, h, w) float32; ``images``: (F, h, w) float32 filtered intensities per size, coarse to fine;
             ``brightness``: (F, h, w) float32 unfiltered intensities of the smallest size.
         points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) start of each frame in them.
@@ -147,7 +146,6 @@ class Fit:
     """State of an adjustment, from which another may start.
 
     Attributes:
-        calibration: Current estimate.
         Ts_camera_world: (F, 4, 4) of every frame.
         light: (P, 2) gain and offset of the second image of every pair over the first.
         scales: Standard deviations of intensity (0..1) and depth differences (over sigma(z)).

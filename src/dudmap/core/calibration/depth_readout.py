@@ -39,9 +39,6 @@ class ReadoutSearch:
     second parabola through the nearest three. No readout exceeds the interval between frames.
 
     Args:
-        pairs: Pairs of keyframes.
-        given: Calibration of the colour camera.
-        adjustment: Fits poses and parameters.
         free: (13,) bool, the timing parameters.
         stride: Step through the points of a keyframe.
 

@@ -59,7 +59,6 @@ class Estimate:
         evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of held-out pairs in standard
             errors; NaN if there were too few pairs.
         gain: Share by which the cost of held-out pairs decreased.
-        pairs: Number of pairs.
     """
 
     calibration: Calibration
@@ -76,7 +75,6 @@ class _Trial:
         free: (13,) bool.
         fits: One per half.
         costs: (2, P) each, of intensities and depths of the pairs of the other half.
-        halves: The pairs of either half of the time.
     """
 
     free: NDArray[np.bool_]

@@ -35,15 +35,8 @@ class SelfCalibration(Stateful):
     Each estimate starts from the given calibration. It uses all keyframes of the current submap with recorded colours,
     so that it does not depend on the calibration at tracking time. It runs in another process.
 
-    Args:
-        given: The initial calibration.
-        sensor: Noise of the sensor.
-        live: Use a result as soon as it exists. Otherwise it is used ``USED_AFTER`` frames later, on every machine;
-            only a late result makes a frame wait.
-
     Attributes:
         estimate: The last finished estimate; None before.
-        waits: Number of frames that waited for a result.
     """
 
     estimate: Remembered[Estimate | None] = None
@@ -112,13 +105,10 @@ class ColorCalibration(Stateful):
     """Calibrates the colour camera during tracking, and repaints the maps with the result.
 
     Args:
-        config: Whether to calibrate, and the noise of the sensor.
         camera: Camera of the depth images, without lens distortion.
         start: The initial calibration; None for colour registered to depth. An estimated one with known standard
             deviations is kept.
-        atlas: The maps and the stored frames.
         color_motion: Registers the colours of the frames.
-        live: Use a calibration as soon as it is estimated.
     """
 
     _estimation: Remembered[SelfCalibration | None]

@@ -106,7 +106,6 @@ class Level:
     """One level of the image pyramid.
 
     Attributes:
-        camera: Of the level.
         depth, intensity: (h, w) m; (h, w) 0..1.
         ceiling: Smallest intensity that is saturated.
         shown: Range of intensities in which neither the image nor the map is saturated.

@@ -38,8 +38,6 @@ class Preprocessor:
     its time (measured in ``docs/design-notes.md``).
 
     Args:
-        camera: Camera of the depth images, and without a ``calibration`` also of the colour images.
-        config: Limits and filters.
         calibration: Separate colour camera. Colour taken at another time than the depth is only scaled to its size, not
             registered. Pixels that the colour camera does not see are dropped, because the registration uses both
             images.

@@ -55,7 +55,6 @@ def rectified(
     """Observation at the time of its middle row.
 
     Args:
-        observation: As recorded.
         readout: Readout of the depth image, seconds.
         velocity: (6,) twist of the camera per second, its own axes.
         with_color: Whether colour has the row times of the depth and is rectified with it. Otherwise colour stays as

@@ -40,7 +40,6 @@ def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[in
     ``#`` starts a comment, commas count as blanks, and a first line without a digit is a header.
 
     Args:
-        path: The list.
         columns: Names of the fields, separated by blanks, e.g. ``timestamp file``.
         short: Whether lines with fewer fields are returned, too.
 

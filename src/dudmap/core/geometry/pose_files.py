@@ -61,7 +61,6 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     - Numbers separated by commas with times in nanoseconds are EuRoC.
 
     Args:
-        path: The file.
         option: Name of the option that gives the format, for messages.
 
     Raises:
@@ -102,10 +101,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
     Comments and a header are skipped; times in another unit than seconds are converted.
 
     Args:
-        path: The file.
         name: One of ``FORMATS``; None recognises the format.
-        optional: Skip rows of timed formats that are not a pose or do not increase in time; the remarks count them.
-        option: As for ``pose_format``.
 
     Raises:
         ConfigError: The name is unknown.

@@ -40,11 +40,9 @@ def refine(
     """Create and drop finer blocks in the blocks (slots (n,)) of the coarser level that a frame was fused into.
 
     Args:
-        level: The finer level.
         parents: Blocks of the coarser level.
         slots: (n,) of the coarser level.
         depths: (n,) depths of the block centres in the view, metres.
-        number: Number of the frame.
         config: Thresholds of bend and texture.
         sensor: Noise of the depth camera.
         coarser: Fusion parameters of the coarser level.

@@ -59,7 +59,6 @@ class ObjectView:
     """Object in a frame: image pyramid of the crop around it.
 
     Attributes:
-        levels: Pyramid, coarse to fine.
         weights: Per level (h, w) float32, 1 at pixels of the object, else 0.
         color: (h, w, 3) colours of the finest level.
     """

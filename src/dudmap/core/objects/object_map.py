@@ -30,10 +30,7 @@ class RigidObject:
     """Result of fusing a moving object: its model, or the reason why there is none.
 
     Attributes:
-        id: Number of the object.
         rigid: Whether it is one rigid object that has moved.
-        reason: Reason against rigidity, empty if rigid.
-        frames: Number of fused frames.
         mesh: Its shape, metres, object frame, or None. The origin is the centre of the mesh's box; the axes are the
             world's at first sight.
         trajectory: Its poses T_world_object by the current camera poses, or None.
@@ -67,17 +64,12 @@ class ObjectTrack:
     """State of an object that is registered and fused.
 
     Attributes:
-        id: Number of the object.
-        volume: Its map.
-        area: Visible surface at the start of the map, square metres.
         T_world_object: (4, 4) current pose.
         T_first: (4, 4) pose at the start of the map.
         first_seen, last_seen: Seconds.
         velocity: (6,) of the origin and of the rotation, m/s and rad/s, world axes.
         Ts_camera_object: Poses (4, 4) of the fused frames, by time.
         points: (n, 3) float32, a sample of the fused surface, object frame, metres.
-        misfits: Reason of each frame that contradicted the map.
-        registrations: Number of attempted registrations.
         max_displacement: Largest displacement of its surface since the start of the map, metres.
         recent_poses: Times and poses T_world_object of the last ``velocity_window`` seconds.
         restarts: Misfit that caused each restart of the map; empty for a larger view.

@@ -28,7 +28,6 @@ class MovingPixels:
         points: (n, 3) float32, metres, world frame.
         area: (n,) float32, surface of each pixel across the line of sight, square metres.
         predicted_id: (n,) int32, number of the predicted object, 0 = none.
-        ranges: Start and stop of each region in these arrays, largest surface first.
         shape: Height and width of the image.
     """
 

@@ -47,12 +47,7 @@ class Atlas(Stateful):
     """The submaps, and all poses that change when a submap is corrected or joined.
 
     Attributes:
-        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
         keyframes: Keyframes of all submaps.
-        volumes: Map of each submap, by number; the provisional map during a rebuilding.
-        rebuildings: Incomplete new maps, by number of the submap.
-        current: Number of the submap that is tracked.
-        poses: Poses of all tracked frames, in order of time.
         depth_late: Delay of the depth time stamps in the present calibration, seconds.
         saved: Number of the submap that began as a saved map, or None. Its world frame is kept: other submaps are
             joined to it, and loop closures do not change it, because not all its frames are stored.

@@ -36,10 +36,8 @@ class StoredFrame:
     """A frame as it was fused.
 
     Attributes:
-        frame: Depth, and colour with the exposure of the map, registered with the present calibration.
         static: (H, W) bool, fused pixels.
         T_world_camera: (4, 4).
-        count: Number of fused frames that it represents.
     """
 
     frame: Frame

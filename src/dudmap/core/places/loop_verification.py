@@ -38,9 +38,6 @@ class LoopQuery:
     """A tracked frame that may show a known place.
 
     Attributes:
-        observation: The frame.
-        levels: Its image pyramid, coarse to fine.
-        tracking: Its registration against the current map.
         dynamic_mask: (H, W) bool.
         labels, unverified_mask: See ``PoseEstimate``.
     """

@@ -35,10 +35,6 @@ class MapRebuilding:
     """An incomplete new map of a submap, which also receives all new frames.
 
     Attributes:
-        history: The stored frames.
-        submap: Number of the submap.
-        volume: Its new map.
-        fused: Numbers of the stored frames in the new map.
         shown: Numbers of the stored frames that the provisional map has, or does not need because a near one is in it.
         start: Number of stored frames when the rebuilding began.
     """

@@ -68,10 +68,7 @@ class Keyframe:
     """A tracked frame with stored features.
 
     Attributes:
-        timestamp: Seconds.
         T_world_camera: (4, 4) in the world of its submap; updated when the map is corrected.
-        features: Its static features.
-        submap: Number of its submap.
         last_seen: Last time at which the camera was near its pose, seconds.
     """
 
@@ -87,8 +84,6 @@ class LastFrame:
     """The last tracked frame; its features are extracted when a later frame is lost.
 
     Attributes:
-        keyframe: Its pose, without features.
-        observation: Its images.
         dynamic_mask: (H, W) bool, pixels without features; None for none.
     """
 
@@ -102,7 +97,6 @@ class PlaceMatch:
     """A frame that shows the place of a keyframe.
 
     Attributes:
-        keyframe: The keyframe.
         T_world_camera: (4, 4) pose of the frame in the world of the keyframe's submap.
         num_inliers: Feature matches that agree with the pose.
     """
@@ -155,7 +149,6 @@ class KeyframeDatabase(Stateful):
         """SIFT features of a frame that lie on one static surface.
 
         Args:
-            observation: The frame.
             dynamic_mask: (H, W) bool, excluded pixels; None = none.
         """
         self.settle()

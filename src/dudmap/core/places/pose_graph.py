@@ -18,7 +18,6 @@ class Edge:
     """Measured motion between two poses.
 
     Attributes:
-        a, b: Indices of the poses.
         T_a_b: (4, 4) measured motion.
         sigma_distance: Standard deviation of its translation, metres, per axis.
         sigma_angle: Standard deviation of its rotation, radians, per axis.

@@ -39,8 +39,6 @@ class Recorder:
 
     Args:
         path: The file; it must not exist and end in .mcap.
-        camera: Intrinsics of the depth images.
-        calibration: Of the colour camera, None for registered colour.
 
     Attributes:
         written, dropped: Numbers of frames.

@@ -51,9 +51,6 @@ def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64] | None = None, *, doubl
     """Content of a GLB file (glTF 2.0, sections 3 and 4.4).
 
     Args:
-        mesh: The mesh.
-        T_gltf_mesh: (4, 4) motion of its node; None keeps the axes of the mesh.
-        double_sided: Whether its back can be seen.
     """
     from dudmap.version import __version__
 

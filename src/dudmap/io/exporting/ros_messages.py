@@ -179,10 +179,7 @@ def mover_markers(types: MessageTypes, seconds: float, movers: Sequence[Mapping[
     """``visualization_msgs/MarkerArray`` with the box of every moving object; older boxes are removed.
 
     Args:
-        types: Message classes.
-        seconds: Time.
         movers: Objects with ``id`` and ``box`` (lower and upper corner, metres), as in movers.jsonl.
-        frame: Frame of the boxes.
     """
     markers = [_marker(types, seconds, frame, "movers", 0, CUBE, action=DELETE_ALL)]
     for mover in movers:
@@ -256,11 +253,9 @@ class McapWriter:
 
     Args:
         folder: Of the bag; it must not exist.
-        purpose: Purpose of the package rosbags, for the error that it is missing.
         compressed: Whether the file is compressed by zstd.
 
     Attributes:
-        types: Message classes.
         file: The MCAP file, complete when the writer is closed.
 
     Raises:

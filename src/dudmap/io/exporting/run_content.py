@@ -33,7 +33,6 @@ class RunContent:
     """Results of a run; each file is read on first access.
 
     Attributes:
-        folder: The run folder.
     """
 
     folder: Path

@@ -40,7 +40,6 @@ class Up(NamedTuple):
         sigma_deg: Standard deviation, degrees; None for a given direction.
         evidence: Words for the source.
         contradiction: Sentence against it; empty without one.
-        floor: The floor below, None if there is none.
     """
 
     direction: NDArray[np.float64]
@@ -116,8 +115,6 @@ def find_up(
     Args:
         mesh: The surface, if there is one.
         poses: Of the cameras, in the world of the mesh.
-        measured: Gravity that the recording measured.
-        given: Known direction.
 
     Raises:
         ConfigError: The given direction has no length.

@@ -33,9 +33,7 @@ class View(NamedTuple):
     """A posed image.
 
     Attributes:
-        name: File name without its suffix.
         color: (h, w, 3) uint8, as recorded.
-        depth: (h, w) float32, metres, seen from the colour camera; with gaps if colour has a separate camera.
         moving: (h, w) bool, dynamic pixels of the colour image.
         T_world_color: (4, 4) pose of the colour image.
     """

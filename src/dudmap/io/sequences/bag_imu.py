@@ -31,7 +31,6 @@ def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64]
     """Gravity measured by the first usable IMU of a bag; None without an IMU.
 
     Args:
-        bag: The bag.
         rotation_of: Rotation (3, 3) of vectors in a named frame into the depth camera, None if it is unknown.
 
     Raises:

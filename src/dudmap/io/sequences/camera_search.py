@@ -47,10 +47,7 @@ def known(
     """Intrinsics of a recording: from a file of a usual name, else the published ones, else from any file that fits.
 
     Args:
-        folder: The folder of the recording.
-        published: Intrinsics of the data set, if it is known.
         sizes: Width and height of the depth and of the colour images, None if no image can be read.
-        why: For the message: why the data set's intrinsics are unknown.
 
     Raises:
         DatasetError: No file gives one camera.
@@ -79,7 +76,6 @@ def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
     """Intrinsics in a folder, its parent, or their configuration folders; None without any.
 
     Args:
-        folder: The folder of the recording.
         depth, color: Width and height of the images.
 
     Raises:

@@ -57,7 +57,6 @@ class MeasuredUp(NamedTuple):
     Attributes:
         direction: (3,) unit vector.
         sigma_deg: Root mean square angle of the measurements to it, degrees.
-        source: Of the measurements.
         readings: Their number.
     """
 

@@ -33,7 +33,6 @@ class ImageFolder(Recording):
     its cameras (``published``), its ground truth (``_find_ground_truth``) and ``_read_depth``.
 
     Args:
-        path: The folder.
         camera: Intrinsics that replace the recording's, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``. Colour
             images of another size than depth keep their own camera.
 

@@ -40,8 +40,6 @@ class Series:
     """Images of one folder whose names differ by numbers alone.
 
     Attributes:
-        label: Names of folder and files, with N for every number.
-        files: The images by name.
         kind: ``depth``, ``color``, ``neither``, or empty: by names, and by content if names contradict each other.
     """
 

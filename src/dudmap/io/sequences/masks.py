@@ -28,10 +28,8 @@ class MaskFolder:
         path: The folder.
         timestamps: (N,) increasing timestamps of the frames, seconds.
         camera: Camera of the frames; the masks must have its image size.
-        images: Files of the frames.
 
     Attributes:
-        said: Sentence on how many frames have a mask.
         complete: Whether every frame has one, and every mask a frame.
 
     Raises:

@@ -32,8 +32,6 @@ class NumberedSequence(ImageFolder):
     ``pose`` or ``poses``.
 
     Args:
-        path: The folder.
-        camera: As for ``ImageFolder``.
         color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, for ambiguous names.
 
     Raises:

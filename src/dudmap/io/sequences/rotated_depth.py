@@ -57,7 +57,6 @@ def judge(count: int, read: Callable[[int], NDArray[np.floating]], units_per_met
     """Whether the 16-bit values of the depth images of a recording are rotated.
 
     Args:
-        count: Number of images.
         read: Returns the stored values of an image by number, 0 for no measurement. Fractions exclude 16-bit values.
         units_per_metre: Unit of the values if they are not rotated.
         given: Whether a file or the user gives that number.

@@ -19,9 +19,7 @@ class CompletedFile:
     """The first bytes of a file followed by bytes in memory; rosbags uses it like a path.
 
     Args:
-        path: The file.
         length: Number of bytes of the file that are read.
-        tail: Bytes that are read after these.
         head: Bytes that replace the first bytes of the file.
     """
 

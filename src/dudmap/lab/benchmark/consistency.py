@@ -61,8 +61,6 @@ class Consistency(NamedTuple):
     """Misfits of k trajectories.
 
     Attributes:
-        names: Of the trajectories.
-        gaps: Frames between the two of a pair.
         misfits: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255). A block is the
             pairs that begin in one stretch of the recording, as long as the longest gap.
         counts: (2, gaps, blocks) numbers of pairs.
@@ -148,7 +146,6 @@ class Motion(NamedTuple):
     Attributes:
         T_second_first: (4, 4) of the depth cameras at the times of the middle rows.
         velocities: (6,) twists per second of both frames, camera axes.
-        calibration: Of the cameras.
     """
 
     T_second_first: NDArray[np.float64]

@@ -87,7 +87,6 @@ def measure_sequence(
     Args:
         surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
-        samples: Number of points sampled on each surface.
         passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
         calibrate: Estimate the calibration of the colour camera first; else use the recording's.
     """
@@ -133,7 +132,6 @@ def score_mesh(
     Args:
         whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
         seen: Part of it that the camera saw, for completeness.
-        samples: Number of points sampled on each surface.
     """
     from dudmap.evaluation.reconstruction import compare_surfaces
     from dudmap.evaluation.surface import moved
@@ -176,11 +174,7 @@ def measure_each(
     """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a separate process.
 
     Args:
-        function: Makes a row of an argument; if it fails, the row has ``error``.
-        jobs: Distinct labels for JSON, and arguments.
         workers: Number of processes at a time. Times per frame are reliable with one only.
-        done: Receives every row as soon as it is measured.
-        kept: File (.jsonl) that collects the rows; rows in it are not measured again.
         shared: Reuse the processes for several jobs. If one dies, the remaining jobs have separate processes.
     """
     jobs = list(jobs)

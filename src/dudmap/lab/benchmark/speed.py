@@ -52,9 +52,7 @@ def speed_figures(
     """Measure all quantities; ``announce`` is called with a description of the next measurement.
 
     Args:
-        frames: Number of frames.
         open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
-        recording: Recording of that comparison; None takes a static synthetic room.
     """
     figures, compared = list[SpeedFigure](), list[SpeedFigure]()
     if open3d is not None:  # first, because the other program may not start

@@ -33,8 +33,6 @@ class FaultRun:
     """Result of a stream with a fault.
 
     Attributes:
-        fault: Name of the fault.
-        rejected: Number of frames not used, by kind (``FrameResult.rejected``, ``FrameError.kind``).
         lost, maps: Numbers of lost frames and of submaps in the end.
         errors: (N,) position error per arrived frame, metres; NaN without a pose.
         flagged: (N,) bool, poses that the run itself reports as doubtful: ``FrameResult.blind``, ``uncertain`` or

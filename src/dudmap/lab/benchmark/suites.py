@@ -29,12 +29,8 @@ class Entry:
     """One recording of a suite.
 
     Attributes:
-        name: Name in tables, folders and published metrics.
-        path: Folder, file or archive of a recording on disk; None for a synthetic one.
         parameters: Arguments of ``lab.synthetic.sequence``. ``camera`` is (width, height) in pixels, ``faults`` maps
             fields of ``SensorFaults`` that differ from the sensor's.
-        address: Public page of its download, or empty.
-        max_frames: Use only this many frames from the start.
         parts: Boxes (x0, y0, z0, x1, y1, z1) by name, metres, world frame of the ground truth. Completeness is also
             measured in each.
     """
@@ -142,7 +138,6 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     """Find the recordings of one of ``SUITES``.
 
     Args:
-        name: Name of the suite.
         data: Folder that is searched, two levels deep, or one recording; synthetic worlds need none.
         quick: A few synthetic worlds, in images of 320x240, and at most 60 frames of every recording.
     """

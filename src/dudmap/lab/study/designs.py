@@ -30,7 +30,6 @@ class Factor:
         low, high: Coded values -1 and +1: ends of the range, or smallest and largest level; NaN if levels are no
             numbers.
         scale: Whether the coded value is linear in the value or in its logarithm.
-        whole: Whether the key takes whole numbers only.
     """
 
     key: str
@@ -140,9 +139,7 @@ class DesignOptions(BaseModel):
     """Table ``design`` of a design file.
 
     Attributes:
-        kind: Name of the design.
         samples: Number of points of a Latin hypercube.
-        seed: Seed of a Latin hypercube.
         foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
             interactions of two factors.
     """

@@ -103,7 +103,6 @@ class Run:
         values: Values of the factors by key.
         entry, sequence, replicate: The recording, its name without the replicate, and the replicate's number.
         calibrate: Whether the colour camera is calibrated first.
-        surfaces: Whether the mesh is scored.
         code: Hash of the code that runs it.
     """
 
@@ -132,12 +131,9 @@ class Plan:
     """A study as described by a design file (``docs/study.md``).
 
     Attributes:
-        base: Configuration of the keys that are no factors.
         entries: Recordings: name without the replicate, number of the replicate, and recording.
         responses: Names of the responses; the first is optimised.
-        tune: Table ``tune`` of the design file.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
-        code: Hash of the code.
     """
 
     name: str

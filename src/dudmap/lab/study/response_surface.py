@@ -23,9 +23,6 @@ class Surface:
     """Quadratic model y = b0 + sum b_i x_i + sum b_ij x_i x_j in coded units (-1 to 1) of K factors.
 
     Attributes:
-        scale: The response.
-        factors: The K numeric factors.
-        model: Fitted model of statsmodels.
         blocks: Number of columns of the recordings after the P terms.
         observed: (N,) values of the response.
         coded: (N, K) coded values of the runs.
@@ -167,8 +164,6 @@ class Prediction:
 
     Attributes:
         point: Values of all factors at the optimum; factors without numbers have their best level.
-        best_point: Values of all factors at the best point of the design.
-        reasons: Sentences that cast doubt on the optimum before its confirmation.
     """
 
     surface: Surface
@@ -227,7 +222,6 @@ class Confirmation:
     """Runs at the predicted optimum, and runs at the best point of the design on the same recordings.
 
     Attributes:
-        scale: The response; all values are as analysed.
         predicted, low, high: Predicted mean of ``count`` runs and its interval.
         design_mean: Mean of all runs of the design: the prediction without a model.
         measured, best_point: Means of the runs at the optimum and at the best point of the design.

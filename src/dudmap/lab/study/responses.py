@@ -20,7 +20,6 @@ class Response(NamedTuple):
 
     Attributes:
         key: Key of the metric in a row of ``dudmap.lab.benchmark.measure``.
-        factor: From the unit of the row to the unit of the report.
         better: Whether low or high values are good.
         needs: Ground truth that the recording must have.
     """

@@ -17,8 +17,6 @@ class WithThing:
     """Some frames of a recording, with solids inserted unless nearer depth hides them; missing depth does not hide.
 
     Args:
-        recording: Its colour must be registered to its depth.
-        frames: Numbers of the frames.
         trajectory: Camera poses in the world of the solids; frames without a pose stay unchanged.
         solids: The thing; without any the frames stay unchanged.
     """

@@ -134,7 +134,6 @@ class Figure:
     """Person 1.72 m tall times ``size``, facing +x and standing on z = 0.
 
     Attributes:
-        primitives: The solids, each in the frame of its limb.
         limbs: (P,) number of the limb of each solid.
     """
 

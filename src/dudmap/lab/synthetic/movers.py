@@ -27,8 +27,6 @@ class SyntheticMover:
         primitives: Its solids, each in the frame of its part.
         parts: T_world_part (P, 4, 4) of every solid as a function of time.
         reference: T_world_mover (4, 4) as a function of time; its origin defines the velocity of the mover.
-        present: Whether the mover exists, as a function of time.
-        settles: Whether it counts as static while it is at rest; people never do.
     """
 
     name: str

@@ -44,11 +44,8 @@ class SyntheticSequence:
     """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        camera: Intrinsics of the depth camera; the files state them for colour too.
         faults: Errors of the sensor that its files do not state.
         timestamps: (N,) seconds.
-        parameters: Arguments of its construction.
-        renderer: Renders all solids; solids of movers come last.
     """
 
     calibration = None

@@ -17,7 +17,6 @@ class Material:
     """Appearance of a surface.
 
     Attributes:
-        texture: Name of a texture (``textures.TEXTURES``).
         scale: Repeats of the texture per metre, across and down.
         offset: Shift of the texture in repeats.
         tint: Factors on red, green, blue.
@@ -184,18 +183,13 @@ class Scene:
     """Static scene with the places that camera paths and movers need; z is up, the floor is z = 0.
 
     Attributes:
-        name: Name of the scene.
         primitives: Static solids in the world frame.
-        home: Central pose T_world_camera (4, 4) of the built-in camera paths.
-        target: Point (world frame) at which the camera is aimed.
         space: ((3,), (3,)) corners of the box in which the camera may move.
         extent: ((3,), (3,)) corners of the scene; surfaces outside are not part of the reference surface.
         walk_line: Two floor points; walkers cross the view from the first to the second.
         rest: Pose T_world_body (4, 4) at which boxes are put down or taken away (centre of the bottom face).
         hinge: Pose of a door hinge at the floor; the closed leaf extends along its +x axis and opens against +y.
         lights: Point lights.
-        ambient: Hemisphere light.
-        sky: Colour (0..1) of rays that hit nothing.
         detail: Edge length of the triangles of the reference surface, metres.
         mover_scale: Factor on the size of movers (a small scene such as a desk has small movers).
         ground: Height on which the movers stand, metres.

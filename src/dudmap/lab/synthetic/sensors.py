@@ -29,7 +29,6 @@ class NoiseModel:
         nearest, fade, farthest: Range, metres; the share of missing depth grows between fade and farthest.
         grazing: Cosine of the angle of incidence below which depth is lost.
         edge_loss: Share of depth lost at a depth edge: on its far side, for time of flight on both.
-        speckle: Share of depth lost at random.
         correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
         color_noise: Standard deviation of the colour noise, grey values.
     """

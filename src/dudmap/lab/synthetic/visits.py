@@ -48,7 +48,6 @@ class TrueChange:
     """True change of a thing.
 
     Attributes:
-        thing: Its name.
         kind: One of ``KINDS`` without "opened", or "unknown" if a visit could not see it.
         size: Longest edge, metres.
         T_after_before: (4, 4) motion in the common frame of both visits; the identity if it did not move.
@@ -264,8 +263,6 @@ def visits(
         size: Longest edge of boxes, balls and bins, metres; drawn by default.
         people: Whether people walk through the second visit.
         other_light: Whether the lamps of the second visit are elsewhere.
-        paths: Camera paths of the visits.
-        options: Arguments of ``sequence`` for both recordings.
 
     Raises:
         ConfigError: A name is unknown, or a thing finds no free place in view.
