@@ -14,11 +14,8 @@ POSTPONED = MOST_WAITING
 
 
 class Background:
-    """Does jobs in order; a later call raises the error of a job.
-
-    Another thread does them. ``postponed`` jobs of a live run wait until the caller is idle, because its frames need
-    both cores.
-    """
+    """Does jobs in order in another thread; a later call raises the error of a job. ``postponed`` jobs of a live run
+    wait until the caller is idle."""
 
     def __init__(self, *, postponed: bool = False) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="dudmap-background")

@@ -34,10 +34,8 @@ def process_source(
     observers: "tuple[RunObserver, ...]" = (),
     poses: "GivenPoses | None" = None,
 ) -> None:
-    """Process one frame, count it, save its mask, and report it.
-
-    Masks, images and moving objects are written in the background, because no later frame waits for them.
-    """
+    """Process one frame, count it, save its mask, and report it; files and moving objects are done in the
+    background."""
     index, read = source.number, source.read
     if record.dropped is not None:
         record.dropped += source.dropped

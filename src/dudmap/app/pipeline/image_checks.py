@@ -68,8 +68,8 @@ CHANGED = 0.05
 def focal_error(sequence: "Sequence") -> float | None:
     """Given focal length over the focal length that preserves point distances between two frames; None if unknown.
 
-    With the factor s of x and y, the squared distance s^2 (dx^2 + dy^2) + dz^2 of two points is equal in both frames.
-    It is linear in s^2. Matches fit one affine motion, because a wrong focal length keeps the motion affine.
+    With the factor s of x and y, s^2 (dx^2 + dy^2) + dz^2 of two points is equal in both frames, linear in s^2. Matches
+    fit one affine motion at any focal length.
     """
     found, rng = [], np.random.default_rng(0)
     for index in np.unique(np.linspace(0, max(len(sequence) - 1 - GAP, 0), PAIRS).astype(int)):

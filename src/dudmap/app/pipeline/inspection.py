@@ -120,11 +120,8 @@ def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int,
 
 
 def repeats(sequence: "Sequence") -> dict[str, float]:
-    """Shares of frames with images bit-identical to the previous frame, by repeated image: ``frame``, ``depth`` or
-    ``color``.
-
-    Compared are RUN consecutive frames at SAMPLES places. Empty if no two can be read.
-    """
+    """Shares of RUN consecutive frames at SAMPLES places bit-identical to the previous one: ``frame``, ``depth`` or
+    ``color``; empty if no two can be read."""
     from dudmap.core.frames.stream_check import repeated
 
     counts, pairs = {"frame": 0, "depth": 0, "color": 0}, 0

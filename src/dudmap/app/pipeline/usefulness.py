@@ -12,10 +12,7 @@ MOST = 0.5
 
 
 def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float, float]) -> str | None:
-    """Sentence on a run that is of no use, by its metrics and the number of ``poses`` of its largest map; else None.
-
-    A run is of no use if hardly any frame is in the map, or if the mesh has no triangle.
-    """
+    """Sentence on a run with hardly any frame in the largest map (``poses``) or no triangle in the mesh; else None."""
     frames = metrics["frames"]
     if poses < LEAST_SHARE * frames:
         found = f"{poses} of {frames} frames are in its largest map"

@@ -1,15 +1,8 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables:
-
-- ``blocks``: voxels by map and slot.
-- ``regions``: blocks that have left the memory.
-- ``frames``: stored frames.
-- ``chunks``: parts of arrays by their content.
-- ``state``: the tree.
-- ``meta``: the description of the run.
-
-The write-ahead log makes a checkpoint complete or absent after a crash, and readable during writing.
+Tables: ``blocks`` (voxels by map and slot), ``regions`` (blocks that have left the memory), ``frames`` (stored frames),
+``chunks`` (parts of arrays by content), ``state`` (the tree), ``meta`` (description of the run). The write-ahead log
+makes a checkpoint complete or absent after a crash, and readable during writing.
 """
 
 import hashlib

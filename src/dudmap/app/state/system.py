@@ -27,10 +27,8 @@ CODE = ("config.py", "core", "app/state", "app/pipeline/metrics.py", "app/pipeli
 
 @cache
 def code_fingerprint() -> str:
-    """Checksum of the code that computes a state and of the versions of its libraries.
-
-    Only the code that wrote a state continues it, because other code would mix two results.
-    """
+    """Checksum of the code that computes a state and of the versions of its libraries: other code would mix two
+    results."""
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     root = Path(str(files("dudmap")))
     for part in CODE:

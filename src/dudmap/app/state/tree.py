@@ -1,10 +1,9 @@
 """Convert state to a tree of plain values and arrays, and back, by the annotations of its classes.
 
-The tree names no classes: the annotation of an attribute determines the class of its value. A value that does not fit
-raises an error.
+The annotation of an attribute determines the class of its value; a value that does not fit raises an error.
 
 - A ``Stateful`` object is restored in place, after its owner created it.
-- Dataclasses and named tuples are created from their fields; an object that occurs twice is created once.
+- Dataclasses and named tuples are created from their fields, once for an object that occurs twice.
 - Functions without arguments and futures are stored by their result.
 
 A node is a number, a text, None, or an object with an ``id`` for references.

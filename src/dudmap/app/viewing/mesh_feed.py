@@ -34,8 +34,8 @@ class MeshChanges:
 class MeshFeed:
     """Copies a growing map from the thread that changes it to a thread that extracts its mesh.
 
-    Each frame adds ``budget_ms`` to a budget. If it covers the cost of the last copy, and the other thread has
-    extracted that copy, up to ``BLOCKS`` changed blocks are copied.
+    Each frame adds ``budget_ms`` to a budget. If it covers the cost of the last copy, which must be extracted, up to
+    ``BLOCKS`` changed blocks are copied.
     """
 
     def __init__(self, budget_ms: float = BUDGET_MS) -> None:

@@ -20,11 +20,10 @@ POLICY_VIOLATION = 1008
 class PageAccess:
     """Decides which connections may see the page.
 
-    - Without a token the page is for this machine. A connection must name the loopback, which excludes web pages that
-      resolve their own name to it (DNS rebinding).
+    - Without a token a connection must name the loopback, which excludes pages that resolve their own name to it (DNS
+      rebinding).
     - With a token the path must be the token.
-    - In both cases the ``Origin`` must be this page, which excludes connections that other pages open in the user's
-      browser.
+    - The ``Origin`` must be this page, which excludes connections by other pages in the user's browser.
 
     Args:
         token: Secret part of the address; None generates one if ``host`` admits other machines.
@@ -73,11 +72,8 @@ class PageAccess:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
 
     def guard(self, server: Any) -> None:  # noqa: ANN401 - viser.ViserServer, of an optional package
-        """Close every forbidden connection to a viser server before anything is sent to it.
-
-        Earlier connections are closed too, and nothing is shown before this call. A page cannot publish the server
-        through viser's relay on the internet.
-        """
+        """Close every forbidden connection to a viser server, also earlier ones, before anything is sent; no page
+        can publish it through viser's relay."""
         connections = server._websock_server
 
         async def check(client: Any) -> None:  # noqa: ANN401 - viser.infra.WebsockClientConnection

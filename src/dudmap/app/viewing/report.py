@@ -64,10 +64,8 @@ CARDS = {
 
 
 class Thumbnails(RunObserver):
-    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames.
-
-    If the number of frames is unknown (camera), up to ``2 NUMBER`` are kept. Beyond it, every second one is removed.
-    """
+    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames, of a camera up to ``2
+    NUMBER``."""
 
     in_background = True
 

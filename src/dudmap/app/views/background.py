@@ -182,10 +182,8 @@ def exposure_gain(
 
 
 def continued(color: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Fill unknown colours (H, W, 3) smoothly by a pyramid of weighted means (pull-push, Gortler et al. 1996).
-
-    The filled area has no edges that a tracker could use.
-    """
+    """Fill unknown colours (H, W, 3) smoothly, without edges, by a pyramid of weighted means (pull-push, Gortler et
+    al. 1996)."""
     if known.all() or not known.any():
         return color
     import cv2

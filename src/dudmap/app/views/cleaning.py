@@ -159,10 +159,8 @@ def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.
 def with_shadow(
     moving: NDArray[np.bool_], depth: NDArray[np.float32], behind: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Mask (H, W) plus connected pixels without depth whose background depth (H, W) is known.
-
-    These are shadows: the object blocks the light of the sensor's projector.
-    """
+    """Mask (H, W) plus connected pixels without depth and with known background depth (H, W): shadows of the
+    projector."""
     return connected(moving, grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0))
 
 
@@ -172,10 +170,11 @@ def unlike(
     where: NDArray[np.bool_],
     surely: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of an image (h, w, 3) whose colours differ unusually from the expected ones.
+    """Pixels (h, w) of an image (h, w, 3) whose colours differ unusually from the expected ones; tested are pixels
+    ``where``.
 
-    Only pixels ``where`` are tested. The usual difference comes from tested pixels that ``surely`` show the expected
-    surface, else from all. Single pixels and lines are discarded, because edges may be off by a pixel.
+    The usual difference comes from tested pixels that ``surely`` show the expected surface, else from all. Single
+    pixels and lines are discarded: edges may be off by a pixel.
     """
     import cv2
 
@@ -197,18 +196,16 @@ def clean_recording(
     progress: "Callable[[int, int], None] | None" = None,
     max_frames: int | None = None,
 ) -> CleanReport:
-    """Write the recording without dynamic objects, in TUM layout, into a new or empty folder.
+    """Write the recording without dynamic objects, in TUM layout, into a new or empty folder: rgb/ and depth/ with
+    their lists, associations.txt, intrinsics.txt, groundtruth.txt if known, and
 
-    The folder receives:
-
-    - rgb/ and depth/ with rgb.txt, depth.txt, associations.txt and intrinsics.txt.
-    - trajectory.txt, the poses of the run, and groundtruth.txt if known.
-    - replaced/ with replaced.txt: masks, 255 = replaced pixels.
+    - trajectory.txt, the poses of the run.
+    - replaced/ with replaced.txt: 255 = replaced pixels.
     - unknown/ with unknown.txt: 255 = pixels whose background no frame saw. Their depth is 0; their colour continues
       the surroundings.
 
-    A separate colour camera keeps its geometry. Then intrinsics.txt holds that camera, and replaced_color/ and
-    unknown_color/ are its masks. ``progress`` receives the numbers of finished and of all frames.
+    A separate colour camera keeps its geometry, which intrinsics.txt holds; replaced_color/ and unknown_color/ are its
+    masks. ``progress`` receives the numbers of finished and of all frames.
 
     Raises:
         DatasetError: The folder is not empty, or run and recording do not match.

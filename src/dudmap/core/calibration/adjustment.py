@@ -215,11 +215,9 @@ class _System:
 class Adjustment:
     """Robust Gauss-Newton over the calibration, the poses of the frames, and the light of the pairs.
 
-    Poses belong to frames, not to pairs: all pairs of a frame determine its pose, several times more accurately than
-    one pair. This also determines the translation between the cameras, which resembles a pose error most.
-
-    ``given`` is the initial calibration, the mean of the priors. ``levels`` are the halvings of the colour images,
-    coarse to fine.
+    Poses belong to frames: all pairs of a frame determine its pose, and so the translation between the cameras, which
+    resembles a pose error most. ``given`` is the initial calibration, the mean of the priors. ``levels`` are the
+    halvings of the colour images, coarse to fine.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
@@ -253,8 +251,8 @@ class Adjustment:
     def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
         """Fit of the poses alone to the calibration of ``start``, and the last residuals (2, n).
 
-        ``levels``: image sizes, all by default. Fine images alone suffice if the poses were fitted to nearly this
-        calibration; another delay displaces the image of a turning camera beyond their convergence.
+        ``levels``: image sizes, all by default. Fine images suffice if the poses were fitted to nearly this
+        calibration.
         """
         fit, residuals = start, np.empty((2, 0), np.float32)
         for level in levels or self.levels:

@@ -34,9 +34,9 @@ def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe
 class ReadoutSearch:
     """Mean robust cost of the pairs of one half of the time, as a function of the depth readout.
 
-    The delay and readout of the colour camera, which resemble the depth readout, and the poses are fitted to each
-    readout. The cost is nearly quadratic. Its minimum is found by a parabola through three readouts, refined by a
-    second parabola through the nearest three. No readout exceeds the interval between frames.
+    Delay and readout of the colour camera, and the poses, are fitted to each readout. The minimum is found by a
+    parabola through three readouts and a second one through the nearest three. No readout exceeds the interval between
+    frames.
 
     Args:
         free: (13,) bool, the timing parameters.

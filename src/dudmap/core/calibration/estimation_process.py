@@ -1,7 +1,6 @@
-"""Estimation of a calibration in a separate process while frames are tracked.
+"""Estimation of a calibration in a separate process: a thread would hold the interpreter lock and delay frames.
 
-A thread would hold the interpreter lock for half of its time and delay the frames. Objects are pickled as in
-``multiprocessing``, which itself would run the user's main module again in the child process.
+Objects are pickled as in ``multiprocessing``, which itself would run the user's main module again in the child.
 """
 
 import os

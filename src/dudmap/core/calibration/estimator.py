@@ -118,23 +118,19 @@ def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
 class CalibrationEstimator:
     """Calibration from pairs of frames of a static scene, by differences of intensity and depth.
 
-    Both colour cameras see a point X of the depth image of frame i. With the calibration theta, the projection
-    pi(theta, xi, X) of ``Calibration`` at camera velocity xi, and the relative pose T of the depth cameras, the
-    residuals are
+    With the projection pi(theta, xi, X) of ``Calibration`` at camera velocity xi, a point X of the depth image of frame
+    i, and the relative pose T of the depth cameras, the residuals are
 
         r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
 
-    An error of theta displaces the colours of both frames differently: it rotates with the camera and varies with its
-    velocity. theta is common to all pairs, T follows from the unknown poses of both frames, and g and o belong to the
-    pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given values.
+    An error of theta rotates with the camera and varies with its velocity. theta is common to all pairs, T follows from
+    the unknown poses of both frames, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to
+    fine, with priors at the given values. The covariance has three parts:
 
-    The covariance has three parts:
-
-    * A sandwich with one score per frame, the sum over its pairs, because errors within a pair and within a frame are
-      correlated (Aronow, Samii and Assenova 2015, without the correction for pairs counted twice).
-    * A factor for differences between both halves of the time beyond it, for example by a bent depth image (Birge
-      1932).
-    * The difference between a fit of all parameters and the result, because wrong given values bias the estimated ones.
+    * A sandwich with one score per frame, the sum over its pairs, whose errors are correlated (Aronow, Samii and
+      Assenova 2015, without the correction for pairs counted twice).
+    * A factor for differences between both halves of the time, for example by a bent depth image (Birge 1932).
+    * The difference between a fit of all parameters and the result: wrong given values bias the estimated ones.
 
     ``given`` is the initial calibration; 2 ``workers`` (threads) process both halves of the time in parallel.
     """
@@ -149,8 +145,7 @@ class CalibrationEstimator:
         """Calibration from keyframes in order of time; parameters without evidence keep their given values.
 
         Groups of parameters leave the given values one by one, most evidence first. Evidence is a better prediction of
-        one half's pairs by an estimate from the other half. A group that only absorbs other errors, such as a bent
-        depth image, varies from place to place and fails this test.
+        one half's pairs by an estimate from the other half.
         """
         halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:

@@ -198,8 +198,8 @@ class KeyframeCollector(Stateful):
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
     ) -> None:
-        """Add a tracked frame, its pose (4, 4) and its moving pixels (H, W). The previous frame may become a keyframe,
-        because its velocity is now known."""
+        """Add a tracked frame with its pose (4, 4) and moving pixels (H, W). The previous one may become a keyframe,
+        as its velocity is now known."""
         now = observation.timestamp
         if observation.ignored is not None:
             dynamic_mask = dynamic_mask | observation.ignored

@@ -77,9 +77,8 @@ def register_color(
 ) -> NDArray[Pixel]:
     """Colour (H, W[, 3]) of each depth pixel, interpolated; the nearest colour pixel outside the colour image.
 
-    Occlusion is not resolved: a surface hidden from the colour camera takes the colour of the occluding surface.
-
-    ``color`` (h, w[, 3]) is the recorded image, ``depth`` (H, W) has no lens distortion, metres, 0 = none.
+    ``color`` (h, w[, 3]) is the recorded image, ``depth`` (H, W) has no lens distortion, metres, 0 = none. Occlusion is
+    not resolved.
     """
     import cv2
 

@@ -30,9 +30,7 @@ class IgnoredRegion:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], camera: Camera, calibration: Calibration | None) -> "IgnoredRegion":
-        """Region of a mask, which has the size of the depth image or of the colour image.
-
-        For a separate colour camera (``calibration``), the region is projected into the other image at all
+        """Region of a mask of the size of the depth or colour image, projected into the other image at all
         ``DISTANCES``.
 
         Raises:
@@ -60,10 +58,7 @@ class IgnoredRegion:
         return cls(depth.copy(), color, _nearest(color))
 
     def filled(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colour image (h, w, 3) with ignored pixels filled from their border.
-
-        The region then has no features or edges that move with the camera.
-        """
+        """Colour image (h, w, 3) with ignored pixels filled from their border, without features or edges."""
         out = color.copy()
         out[self.color] = color.reshape(-1, 3)[self.nearest]
         return out

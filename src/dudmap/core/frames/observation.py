@@ -154,10 +154,10 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
 
 
 def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.0) -> tuple[float, float]:
-    """Range of map intensities that are saturated neither in the map nor in an image with this gain and offset.
+    """Range of map intensities saturated neither in the map nor in an image with this gain and offset.
 
     The saturation limit of the image is ``ceiling``, of the map ``other``. The range is infinite if the exposures
-    hardly differ, because both then saturate at the same pixels.
+    hardly differ.
     """
     gain, offset = exposure
     if 1 / LARGE_GAIN < gain < LARGE_GAIN:

@@ -25,11 +25,8 @@ def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
 
 
 def equally_exposed(before: Pyramid, after: Pyramid) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Grey values (h, w) of two images for matching corners.
-
-    If the light changed, the darker image gets the exposure of the brighter one, and both are clipped to their common
-    unsaturated range.
-    """
+    """Grey values (h, w) of two images for matching corners. After a change of the light the darker image gets the
+    other exposure, and both are clipped to their common range."""
     pair = [before, after]
     dark, bright = sorted(pair, key=lambda pyramid: float(pyramid.coarse.intensity.mean()))
     darker, brighter = dark.coarse.intensity, bright.coarse.intensity
@@ -125,8 +122,8 @@ def consistent_with_static(
 ) -> NDArray[np.bool_]:
     """Whether corners (n,) found elsewhere match as well at the position of a static point.
 
-    The coarse levels of the search see more than the window and may follow a nearer surface. Textures may repeat.
-    Therefore the search is repeated from the static position at full resolution alone.
+    The coarse levels of the search may follow a nearer surface, and textures may repeat: the search is repeated from
+    the static position at full resolution alone.
 
     Args:
         first, second: (h, w) uint8 images.

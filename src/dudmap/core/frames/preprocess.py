@@ -34,8 +34,8 @@ DEPTH_MIN = 1e-3
 class Preprocessor:
     """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
-    The bilateral filter is separable (columns, then rows), an approximation of the exact filter that takes a sixth of
-    its time (measured in ``docs/design-notes.md``).
+    The bilateral filter is separable (columns, then rows), in a sixth of the time of the exact one
+    (``docs/design-notes.md``).
 
     Args:
         calibration: Separate colour camera. Colour taken at another time than the depth is only scaled to its size, not

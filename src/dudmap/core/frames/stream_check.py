@@ -43,13 +43,9 @@ class StreamCheck(Stateful):
     """Checks the stamp and the images of every frame against the previous frames, before registration.
 
     Stamps must increase. The clock counts as reset if ``AGREEING`` consecutive frames increase among themselves but not
-    after the last used one. Their stamps are then shifted to follow the last used one by the usual interval.
-
-    An image that equals the previous one bit for bit is a repetition, because sensor noise never repeats. It occurs if
-    one stream is slower than the other, or if a driver repeats an image in place of a lost one.
-
-    A change of the depth unit multiplies all depths by one factor between two images, faster than any camera motion.
-    Frames are then rejected until the factor is reversed.
+    after the last used one; their stamps are then shifted to follow it by the usual interval. An image that equals the
+    previous one bit for bit is a repetition. A change of the depth unit multiplies all depths by one factor between two
+    images; frames are rejected until it is reversed.
 
     Attributes:
         max_speed: Largest speed of the camera, m/s.
@@ -81,9 +77,8 @@ class StreamCheck(Stateful):
     def judge(self, observation: Observation) -> Verdict:
         """Whether a frame can be used. Each frame must be checked once, in order of arrival.
 
-        The checks are ``clock``, ``duplicate``, ``order``, ``burst`` and ``unit``.
-
-        A frame that proves a clock reset is accepted and changes ``clock_offset``; the caller then calls ``restamped``.
+        The checks are ``clock``, ``duplicate``, ``order``, ``burst`` and ``unit``. A frame that proves a clock reset is
+        accepted and changes ``clock_offset``; the caller then calls ``restamped``.
         """
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
         self.repeats = "" if before is None else repeated(before, self._before)

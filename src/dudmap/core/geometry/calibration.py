@@ -103,11 +103,8 @@ class Calibration:
         return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
     def time_sigma(self, assumed: float) -> float:
-        """Standard deviation of the time between colour and depth of a pixel, seconds.
-
-        If the timing was estimated: root of the sum of the variances of the delay and of both row times (sigma / sqrt
-        12). Otherwise ``assumed``.
-        """
+        """Standard deviation of the time between colour and depth of a pixel, seconds. If the timing was estimated:
+        root of the variances of the delay and of both row times (sigma / sqrt 12). Otherwise ``assumed``."""
         if not {"delay", "depth_readout"} & set(self.estimated) or np.isnan(self.depth_readout_sigma):
             return assumed
         delay, readout = (self.sigma[PARAMETERS.index(name)] for name in ("delay", "readout"))
@@ -125,11 +122,8 @@ class Calibration:
         return out
 
     def with_depth_readout(self, depth_readout: float) -> "Calibration":
-        """The same colour camera with another readout of the depth camera, seconds.
-
-        If the colour readout was estimated, its rows keep their absolute times, else their times relative to the rows
-        of the depth image.
-        """
+        """The same colour camera with another readout of the depth camera, seconds. An estimated colour readout
+        keeps the absolute times of its rows, a given one their times relative to the depth image."""
         known = "readout" in self.estimated
         readout = self.readout + self.depth_readout - depth_readout if known else self.readout
         return replace(self, readout=readout, depth_readout=depth_readout)

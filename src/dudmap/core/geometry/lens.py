@@ -67,22 +67,16 @@ class OtherView:
         self._spread = max(1, int(np.ceil(max(other.fx / one.fx, other.fy / one.fy))))
 
     def depth(self, depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (h, w), metres, of a depth image (H, W) in the second camera; 0 for pixels without a projected
-        measurement.
-
-        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera, each at its own time.
-        """
+        """Depth (h, w), metres, of a depth image (H, W) in the second camera, 0 without a measurement.
+        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera."""
         rows, columns = np.nonzero(depth > 0)
         return self._splatted(rows, columns, depth[rows, columns], T_color_depth)
 
     def mask(
         self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the second camera that show the surface marked by a mask (H, W) of the depth camera.
-
-        Marked pixels without depth take the depth of the nearest marked pixel. Surfaces that other pixels hide from the
-        second camera are left out.
-        """
+        """Pixels (h, w) of the second camera that show the surface marked by a mask (H, W) of the depth camera,
+        unless hidden. Marked pixels without depth take the depth of the nearest marked pixel."""
         from scipy.ndimage import binary_closing, distance_transform_edt
 
         marked = mask & (depth > 0)

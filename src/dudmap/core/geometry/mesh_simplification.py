@@ -1,7 +1,6 @@
 """Mesh simplification by vertex clustering (Rossignac and Borrel 1993): the vertices of each grid cell become one.
 
-Colours belong to vertices. Simplification by quadrics leaves few vertices on a flat wall and would lose its texture;
-clustering keeps vertices evenly spaced.
+Colours belong to vertices: quadrics would leave few on a flat wall and lose its texture.
 """
 
 import numpy as np
@@ -22,11 +21,9 @@ def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
 
 
 def clustered(mesh: Mesh, cell: float) -> Mesh:
-    """Mesh in which all vertices in one cube of edge ``cell`` (metres) with normals in the same octant are merged.
-
-    The merged vertex has their mean position, colour and normal. The octant of the normal keeps the two sides of a thin
-    wall apart. Triangles with two equal corners are dropped.
-    """
+    """Mesh in which all vertices in one cube of edge ``cell`` (metres) with normals in the same octant, which
+    separates sides of a wall, get their mean position, colour and normal. Triangles with two equal corners are
+    dropped."""
     lowest = mesh.vertices.min(axis=0, initial=np.inf)
     cells = np.floor((mesh.vertices - lowest) / cell).astype(np.int64)
     octant = (mesh.normals > 0) @ np.array([4, 2, 1])

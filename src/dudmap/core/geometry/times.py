@@ -27,8 +27,8 @@ UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), 
 def time_unit(stamps: ArrayLike) -> TimeUnit:
     """Unit of time stamps (N,), in any order.
 
-    If all stamps in one of the units lie in this century, it is the unit. Otherwise the median step decides. At 1 to
-    1000 images a second it is at most 1 s, 10^3 ms, 10^6 us or 10^9 ns.
+    If all stamps in one of the units lie in this century, it is the unit. Otherwise the median step decides: at 1 to
+    1000 images a second at most 1 s, 10^3 ms, 10^6 us or 10^9 ns.
     """
     values = np.sort(np.asarray(stamps, dtype=np.float64))
     steps = np.diff(values)

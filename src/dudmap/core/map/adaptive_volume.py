@@ -1,8 +1,8 @@
 """Map with several voxel sizes (thesis section 7.1).
 
-The blocks of ``TsdfVolume`` cover everything observed. They alone hold free space, carving and the band far from the
-surface. Finer blocks, with a half and a quarter of the voxel size, refine them near surfaces with detail
-(``refinement.py``). An observed finer voxel replaces the coarser one.
+The blocks of ``TsdfVolume`` cover everything observed, and alone hold free space, carving and the band far from the
+surface. Finer blocks, with a half and a quarter of the voxel size, refine them near detail (``refinement.py``). An
+observed finer voxel replaces the coarser one.
 """
 
 import numpy as np
@@ -38,10 +38,8 @@ def make_volume(
 class AdaptiveVolume(TsdfVolume):
     """A map with smaller voxels at surface detail (curvature or texture) that the sensor resolves.
 
-    Registration and labels read the coarsest level, so that several voxel sizes change no pose and no mask. Mesh
-    and views read the finest level. See ``docs/adaptive.md``.
-
-    ``levels`` are the finer levels, larger voxels first.
+    Registration and labels read the coarsest level: several voxel sizes change no pose and no mask. Mesh and views read
+    the finest level (``docs/adaptive.md``). ``levels`` are the finer levels, larger voxels first.
     """
 
     def _empty(self) -> None:

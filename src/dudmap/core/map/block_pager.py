@@ -1,7 +1,5 @@
-"""Paging of blocks far from the view: to a store on disk, and back before they are in view.
-
-Blocks move in regions, cubes of 16x16x16 blocks (Niessner et al. 2013, section 5).
-"""
+"""Paging of regions of 16x16x16 blocks far from the view to a store on disk, and back (Niessner et al. 2013, section
+5)."""
 
 from collections.abc import Callable
 from itertools import product
@@ -43,8 +41,8 @@ class Away(NamedTuple):
 class BlockPager(Stateful):
     """Moves regions of a map between memory and a store on disk.
 
-    A region is either in memory or in the store, so that the content of the map does not depend on paging. Writing or
-    reading a region with surfaces takes a few milliseconds.
+    A region is in one of both, so that the content of the map does not depend on paging. Writing or reading a region
+    takes a few milliseconds.
 
     Attributes:
         max_blocks: Largest number of blocks with voxels in memory, of all levels, or a limit that is evaluated each
@@ -111,10 +109,8 @@ class BlockPager(Stateful):
         self._returned.pop(_key(first >> REGION_BITS), None)
 
     def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
-        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` blocks around it.
-
-        If memory holds too many blocks, the farthest regions leave. The entries in memory are then renumbered.
-        """
+        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` around it. If too many are in
+        memory, the farthest regions leave, and the entries are renumbered."""
         first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
         last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
         wanted = self._stored_in(first, last) if self._away else []

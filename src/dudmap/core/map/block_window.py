@@ -44,11 +44,8 @@ class BlockWindow(Stateful):
         self.near = np.empty(0, dtype=np.int32)
 
     def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
-        """Origin (3,) of a window centred on a point (3,), metres; None if the window can stay.
-
-        It stays while the centre moves by at most ``MARGIN`` blocks. A window emptied by paging returns to its old
-        origin ``left`` (3,) in that case.
-        """
+        """Origin (3,) of a window centred on a point (3,), metres; None while the centre moves by at most ``MARGIN``
+        blocks. A window emptied by paging then returns to its old origin ``left`` (3,)."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         last = self.origin if left is None else left
         if last is None:

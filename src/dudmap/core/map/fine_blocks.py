@@ -111,11 +111,8 @@ class FineBlocks(Stateful):
     def take_colors(
         self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
     ) -> None:
-        """Give blocks (n,) the colours and intensities of this level of another map.
-
-        Voxels that the other map does not refine or colour take the ``interpolated`` voxels and colours (n, 512) of its
-        coarser level.
-        """
+        """Give blocks (n,) the colours and intensities of this level of another map, or where it has none, the
+        ``interpolated`` voxels and colours (n, 512) of its coarser level."""
         blocks, (voxels, colors) = self.blocks, interpolated
         there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
         painted = (there[:, None] >= 0) & (other.blocks.colors[there] != 0)
@@ -159,10 +156,8 @@ class FineBlocks(Stateful):
 
 
 class BlockTree:
-    """Blocks of the coarsest level with all finer blocks inside them, for ``BlockPager``.
-
-    Entries are entries of the coarsest level; slots and memory count all levels, larger voxels first.
-    """
+    """Blocks of the coarsest level, the entries, with all finer blocks inside them, for ``BlockPager``. Slots and
+    memory count all levels, larger voxels first."""
 
     def __init__(self, blocks: VoxelBlocks, levels: Sequence[FineBlocks]) -> None:
         self.blocks, self.levels = blocks, levels

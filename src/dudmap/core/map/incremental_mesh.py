@@ -17,8 +17,8 @@ GROWTH = 4
 class VolumeMirror:
     """Copy of a volume, updated by copying only the blocks written since the last copy.
 
-    ``update`` runs in the thread that changes the volume. Between two updates any thread may read the copy ``volume``
-    (``extract_mesh``, ``IncrementalMesh``), whose frames count the updates.
+    ``update`` runs in the thread that changes the volume. Between two updates any thread may read the copy ``volume``,
+    whose frames count the updates.
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
@@ -34,11 +34,8 @@ class VolumeMirror:
         self._copied = [np.zeros(0, dtype=np.int32) for _ in range(levels)]  # frame up to which each slot was copied
 
     def update(self, limit: int | None = None) -> None:
-        """Copy the blocks written since the last update.
-
-        ``limit`` is the largest number of blocks of the coarsest level. The least recently copied blocks come first;
-        the others keep their earlier state. None copies all.
-        """
+        """Copy at most ``limit`` blocks of the coarsest level written since the last update, the least recently
+        copied first; None copies all."""
         if self._source.map_id != self.volume.map_id:  # the map was cleared
             self._start()
         source, target = self._source.blocks, self.volume.blocks
@@ -79,10 +76,9 @@ Chunk = tuple[int, int, int]
 class IncrementalMesh:
     """Mesh of a volume, kept up to date for a live view while the map grows.
 
-    The map is divided into chunks of 4x4x4 blocks. An update extracts the chunks that contain or touch a block written
-    since the last update. Its time is proportional to the view, not to the map. All chunks together are the surface of
-    ``TsdfVolume.extract_mesh``, with duplicate vertices between chunks. Updates and ``integrate`` must not run at the
-    same time.
+    An update extracts the chunks of 4x4x4 blocks that contain or touch a block written since the last update: its time
+    grows with the view, not with the map. All chunks together are the surface of ``TsdfVolume.extract_mesh``, with
+    duplicate vertices between chunks. Updates and ``integrate`` must not run at the same time.
 
     ``chunks`` are the meshes of all chunks with a surface, by chunk coordinates. Chunk (i, j, k) begins at block (4 i,
     4 j, 4 k).
@@ -98,10 +94,8 @@ class IncrementalMesh:
         self._reach = 2 if volume.levels else 1
 
     def update(self) -> list[Chunk]:
-        """Extract the chunks changed since the last update, and return the coordinates of all that may have changed.
-
-        A returned chunk that is not in ``chunks`` has no surface any more.
-        """
+        """Extract the changed chunks, and return the coordinates of all that may have changed; those not in
+        ``chunks`` have no surface any more."""
         removed: list[Chunk] = []
         if self._volume.map_id != self._map_id:  # the map was cleared: its frame numbers restart
             removed = list(self.chunks)

@@ -19,8 +19,7 @@ _STATM = Path("/proc/self/statm")
 class MemoryLimit:
     """Memory limit of the process, shared by all its maps.
 
-    The maps may use the rest of ``limit`` bytes of resident memory. The memory of the rest of the program is measured
-    each time, because it depends on camera, configuration and platform. Paging changes no result.
+    The maps may use the rest of ``limit`` bytes of resident memory, measured each time. Paging changes no result.
 
     Raises:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.

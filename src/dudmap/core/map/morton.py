@@ -1,7 +1,6 @@
 """Morton codes of blocks (Morton 1966): the bits of the three coordinates interleaved.
 
-Blocks with neighbouring codes are close. An aligned cube of ``2^k`` blocks per edge has one contiguous range of codes,
-with equal ``code >> 3 k``.
+An aligned cube of ``2^k`` blocks per edge has one contiguous range of codes, with equal ``code >> 3 k``.
 """
 
 import numpy as np

@@ -123,11 +123,8 @@ class PagedMap(Stateful):
             yield self.all_blocks.records(self.blocks.entries_in(first, first + REGION))
 
     def take_colors(self, other: "PagedMap") -> None:
-        """Replace colours and intensities from another map of the same world; distances and weights stay.
-
-        A voxel without colour in the other map loses its colour, and takes the colour of the next measurement near the
-        surface.
-        """
+        """Replace colours and intensities from another map of the same world. A voxel without colour there takes the
+        colour of the next measurement near the surface."""
         assert other.config == self.config
         number = self._frame_number + 1
         for level in range(1 + len(self.levels)):
@@ -153,10 +150,8 @@ class PagedMap(Stateful):
         return self._frame_number
 
     def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Slots (n,) int32 written after frame ``num_integrated``, and the coordinates (n, 3) int32 of their blocks.
-
-        A released slot is included, with the coordinates of its last block or of its new one.
-        """
+        """Slots (n,) int32 written after frame ``num_integrated``, also released ones, and the coordinates (n, 3)
+        int32 of their last or new blocks."""
         blocks = self.blocks
         slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
         return slots, blocks.slot_coords[slots].astype(np.int32)

@@ -333,10 +333,8 @@ class TsdfVolume(PagedMap):
         return joined(self.extract_chunks(slots, np.zeros(len(slots), np.int64), min_weight))
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
-        """The mesh region by region, in Morton order; each region has its own copies of the vertices at its borders.
-
-        Blocks are paged meanwhile. Frames must not be integrated until the end.
-        """
+        """The mesh region by region, in Morton order, each with its own vertices at borders. Blocks are paged
+        meanwhile; frames must not be integrated until the end."""
         reach = np.arange(-1, REGION + 1, dtype=np.int32)
         offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
         inner = np.all((offsets >= 0) & (offsets < REGION), axis=1)
@@ -348,10 +346,8 @@ class TsdfVolume(PagedMap):
 
     @property
     def min_weight(self) -> int:
-        """Smallest weight of a voxel for mesh and views: the configured one.
-
-        In a map of few frames it is half the number of frames, because every measurement has at least weight 1.
-        """
+        """Smallest weight of a voxel for mesh and views: the configured one, or half the number of frames in a map
+        of few frames."""
         return min(self.config.min_weight, (self.num_frames + 1) // 2 or self.config.min_weight)
 
     def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
@@ -363,8 +359,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        ``slots`` (n,) are the blocks to mesh and all blocks that touch them. ``chunks`` (n,) is the group of each,
-        counted from 0; -1 for blocks that only provide voxels at the border.
+        ``slots`` (n,) are the blocks to mesh and all that touch them; ``chunks`` (n,) the group of each from 0, -1 for
+        blocks that only provide borders.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbourhood(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(

@@ -60,8 +60,8 @@ _TYPES = {
 class VoxelBlocks(Stateful):
     """The blocks of a map.
 
-    An entry is an observed block; an entry near a surface owns a slot of 512 voxels. Arrays are larger than their
-    content and grow by factors. The constructor reserves ``slots``, which take no memory while unused.
+    An entry is an observed block; near a surface it owns a slot of 512 voxels. Arrays grow by factors. The constructor
+    reserves ``slots``, which take no memory while unused.
 
     Attributes:
         table: Hash table of entry numbers (``core/backends/cpu/hashing.py``).
@@ -169,10 +169,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all slots (used or released), all entries and the hash table.
-
-        Spare capacity is not counted: it is address space without physical memory.
-        """
+        """Memory of all slots, entries and the hash table, without spare capacity, which is only address space."""
         return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
 
     @property

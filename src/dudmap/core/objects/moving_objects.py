@@ -33,10 +33,8 @@ class _Frame:
 
 
 class MovingObjects(Stateful):
-    """Tracks the objects that are labelled as moving, without influence on the camera pose or the map.
-
-    ``movers`` of the configuration switches tracking and fusion on and off.
-    """
+    """Tracks the objects that are labelled as moving, without influence on pose or map; ``movers`` of the
+    configuration switches it."""
 
     tracker: Remembered[ObjectTracker | None]
     fusion: Remembered[ObjectFusion | None]
@@ -49,10 +47,9 @@ class MovingObjects(Stateful):
         self._finding = Lock()
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
-        """Record a tracked frame; the returned function computes its moving objects, sorted by id.
+        """Record a tracked frame; the returned function computes its moving objects, sorted by id, in any thread.
 
-        The function may be called from any thread. It also computes the objects of all earlier frames. Without calls,
-        only the last ``MOST_WAITING`` frames are kept, and identities begin at the first of them. With fusion, objects
+        It also computes the objects of all earlier frames; of these at most ``MOST_WAITING`` wait. With fusion, objects
         are computed at once.
         """
         if self.tracker is None or estimate.labels is None:

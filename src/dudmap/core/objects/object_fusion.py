@@ -1,8 +1,8 @@
 """Rigid fusion: a map and a trajectory for every moving object that proves to be rigid.
 
 An object is registered to its own map and fused there (thesis section 4.4; Ruenz and Agapito, Co-Fusion, 2017).
-Rigidity is measured, not classified: later frames observe the unoccluded surface of a rigid object again, but see
-through the old surface of a leg. The objects never influence the camera pose or the static map.
+Rigidity is measured: later frames observe the surface of a rigid object again, but see through the old surface of a
+leg. Camera pose and static map do not depend on it.
 """
 
 from collections.abc import Sequence
@@ -180,10 +180,10 @@ class ObjectFusion(Stateful):
         T_world_camera: NDArray[np.float64],
         exposure: tuple[float, float],
     ) -> list[Mover]:
-        """Register and fuse the objects of a tracked frame, whose masks belong to ``level``.
+        """Register and fuse the objects of a tracked frame, whose masks belong to ``level``; return the objects.
 
-        Returns the objects; an established object gets the velocity of the centre of its map. The velocity of the
-        visible surface differs: the visible upper half of a rolling ball is faster than the ball.
+        An established object gets the velocity of the centre of its map: the visible upper half of a rolling ball is
+        faster.
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):

@@ -1,7 +1,6 @@
 """Moving objects with a lasting identity, position, extent and velocity (thesis section 7.1).
 
-An object is a spatially connected set of pixels that are labelled as moving, without a classifier. Its estimates never
-influence the camera pose or the map.
+An object is a spatially connected set of moving pixels, without a classifier; it never influences camera pose or map.
 """
 
 from dataclasses import dataclass, field
@@ -101,16 +100,12 @@ class _Track:
 class ObjectTracker(Stateful):
     """Segments the moving pixels of each frame into objects and associates them with earlier objects.
 
-    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel.
-    If two separate objects touch, their connected region is split by the nearest predicted pixel.
+    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel,
+    and split the region of touching objects. Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
 
-    Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
-
-    * A fully visible object: slope of a line through its positions, because the visible surface of a rolling ball is
-      faster than the ball.
-    * An object cut off by the image border or an occluder: its position is unknown. Mean of its frame-to-frame
-      displacements without outliers, each the median over pixels matched by forward-backward optical flow (Lucas and
-      Kanade 1981).
+    * A fully visible object: slope of a line through its positions (the surface of a rolling ball is faster).
+    * An object cut off by the image border or an occluder: mean of its frame-to-frame displacements without outliers,
+      each the median over pixels matched by forward-backward optical flow (Lucas and Kanade 1981).
     """
 
     _tracks: Remembered[list[_Track]]

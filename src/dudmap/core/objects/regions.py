@@ -117,10 +117,8 @@ def connected_regions(
 
 
 def split_between(pixels: MovingPixels, indices: NDArray[np.int64], ids: Collection[int]) -> list[NDArray[np.int64]]:
-    """Pixels (k,) of a region per object: each pixel belongs to the object of the nearest predicted pixel.
-
-    Each object of ``ids`` must be predicted in some pixels of the region.
-    """
+    """Pixels (k,) of a region per object of ``ids``, each predicted in it: a pixel belongs to the object of the
+    nearest predicted pixel."""
     import cv2
 
     predicted = pixels.predicted_id[indices]

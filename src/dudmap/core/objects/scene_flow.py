@@ -41,8 +41,8 @@ def displacements(
 ) -> dict[int, NDArray[np.float64]]:
     """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame.
 
-    The result contains the ``known`` objects with enough matched pixels in both frames. Pixel displacements longer than
-    ``max_jump`` metres are mismatches.
+    It contains the ``known`` objects with enough matched pixels in both frames. Displacements beyond ``max_jump``
+    metres are mismatches.
     """
     import cv2
 

@@ -88,11 +88,8 @@ class Atlas(Stateful):
         *,
         keep_frames: bool,
     ) -> "Atlas":
-        """An atlas with one empty map, for frames of a camera without lens distortion.
-
-        Frames are stored for corrections if ``keep_frames`` is set and the configuration needs them. A ``prior`` map of
-        a first pass provides the keyframes; no frames are stored then.
-        """
+        """An atlas with one empty map. Frames are stored for corrections if ``keep_frames`` is set and the
+        configuration needs them. A ``prior`` map of a first pass provides the keyframes; no frames are stored then."""
         if prior is not None:
             return cls(make_volume, prior.keyframes, None, prior.submap)
         keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
@@ -134,11 +131,8 @@ class Atlas(Stateful):
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
     def recolor(self) -> None:
-        """Repaint all maps with the colours of the stored frames under the present calibration.
-
-        The current map is repainted during the next frames, so that none of them waits. A saved map keeps its colours,
-        because not all its frames are stored.
-        """
+        """Repaint all maps with the colours of the stored frames under the present calibration, the current one
+        during the next frames. A saved map keeps its colours."""
         assert self.history is not None
         self.complete()
         for number in self.volumes:
@@ -184,8 +178,8 @@ class Atlas(Stateful):
             self.history.remove_submap(self.current)
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
-        """Append the pose (4, 4) of a frame in the current submap. A tracked pose replaces the predicted poses since
-        the last tracked frame by interpolated ones."""
+        """Append the pose (4, 4) of a frame in the current submap. A tracked pose replaces predicted ones since the
+        last by interpolation."""
         new = TimedPose(timestamp, T_world_camera, self.current, repeats, self.depth_late)
         first = len(self.poses)
         while repeats != "depth" and first and self.poses[first - 1].repeats == "depth":
@@ -284,9 +278,9 @@ class Atlas(Stateful):
     ) -> NDArray[np.float64]:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
-        Trajectory and keyframes receive the correction interpolated in time between the stored frames. ``volume`` was
-        built from the stored frames ``nodes`` at their new poses (n, 4, 4). If it was built only from ``fused``, it is
-        provisional until the map of all frames is complete. Returns the motion (4, 4) of the newest stored frame.
+        Trajectory and keyframes receive the correction interpolated in time. ``volume`` was built from the stored
+        frames ``nodes`` at their new poses (n, 4, 4); if only from ``fused``, it is provisional until the map is
+        complete. Returns the motion (4, 4) of the newest stored frame.
         """
         assert self.history is not None
         frames = [self.history.frames[n] for n in nodes]
@@ -307,8 +301,8 @@ class Atlas(Stateful):
         return [place for place in (*self.poses, *self.keyframes.places, *frames) if place.submap == submap]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64]) -> None:
-        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,). A
-        running repainting is cancelled, because the map is rebuilt afterwards with the present colours."""
+        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); a
+        running repainting is cancelled."""
         self.repainting = None
         for place in self._places(self.current):
             correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)

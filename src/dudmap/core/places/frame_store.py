@@ -70,15 +70,10 @@ class KeptFrame:
 class FrameStore(Stateful):
     """Selected fused frames in a temporary file, which the operating system removes.
 
-    A frame is stored if one of these holds:
-
-    * the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored frame
-    * ``gap`` frames were fused since then
-    * the submap is another
-
-    Other frames increase the count of the last stored frame. One background thread encodes the frames (depth RVL,
-    colour JPEG, mask PNG). Memory grows by about 1.5 kB per stored frame. Frames are numbered in order of time; a frame
-    without images keeps its number and pose. Not thread-safe.
+    A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
+    frame, ``gap`` frames were fused since then, or the submap is another. Other frames increase the count of the last
+    stored frame. A background thread encodes the frames (depth RVL, colour JPEG, mask PNG). Frames are numbered in
+    order of time; a frame without images keeps its number and pose. Not thread-safe.
 
     Attributes:
         registered: Registers recorded colour to the depth image; None if colour is registered already.
@@ -128,10 +123,10 @@ class FrameStore(Stateful):
         submap: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> bool:
-        """Store a fused frame with its recorded colour, or increase the count of the last stored frame.
+        """Store a fused frame with its recorded colour, or increase the count of the last stored frame; return whether
+        it was stored.
 
-        Returns whether the frame was stored. Pixels that were not fused are stored too; the arrays must not change
-        afterwards.
+        Pixels that were not fused are stored too; the arrays must not change afterwards.
 
         Raises:
             MapError: The temporary file cannot be written.

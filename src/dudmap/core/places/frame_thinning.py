@@ -1,8 +1,7 @@
 """Removal of stored images that newer frames replace: their number grows with the observed space, not with time.
 
-The map is a running average with a capped weight, so that only the newest measurements of a surface count. An old frame
-whose view was fused often enough later would hardly change a rebuilt map. Its pose stays a node of the pose graph,
-which takes little memory.
+In a running average with a capped weight only the newest measurements of a surface count. The pose stays a node of the
+pose graph.
 """
 
 import numpy as np
@@ -22,14 +21,11 @@ MIN_KEPT = 256
 
 
 class FrameThinning(Stateful):
-    """Removes the images of frames of the current submap whose view newer frames show.
+    """Removes the images of frames of the current submap whose view newer frames show (SAME_DISTANCE, SAME_ANGLE_DEG).
 
-    Two conditions must hold for newer frames of the same view (SAME_DISTANCE, SAME_ANGLE_DEG):
-
-    * They fill every cell that the frame was fused in: more than ``similarity.threshold`` of the measurements that a
-      voxel's running average can hold. Background behind an object that stays is thus kept.
-    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen. A loop closure is verified
-      against frames stored until then.
+    * They fill every cell that the frame was fused in: more than ``similarity.threshold`` of the measurements of a
+      running average. Background behind an object that stays is thus kept.
+    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, for the verification of loops.
     """
 
     _stored: Remembered[int] = 0  # number of frames stored until the last call

@@ -51,16 +51,10 @@ class LoopSearch:
 class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
-    A match is accepted if all of these hold:
-
-    * features (3D-3D RANSAC), distances and intensities of the local map of the matched time give the same camera pose
-    * a second frame confirms the correction
-    * the newest frame has not been registered to the older surfaces meanwhile
-
-    One background thread matches features. The result is always evaluated ``CHECK_INTERVAL`` frames later, so that
-    results do not depend on timing.
-
-    ``closed`` is the number of corrections and joins made.
+    A match is accepted if features (3D-3D RANSAC), distances and intensities of the local map of the matched time give
+    the same camera pose, a second frame confirms the correction, and the newest frame has not been registered to the
+    older surfaces meanwhile. A background thread matches features; the result is evaluated ``CHECK_INTERVAL`` frames
+    later, independent of timing. ``closed`` is the number of corrections and joins.
     """
 
     corrector: Remembered[LoopCorrector]

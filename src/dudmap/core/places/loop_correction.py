@@ -40,11 +40,9 @@ class LoopCorrector(Stateful):
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Measured motion to the newest stored frame from the stored frame nearest in time to a recognised keyframe.
-
-        ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose relative to the map at the
-        time of the keyframe. Returns None if both stored frames are the same.
-        """
+        """Measured motion to the newest stored frame from the one nearest in time to a recognised keyframe, None if
+        they are the same. ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose
+        relative to the map at the time of the keyframe."""
         history = self.atlas.history
         assert history is not None
         nodes = self.atlas.nodes(self.atlas.current)
@@ -60,9 +58,8 @@ class LoopCorrector(Stateful):
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
 
-        The correction is applied only if the poses are finite and the new pass fits the map of the old pass. Its misfit
-        may hardly exceed the misfit to its own map. Returns the motion (4, 4) of the newest pose, None if the
-        correction was rejected.
+        Returns the motion (4, 4) of the newest pose, or None: the poses are not finite, or the misfit of the new pass
+        to the map of the old pass exceeds the misfit to its own map.
         """
         history = self.atlas.history
         assert history is not None

@@ -94,11 +94,9 @@ class LoopVerifier:
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
         """Whether a correction improves the fit of the newest frame to the map of the time of a place.
 
-        Frames are registered to the whole map, including old surfaces. Near a revisited place, registration can return
-        to the older surfaces by itself. A correction measured a few frames earlier would then displace the camera.
-
-        The older pass consists of the frames stored before the farthest point of the path since the last visit. Returns
-        True if no stored frame of it is near.
+        Near a revisited place registration can return to the older surfaces by itself; an earlier correction would then
+        displace the camera. The older pass are the frames stored before the farthest point of the path since the last
+        visit. True if no stored frame of it is near.
         """
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked

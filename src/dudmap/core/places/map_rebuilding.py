@@ -1,9 +1,8 @@
 """Rebuilding of a map from the stored frames of its submap, a few with every new frame.
 
-Corrected poses require a new map. ElasticFusion (Whelan et al. 2015) deforms the surface; BundleFusion (Dai et al.
-2017) re-integrates frame by frame, as here. The new map is fused in order of time, because later frames carve surfaces
-of earlier ones; it is used when complete. Until then frames are registered to a provisional map of stored frames with
-the present view.
+ElasticFusion (Whelan et al. 2015) deforms the surface; BundleFusion (Dai et al. 2017) re-integrates frame by frame, as
+here, in order of time, because later frames carve. Until the new map is complete, frames are registered to a
+provisional map of stored frames with the present view.
 """
 
 from collections.abc import Iterable, Sequence

@@ -180,10 +180,10 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
-        """Make a tracked frame a keyframe if no keyframe of its submap is near; call with every tracked frame.
+        """Make a tracked frame a keyframe if no keyframe of its submap is near and ``relocalization.keyframe_gap``
+        tracked frames have passed; call with every tracked frame.
 
-        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. ``settle`` removes
-        it if it has fewer than ``MIN_INLIERS`` features.
+        ``settle`` removes it if it has fewer than ``MIN_INLIERS`` features.
         """
         self.settle()
         self._frames_since_last += 1
@@ -215,10 +215,8 @@ class KeyframeDatabase(Stateful):
         return [*self.keyframes, *([] if self.last is None else [self.last.keyframe])]
 
     def recognise(self, features: PlacedFeatures) -> list[PlaceMatch]:
-        """Places that a frame with these features may show: the last tracked frame first, then the keyframes.
-
-        The last tracked frame needs half as many inliers: one frame is confused less often than one of many keyframes.
-        """
+        """Places that a frame with these features may show: the last tracked frame, which needs half as many
+        inliers, then the keyframes."""
         if self.last is not None and len(self.last.keyframe.features) == 0:
             self.last.keyframe.features = self.extract(self.last.observation, self.last.dynamic_mask)
         last = [] if self.last is None else [self.last.keyframe]

@@ -42,11 +42,9 @@ def optimize(
     standard deviations.
 
     Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. SciPy (SuperLU) solves the
-    sparse normal equations. The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the series
-    of the inverse right Jacobian. The derivative by ``xi_a`` is that matrix times ``-Ad(T_b^-1 T_a)``.
-
-    The edges must connect all initial poses (N, 4, 4). Returns the optimized poses; they are not finite if the normal
-    equations are singular.
+    sparse normal equations. The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
+    inverse right Jacobian, by ``xi_a`` that matrix times ``-Ad(T_b^-1 T_a)``. The edges must connect all initial poses
+    (N, 4, 4). The result is not finite if the normal equations are singular.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve

@@ -1,7 +1,6 @@
 """Redundant views: frames without new information for the map, which are not fused (thesis section 4.3).
 
-The thesis compares SIFT features of two images. The map's weights measure the same directly: the information that the
-map has already.
+The thesis compares SIFT features of two images; the map's weights measure the information directly.
 """
 
 from dataclasses import dataclass
@@ -40,8 +39,7 @@ class _Place:
 class RedundantViews(Stateful):
     """Decides which frames are not fused because the map has their information already.
 
-    A view is redundant only at the place of the last fused frames. From another place the surface is seen at another
-    angle, with other systematic errors, which the average should contain as well.
+    A view is redundant only at the place of the last fused frames: elsewhere the systematic errors differ.
     """
 
     _place: Remembered[_Place | None] = None
@@ -53,12 +51,11 @@ class RedundantViews(Stateful):
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:
         """Whether to leave a registered frame out of the fusion into a map.
 
-        A frame is redundant if the map has on average more than ``similarity.threshold`` of the information on the
-        visible static surface.
-        Exceptions are regions with news:
+        It is redundant if the map has on average more than ``similarity.threshold`` of the information on the visible
+        static surface, except for
 
-        * a surface with fewer than 2 ``volume.free_after`` observations, because the space before it is not yet known
-          to be free (each frame observes every second plane of blocks)
+        * a surface with fewer than 2 ``volume.free_after`` observations: the space before it is not yet known to be
+          free (each frame observes every second plane of blocks)
         * measurements off the surface of the map: a new object
         * measurements behind the last fused depth of their pixel, until they are fused as often: an object left and is
           carved

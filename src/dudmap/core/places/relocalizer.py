@@ -39,9 +39,8 @@ class Relocalization:
 class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
-    A lost frame is compared with the last tracked frame and with all keyframes of the atlas. Each candidate pose is
-    verified by registration against the map of its submap. The atlas is not changed: the caller switches submaps or
-    starts a new one.
+    A lost frame is compared with the last tracked frame and all keyframes of the atlas; registration verifies each
+    candidate pose. The atlas is not changed.
     """
 
     _lost_since: Remembered[float | None] = None
@@ -89,9 +88,8 @@ class Relocalizer(Stateful):
     ) -> Relocalization | None:
         """Pose of a lost frame, verified by registration against the map; None if no candidate passes.
 
-        Candidates in the current submap are tried first: the pose by the last tracked frame, then poses by decreasing
-        number of feature matches. The result is the first pose that its registration confirms and ``judge`` accepts.
-        The view's timer records feature matching as stage ``recognise``.
+        Candidates in the current submap come first: the last tracked frame, then most feature matches. The first that
+        its registration confirms and ``judge`` accepts is the result. The timer records stage ``recognise``.
         """
         if not (self.config.relocalization.enabled and view.observation.has_color):
             return None
@@ -121,14 +119,12 @@ class Relocalizer(Stateful):
         return self.config.submaps.enabled and self.atlas.history is not None
 
     def start_verdict(self, view: FrameView) -> Verdict:
-        """Whether to start a new, empty submap with this lost frame.
-
-        All of these conditions must hold:
+        """Whether to start a new, empty submap with this lost frame. All of these conditions must hold:
 
         * The camera has been lost for ``submaps.patience`` seconds.
         * The frame has enough depth for a map and, if it has colour, enough features for a keyframe.
-        * The image motion is camera motion (``_shows_static_world``). The last lost image reveals fast people, and an
-          image LONGEST_BASELINE older reveals slow people.
+        * The image motion is camera motion (``_shows_static_world``), by the last lost image (fast people) and an image
+          LONGEST_BASELINE older (slow people).
         """
         return Verdict.of(self._start_outcomes(view))
 
