@@ -10,12 +10,12 @@ PIP := $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check
 CLEAN := $(PYTHON) -m pip --python build/clean/bin/python --disable-pip-version-check install --quiet
 SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
-	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
+	--generate-hashes --custom-compile-command "make lock"
 
 # tests of one file share fixtures, so they stay in one process; the longest file takes a sixteenth of the time
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all ready check docs package processors soak fuzz fuzz-guided audit lock clean
+.PHONY: demo test test-all costs ready check docs package processors soak fuzz fuzz-guided audit lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -23,8 +23,12 @@ demo: .venv/installed
 test: ready
 	$(PYTEST)
 
-test-all: ready
+test-all: ready .venv/publishing
 	$(PYTEST) -m "slow or not slow"
+
+# processor seconds of each file, see tests/costs.py
+costs: ready
+	$(PYTEST) --costs
 
 # a new checkout: most kernels are compiled once for all test processes, while another core does the checks
 ready: .venv/developed
@@ -38,12 +42,12 @@ check: .venv/developed
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-docs: .venv/developed
+docs: .venv/publishing
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
 
 # sdist, wheel (from the sdist) without kernels, wheel with the kernels for this Python on Linux, and the latter in an
 # environment that has nothing but what it requires
-package: .venv/developed
+package: .venv/publishing
 	rm -rf dist build/clean build/kernels
 	$(BIN)/python -m build --no-isolation --outdir dist
 	$(BIN)/python -m dudmap.lab.wheel_kernels build/kernels
@@ -82,8 +86,9 @@ audit: $(BIN)/python
 
 lock: $(BIN)/python
 	$(PIP) install --quiet --upgrade uv
-	$(COMPILE) --extra dev --output-file requirements/dev.txt
-	$(COMPILE) --constraint requirements/dev.txt --output-file requirements/run.txt
+	$(COMPILE) --group build pyproject.toml --extra dev --output-file requirements/dev.txt
+	$(COMPILE) --group build pyproject.toml --constraint requirements/dev.txt --output-file requirements/run.txt
+	$(COMPILE) --group publish --constraint requirements/dev.txt --output-file requirements/publish.txt
 
 clean:
 	rm -rf .venv .numba_cache build dist docs/_build
@@ -104,3 +109,8 @@ $(BIN)/python:
 	$(PIP) install --quiet --requirement requirements/dev.txt
 	$(SELF) '.[dev]'
 	@touch $@ .venv/installed
+
+# for the site and the packages, which no quick test needs
+.venv/publishing: .venv/developed requirements/publish.txt
+	$(PIP) install --quiet --requirement requirements/publish.txt
+	@touch $@

@@ -1,7 +1,6 @@
 """Settings of the test processes (pytest-xdist's workers; OpenCV's for tests/processors.py), shared fixtures."""
 
 import os
-import shutil
 import sys
 import types
 from pathlib import Path
@@ -13,14 +12,9 @@ from fake_slam import FakeSlam
 
 worker = os.environ.get("PYTEST_XDIST_WORKER")
 if worker is not None:
-    # One Numba cache per worker. Numba's index of a function is read, changed and written without a lock: two
-    # processes that compile one function for different argument types can give both results the same file name,
-    # and a changed function's old machine code stays readable between the writes of the index and of the new file.
-    # A new worker begins with a copy of what "make test" has compiled while it checked the sources.
-    caches = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".numba_cache")
-    if not (caches / worker).exists() and (caches / "common").exists():
-        shutil.copytree(caches / "common", caches / worker)
-    os.environ["NUMBA_CACHE_DIR"] = str(caches / worker)
+    # The workers share the kernels that "make test" has compiled while it checked the sources. Two processes write no
+    # file of one name (dudmap.core.kernel_cache); a form that one deletes from the index is compiled again.
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".numba_cache" / "common"))
     # The cores are shared by the workers. The first one has at least two threads, so that whole systems run on several;
     # more threads than cores cost a tenth of the time. What threads share has tests with given numbers of them.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -31,6 +25,17 @@ if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
     import cv2
 
     cv2.setUseOptimized(False)
+
+
+def pytest_addoption(parser):
+    parser.addoption("--costs", action="store_true", help="print the processor seconds of each test file")
+
+
+def pytest_configure(config):
+    if config.getoption("--costs"):
+        from costs import Costs
+
+        config.pluginmanager.register(Costs())
 
 
 @pytest.fixture(autouse=True)

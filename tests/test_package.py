@@ -1,6 +1,5 @@
-"""What is published: wheel and sdist, citation, hooks, workflow. "make package" installs the wheel, too."""
+"""Wheel and sdist, citation, hooks, workflow. "make package" checks the metadata and installs the wheel."""
 
-import os
 import re
 import subprocess
 import sys
@@ -37,22 +36,7 @@ def unpacked(dist, tmp_path_factory):
     return folder
 
 
-def program(unpacked, *arguments):
-    done = subprocess.run(
-        [sys.executable, *arguments], cwd=unpacked, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": str(unpacked)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_metadata_can_be_published(dist):
-    command = [sys.executable, "-m", "twine", "--no-color", "check", "--strict", *dist.iterdir()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    assert done.stdout.count("PASSED") == 2
-
-
+@pytest.mark.slow
 def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(unpacked):
     inside = {path.relative_to(unpacked).as_posix() for path in unpacked.rglob("*") if path.is_file()}
     expected = {
@@ -64,22 +48,13 @@ def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(unpacked):
     assert f"dudmap-{dudmap.__version__}.dist-info/licenses/LICENSE" in inside
 
 
+@pytest.mark.slow
 def test_the_sdist_holds_what_its_tests_need_and_no_results(dist):
     (sdist,) = dist.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "LICENSE", "Makefile", "tests/test_docs.py", "docs/conf.py", "README.md"} <= inside
     assert not [name for name in inside if name.startswith(("runs/", ".venv/", "dist/", "docs/_build/"))]
-
-
-def test_the_wheel_works(unpacked):
-    where = program(
-        unpacked, "-c", "import dudmap; [getattr(dudmap, n) for n in dudmap.__all__]; print(dudmap.__file__)"
-    )
-    assert Path(where.strip()).is_relative_to(unpacked)
-    assert program(unpacked, "-m", "dudmap", "--version") == f"dudmap {dudmap.__version__}\n"
-    assert "--max-frames" in program(unpacked, "-m", "dudmap", "demo", "--help")
-    assert "voxel_size" in program(unpacked, "-m", "dudmap", "config")
 
 
 def test_the_citation_is_complete_and_of_this_version():
@@ -114,6 +89,6 @@ def test_the_workflow_pins_its_actions_and_calls_what_is_documented():
     for used in re.findall(r"uses: (.*)", release + text):
         assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v[\d.]+", used)
     commands = [step["run"] for step in yaml.safe_load(text)["jobs"]["test"]["steps"] if "run" in step]
-    assert commands == [".ci/run", "make package"]
+    assert commands == [".ci/run", "make docs", "make package"]
     for target in re.findall(r"^make ([\w-]+)", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE):
         assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)

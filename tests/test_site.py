@@ -40,11 +40,13 @@ def text(site, name):
     return re.sub(r"<[^>]+>", "", html.replace("&lt;", "<").replace("&gt;", ">"))
 
 
+@pytest.mark.slow
 def test_every_page_is_built(site):
     for page in DOCS.glob("*.md"):
         assert page.name == "README.md" or (site / f"{page.stem}.html").is_file()
 
 
+@pytest.mark.slow
 def test_every_command_with_its_options_is_on_the_site(site):
     page = text(site, "commands")
     for name in COMMANDS:
@@ -55,12 +57,14 @@ def test_every_command_with_its_options_is_on_the_site(site):
                 assert parameter.param_type_name == "argument" or all(option in page for option in parameter.opts)
 
 
+@pytest.mark.slow
 def test_every_public_name_is_on_the_site(site):
     page = text(site, "python")
     for name in dudmap.__all__:
         assert name == "__version__" or re.search(rf"\.{name}\b", page), name
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_from_elsewhere(site):
     for page in site.glob("*.html"):
         html = page.read_text(encoding="utf-8")
