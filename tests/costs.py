@@ -1,6 +1,6 @@
 """``pytest --costs``: processor seconds of each test file, with its child processes, and the memory of its worker.
 
-Compilation by Numba, data (fixtures) and work are counted apart; a child's compilation is part of its test's work.
+Compilation by Numba, data (fixtures) and work are counted apart. Children count as a whole.
 """
 
 import os
@@ -21,19 +21,19 @@ def spent():
 
 
 class Compilation(numba.core.event.Listener):
-    """Processor seconds of the outermost compilations."""
+    """Processor seconds of each kernel that was compiled, with the functions that it inlines."""
 
     def __init__(self):
-        self.seconds, self.inside = 0.0, threading.local()
+        self.seconds, self.inside = defaultdict(float), threading.local()
 
     def on_start(self, event):
-        stack = self.inside.__dict__.setdefault("stack", [])
-        stack.append(time.thread_time())
+        self.inside.__dict__.setdefault("begun", []).append(time.thread_time())
 
     def on_end(self, event):
-        begin = self.inside.stack.pop()
-        if not self.inside.stack:
-            self.seconds += time.thread_time() - begin
+        begin = self.inside.begun.pop()
+        if not self.inside.begun:
+            function = event.data["dispatcher"].py_func
+            self.seconds[f"{function.__module__.rpartition('.')[2]}.{function.__name__}"] += time.thread_time() - begin
 
 
 class Costs:
@@ -42,16 +42,19 @@ class Costs:
     def __init__(self):
         self.compilation = Compilation()
         numba.core.event.register("numba:compile", self.compilation)
-        self.last = *spent(), 0.0
+        self.last = spent()
         self.files, self.tests = defaultdict(lambda: [0.0] * 4), defaultdict(float)
-        self.peaks = defaultdict(int)
+        self.peaks, self.kernels = defaultdict(int), defaultdict(float)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item, call):
         report = yield
-        now = *spent(), self.compilation.seconds
-        own, children, compiled = (a - b for a, b in zip(now, self.last, strict=True))
+        now = spent()
+        own, children = (a - b for a, b in zip(now, self.last, strict=True))
         self.last = now
+        report.kernels = dict(self.compilation.seconds)
+        self.compilation.seconds.clear()
+        compiled = sum(report.kernels.values())
         report.costs = [compiled, own - compiled, children]
         report.peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         return report
@@ -63,6 +66,8 @@ class Costs:
         self.files[file] = [a + b for a, b in zip(self.files[file], row, strict=True)]
         self.tests[report.nodeid] += compiled + own + children
         self.peaks[file] = max(self.peaks[file], report.peak)
+        for name, seconds in report.kernels.items():
+            self.kernels[f"{name} ({file})"] += seconds
 
     def pytest_terminal_summary(self, terminalreporter):
         terminalreporter.section("processor seconds")
@@ -73,5 +78,7 @@ class Costs:
         for file, row, peak in rows:
             cells = (f"{x:9.2f}" if isinstance(x, float) else f"{x:>9}" for x in row)
             terminalreporter.write_line("".join(cells) + f"{peak:>9}  {file}")
-        for test in sorted(self.tests, key=lambda test: -self.tests[test])[:40]:
-            terminalreporter.write_line(f"{self.tests[test]:9.2f}  {test}")
+        for title, seconds in (("test", self.tests), ("compiled kernel", self.kernels)):
+            terminalreporter.write_line(f"\n      all  {title}")
+            for name in sorted(seconds, key=lambda name: -seconds[name])[:40]:
+                terminalreporter.write_line(f"{seconds[name]:9.2f}  {name}")
