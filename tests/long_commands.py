@@ -50,7 +50,7 @@ FAKED = {
     ),
     "benchmark speed": (
         ["benchmark", "speed", "--out", "speed"],
-        {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
+        {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: [], "dudmap.lab.benchmark.speed.stages": lambda: ""},
     ),
     "benchmark soak": (
         ["benchmark", "soak"],

@@ -182,7 +182,7 @@ def test_exit_codes_are_documented():
 PROGRAM = [sys.executable, "-c", "from dudmap.cli import main; main()"]
 
 
-@pytest.mark.parametrize("words", ["synth", "clean", "evaluate trajectory"])
+@pytest.mark.parametrize("words", ["synth", "clean"])
 def test_pipes_get_no_progress_bar_and_no_codes(where, tmp_path, words):
     arguments = [str(argument) for argument in CALLS[words]]
     renamed = {"made": tmp_path / "made", "cleaned": tmp_path / "cleaned", "orbit.avi": tmp_path / "orbit.avi"}
@@ -252,17 +252,7 @@ def test_completion_can_be_installed():
     assert "complete -o default" in done.stdout, done.stderr
 
 
-# -- help --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("words", ALL)
-def test_help_fits_80_columns_uncut(words):
-    done = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, [*words.split(), "--help"])
-    assert done.exit_code == 0
-    assert "…" not in done.output
-
-
-# -- options -----------------------------------------------------------------------------------------------------------
+# -- help and options -----------------------------------------------------------------------------------------------------------
 
 
 def test_an_option_of_several_commands_means_one_thing():

@@ -1,6 +1,7 @@
 """The focal length that frames are consistent with, on exact views of a patterned corner."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -30,6 +31,11 @@ class Corner:
         return len(self.timestamps)
 
     def __getitem__(self, index):
+        return self.view(index)
+
+    @staticmethod
+    @cache
+    def view(index):
         R = cv2.Rodrigues(np.radians([0.5, 1.1, 0.0]) * (index - 20))[0]
         v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
         rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)

@@ -45,6 +45,12 @@ def processed(recording, Ts, **given):
     return slam, results
 
 
+@pytest.fixture(scope="module")
+def estimated(room):
+    """Results without given poses."""
+    return processed(room, [None] * len(room))[1]
+
+
 def iou(recording, results):
     """Mean intersection over union of the masks of frames with people."""
     pairs = [(recording.mask(index), result.dynamic_mask) for index, result in enumerate(results)]
@@ -57,19 +63,17 @@ def error(Ts, results):
     return np.sqrt(np.mean(ate(found, Trajectory(np.arange(len(Ts)), Ts)).trans_errors ** 2))
 
 
-def test_given_poses_are_the_result_and_people_are_left_out(room):
+def test_given_poses_are_the_result_and_people_are_left_out(room, estimated):
     Ts = room.ground_truth.Ts_world_camera
     slam, results = processed(room, Ts, poses="given")
     np.testing.assert_allclose([result.T_world_camera for result in results], Ts, atol=1e-12)
     np.testing.assert_allclose(slam.trajectory.Ts_world_camera, Ts, atol=1e-12)
-    _, estimated = processed(room, [None] * len(Ts))
     assert iou(room, results) > iou(room, estimated) - 0.02
     assert np.mean([result.fused for result in results]) > 0.5
 
 
-def test_drifting_poses_are_the_start_of_registration(room):
+def test_drifting_poses_are_the_start_of_registration(room, estimated):
     Ts = room.ground_truth.Ts_world_camera
-    _, estimated = processed(room, [None] * len(Ts))
     start = drifting(Ts)
     _, refined = processed(room, start, poses="refined")
     assert all(result.state == "tracked" for result in refined)

@@ -113,7 +113,7 @@ def test_warnings_are_in_the_metrics_and_the_report(tmp_path):
     assert f"warning: {warning}" in (tmp_path / "run" / "report.html").read_text()
 
 
-@pytest.mark.parametrize(("ratio", "seed"), [(1.6, 1), (1.3, 0), (0.65, 2)])
+@pytest.mark.parametrize(("ratio", "seed"), [(1.6, 1), (0.65, 2)])
 def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(ratio, seed, caplog):
     faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.015, 0.0, 0.0))
     recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=seed)
@@ -124,7 +124,7 @@ def test_colours_that_are_not_registered_are_found_and_calibrated_from_there(rat
     assert "the edges of both images agree where its focal length is" in caplog.messages[0]
 
 
-@pytest.mark.parametrize("ratio", [0.9, 1.0, 1.1])
+@pytest.mark.parametrize("ratio", [0.9, 1.1])
 def test_colours_that_a_calibration_finds_by_itself_are_not_called_unregistered(ratio):
     faults = SensorFaults(color_focal_ratio=ratio, color_translation=(0.03, 0.0, 0.0))
     recorded = synthetic.sequence(movers=(), frames=24, camera=DEFAULT_CAMERA.scaled(1), faults=faults, seed=3)

@@ -290,7 +290,7 @@ def test_a_map_that_is_never_joined_is_written_beside_the_main_one(tmp_path):
 
 
 def test_without_a_loop_nothing_changes():
-    sequence = turned(np.linspace(0, 40, 40))
+    sequence = turned(np.linspace(0, 26, 26))
     settings = ["volume.voxel_size=0.02"]
     without = [*settings, "loops.enabled=false", "submaps.enabled=false"]
     on, off = (Slam(SMALL, Config().override(changes)) for changes in (settings, without))

@@ -81,8 +81,9 @@ def at_once(atlas):
     return volume
 
 
-@pytest.mark.parametrize("volume", [CONFIG, ADAPTIVE], ids=["one voxel size", "adaptive"])
-@pytest.mark.parametrize("max_blocks", [None, 300])
+@pytest.mark.parametrize(
+    ("max_blocks", "volume"), [(None, CONFIG), (300, ADAPTIVE)], ids=["one voxel size", "adaptive and paged"]
+)
 def test_the_complete_map_is_that_of_all_stored_frames(max_blocks, volume):
     """Frames that come meanwhile are part of it; until then the map holds what is around the camera."""
     atlas = walked(max_blocks, volume=volume)
@@ -137,8 +138,7 @@ def test_a_small_map_is_rebuilt_at_once():
     assert content(atlas.volume) == content(at_once(atlas))
 
 
-@pytest.mark.parametrize("max_blocks", [None, 300])
-@pytest.mark.parametrize("rebuilt", [False, True])
+@pytest.mark.parametrize(("max_blocks", "rebuilt"), [(None, True), (300, False), (300, True)])
 def test_submaps_are_joined_over_many_frames(max_blocks, rebuilt):
     """The result is the map of the stored frames of both, also if that of the older one is being rebuilt."""
     first = 40

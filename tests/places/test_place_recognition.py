@@ -177,10 +177,9 @@ def errors(slam, sequence, count):
     return out
 
 
-@pytest.mark.parametrize("yaw", [90.0, 150.0])
-def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found(yaw):
+def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found():
     sequence = dudmap.lab.synthetic.sequence(movers=(), frames=50, seed=1, camera=SMALL, camera_path="fast")
-    sequence = turned_away(sequence, 15, 40, yaw)
+    sequence = turned_away(sequence, 15, 40, 150.0)
     slam = Slam(sequence.camera)
     rows = errors(slam, sequence, 45)
     assert [result.state for result, _ in rows] == ["tracked"] * 15 + ["lost"] * 25 + ["tracked"] * 5

@@ -46,7 +46,8 @@ def checked(path):
     return page
 
 
-def test_markup_in_each_text_and_number_of_metrics_json(tmp_path):
+def test_markup_in_each_text_and_number_of_metrics_json(tmp_path, monkeypatch):
+    monkeypatch.setattr("dudmap.app.viewing.report.plots", lambda run: {})  # no metric is part of a plot
     folder = write_run(tmp_path / "run")
     whole = json.loads((folder / "metrics.json").read_text())
     counts = {"skipped_similar": 1, "blind": 1, "uncertain": 1, "dropped": 1, "maps": 1}
@@ -75,7 +76,7 @@ def test_markup_in_the_other_files(name, tmp_path):
     text = (folder / name).read_text()
     refusals = []
     numbers = list(re.finditer(r"[\d.]+|\w+", text))
-    for match in numbers[:: max(1, len(numbers) // 20)]:
+    for match in numbers[:: max(1, len(numbers) // 10)]:
         (folder / name).write_text(text[: match.start()] + MARKUP.replace('"', "'") + text[match.end() :])
         try:
             checked(write_report(folder))

@@ -30,10 +30,10 @@ from dudmap.lab import synthetic
 from dudmap.lab.synthetic.recording import SyntheticSequence
 from rendered import Rendered
 
-SMALL = Camera(fx=196.9, fy=196.9, cx=119.5, cy=89.5, width=240, height=180)
+SMALL = Camera(fx=157.52, fy=157.52, cx=95.5, cy=71.5, width=192, height=144)
 CONFIG = Config().override(
     [
-        "volume.voxel_size=0.02",
+        "volume.voxel_size=0.025",
         "submaps.patience=0.3",
         "loops.min_age=1.0",
         "loops.gap=3",
