@@ -73,7 +73,7 @@ class Costs:
         terminalreporter.section("processor seconds")
         order = sorted(self.files, key=lambda file: -sum(self.files[file]))
         sums = [sum(column) for column in zip(*self.files.values(), strict=True)]
-        rows = [("file", ["all", *COLUMNS], "peak MB"), ("all", [sum(sums), *sums], max(self.peaks.values(), default=0))]
+        rows = [("file", ["all", *COLUMNS], "peak MB"), ("all", [sum(sums), *sums], max(self.peaks.values()))]
         rows += [(file, [sum(self.files[file]), *self.files[file]], self.peaks[file]) for file in order]
         for file, row, peak in rows:
             cells = (f"{x:9.2f}" if isinstance(x, float) else f"{x:>9}" for x in row)

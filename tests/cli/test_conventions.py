@@ -252,7 +252,7 @@ def test_completion_can_be_installed():
     assert "complete -o default" in done.stdout, done.stderr
 
 
-# -- help and options -----------------------------------------------------------------------------------------------------------
+# -- help and options --------------------------------------------------------------------------------------------------
 
 
 def test_an_option_of_several_commands_means_one_thing():
