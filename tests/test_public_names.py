@@ -1,6 +1,8 @@
 """The public names: documented, importable, cheap; and ``Slam.process`` with plain arrays."""
 
+import copy
 import inspect
+import pickle
 import re
 import subprocess
 import sys
@@ -29,6 +31,71 @@ def test_every_public_name_is_importable_and_documented(name):
             if not key.startswith("_") and inspect.isfunction(member)
         ] if inspect.isclass(value) else []  # fmt: skip
         assert [member.__qualname__ for member in public if not inspect.getdoc(member)] == []
+
+
+def annotations(name):
+    """Texts of the annotations of a public function, or of a class: its arguments and its documented members."""
+    value = getattr(dudmap, name)
+    if inspect.isfunction(value):
+        return [value.__annotations__]
+    if not inspect.isclass(value) or issubclass(value, Exception) or name == "FrameView":  # only passed on
+        return []
+    options = re.search(rf"autoclass:: dudmap\.{name}\n((?:   :.*\n)*)", PAGE)[1]
+    listed = re.search(r":members: (.+)", options)
+    left_out = re.findall(r"\w+", (re.search(r":exclude-members: (.+)", options) or ["", ""])[1])
+    members = re.findall(r"\w+", listed[1]) if listed else [key for key in dir(value) if key[0] != "_"]
+    members = [inspect.getattr_static(value, key) for key in members if key not in left_out]
+    functions = [getattr(found, "fget", None) or getattr(found, "__func__", found) for found in members]
+    own = [value.__init__, *functions] if ":members:" in options else [value.__init__]
+    return [found.__annotations__ for found in own if inspect.isfunction(found)]
+
+
+CLASSES = {
+    name
+    for file in Path(dudmap.__file__).parent.rglob("*.py")
+    for name in re.findall(r"^class ([A-Z]\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+}
+
+
+@pytest.mark.parametrize("name", dudmap.__all__)
+def test_types_of_a_public_name_are_public(name):
+    texts = [
+        text if isinstance(text, str) else inspect.formatannotation(text)
+        for found in annotations(name)
+        for text in found.values()
+    ]
+    named = {word for text in texts for word in re.findall(r"\b[A-Z]\w+", text)} & CLASSES
+    assert named - set(dudmap.__all__) - INSIDE == set()
+
+
+INSIDE = {
+    "Backend",
+    "Keyframe",
+    "RegistrationHistory",
+    "Segmentation",
+    "Mixture",
+    "Verdict",
+    "Observation",
+    "Level",
+    "Scalar",
+}
+"""Types of attributes that only the core makes and reads."""
+
+
+def test_results_are_pickled_and_copied():
+    slam = Slam(CAMERA)
+    results = [slam.process(wall(1.5 + 0.01 * number, seed=number)) for number in range(3)]
+    slam.finish()
+    for copied in (lambda value: pickle.loads(pickle.dumps(value)), copy.deepcopy, copy.copy):
+        found = copied(results[-1])
+        np.testing.assert_array_equal(found.T_world_camera, results[-1].T_world_camera)
+        np.testing.assert_array_equal(found.dynamic_mask, results[-1].dynamic_mask)
+        assert found.movers == results[-1].movers
+        np.testing.assert_array_equal(copied(slam.trajectory).Ts_world_camera, slam.trajectory.Ts_world_camera)
+    mesh = slam.volume.extract_mesh()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(mesh)).vertices, mesh.vertices)
+    again = pickle.loads(pickle.dumps(slam.volume)).extract_mesh()
+    np.testing.assert_array_equal(again.vertices, mesh.vertices)
 
 
 def test_other_names_are_refused():

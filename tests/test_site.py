@@ -1,5 +1,7 @@
 """The documentation as a site: it builds without a warning, is complete, and its Python runs."""
 
+import json
+import os
 import re
 import subprocess
 import sys
@@ -13,17 +15,15 @@ from dudmap.cli import COMMANDS, application_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-SHOWN = ["first-mesh.md", "extending.md", "python.md"]
 
 
-def blocks():
-    for page in SHOWN:
-        found = re.findall(
-            r"^```python\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-        )
-        assert found, page
-        for number, code in enumerate(found, start=1):
-            yield pytest.param(code, id=f"{page} {number}")
+def programs():
+    """Name and text of each shown program: a block, or all blocks of python.md."""
+    for path in [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]:
+        found = re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+        if path.name == "python.md":
+            found = ["\n".join(found)]
+        yield from ((f"{path.stem} {number}", code) for number, code in enumerate(found, start=1))
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +71,36 @@ def test_nothing_is_loaded_from_elsewhere(site):
         assert re.findall(r'<(?:script|img)[^>]*src="https?:|<link[^>]*rel="stylesheet"[^>]*href="https?:', html) == []
 
 
-@pytest.mark.parametrize("code", blocks())
+@pytest.mark.parametrize("code", [pytest.param(code, id=name) for name, code in programs() if name[:6] != "README"])
 def test_the_shown_python_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
+    for file in (Path("run/trajectory.txt"), Path("recording/groundtruth.txt")):  # which evaluation.md reads
+        file.parent.mkdir()
+        file.write_text("".join(f"{0.1 * k} {k} {k * k} 0 0 0 0 1\n" for k in range(5)), encoding="utf-8")
     exec(compile(code, "<shown>", "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "checker",
+    [["pyright", "--project", "strict.json", "--pythonpath", sys.executable],
+     ["mypy", "--strict", "--follow-imports=silent", "--python-executable", sys.executable, "shown"]],
+    ids=["pyright", "mypy"],
+)  # fmt: skip
+def test_the_shown_python_is_typed(checker, tmp_path):
+    """All blocks and examples; the tests of README and of the examples run the others."""
+    (tmp_path / "shown").mkdir()
+    examples = [(path.stem, path.read_text(encoding="utf-8")) for path in (ROOT / "examples").glob("*.py")]
+    for name, code in [*programs(), *examples]:
+        (tmp_path / "shown" / f"{name.replace(' ', '_').replace('-', '_')}.py").write_text(code, encoding="utf-8")
+    strict = {"include": ["shown"], "extraPaths": [str(ROOT / "src")], "typeCheckingMode": "strict"}
+    (tmp_path / "strict.json").write_text(json.dumps(strict), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", *checker], cwd=tmp_path, env=os.environ | {"MYPYPATH": str(ROOT / "src")},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_pictures_are_small():

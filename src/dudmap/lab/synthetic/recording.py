@@ -1,6 +1,7 @@
 """Synthetic recording: rendered frames with true poses, masks, movers and surface."""
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -82,6 +83,9 @@ class SyntheticSequence:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
         """Frame number ``index`` (negative counts from the end).
