@@ -164,8 +164,8 @@ def register(
 ) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 
-    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``, so
-    that ghosts and missing parts have no influence.
+    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``.
+    Ghosts and missing parts thus have no influence.
 
     Raises:
         MapError: A mesh has no faces, or too few points lie within ``REACH``.

@@ -31,7 +31,7 @@ LARGEST_HINT = CHUNK * STEP / 2
 class TimeOffset(NamedTuple):
     """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
 
-    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. r is the correlation of the aligned
+    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. The correlation r is of the aligned
     positions or of the angles of rotation; the mean of both if both are defined.
     """
 

@@ -192,7 +192,7 @@ def ate(
 
     Args:
         align: ``se3``: A minimises the squared distances of the positions, without scale (Umeyama 1991, as in the TUM
-            script); an undetermined rotation is the mean of the rotations between orientations. ``origin``: A maps the
+            script). An undetermined rotation is the mean of the rotations between orientations. ``origin``: A maps the
             first pose onto its partner, so that the error of a fixed camera is its drift. ``none``: A is the identity.
     """
     if align not in get_args(Align):
@@ -217,7 +217,7 @@ def rpe(
 ) -> RpeResult:
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
-    Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``: j is
+    Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``. j is
     the pose nearest to that distance, metres along the reference path. A pair is dropped if it misses ``delta`` by more
     than half the median time between two poses (at least ``max_difference``) for ``s``, a tenth for ``m``. The script
     pairs across gaps of lost frames, and drops all pairs that end at the last pose.

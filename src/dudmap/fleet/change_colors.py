@@ -1,7 +1,7 @@
 """Surface that stayed in place and got other colours: a poster, a screen, a painted wall.
 
-Light changes brightness smoothly, paint abruptly. Colours are averaged over small cells, a gain is fitted to the cells
-around each cell, and a remaining difference above the spread of all cells marks other colours.
+Light changes brightness smoothly, paint abruptly. Colours are averaged over small cells, and a gain is fitted to the
+cells around each cell. A remaining difference above the spread of all cells marks other colours.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Compare the surface of one map with another map of the same place.
 
 Every vertex of one mesh is confirmed, denied, behind a surface, or not seen by the other map. It is denied if the other
-map has free space there and no surface within the noise of both maps: one voxel plus three standard deviations of the
-local noise. This is the larger of the sensor's noise and the spread of the distances between both surfaces nearby,
-which includes alignment and bending.
+map has free space there and no surface within the noise of both maps. The noise is one voxel plus three standard
+deviations of the local noise. This is the larger of the sensor's noise and the spread of the distances between both
+surfaces nearby, which includes alignment and bending.
 """
 
 from dataclasses import dataclass
@@ -189,8 +189,8 @@ def surface_tree(points: NDArray[np.floating]) -> KDTree:
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3): 1.48 times the median
-    absolute distance below a limit (n,) in a cell, at least the value of the whole place."""
+    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3). It is 1.48 times the
+    median absolute distance below a limit (n,) in a cell, at least the value of the whole place."""
     near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
     if not near.any():
         return np.ones(len(points))

@@ -55,8 +55,8 @@ point."""
 MIN_POINTS = 60
 """Fewest matched points that determine a motion."""
 LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
-"""Smallest shares of matched surface: of the surface that matches or lies in free space, of the larger body; and
-smallest explained share of the former."""
+"""Smallest shares of matched surface: of the surface that matches or lies in free space, of the larger body. Smallest
+explained share of the former."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
 """Largest median colour difference of an untextured thing under one light, grey levels; largest difference of the
 shares of red, green and blue."""
@@ -210,7 +210,7 @@ class _Meeting:
     def starts(self) -> list[Array]:
         """Candidate motions (4, 4), by decreasing number of points with a neighbour.
 
-        Each brings a point onto one of the second body with a similar colour; the turn about the vertical aligns their
+        Each brings a point onto one of the second body with a similar colour. The turn about the vertical aligns their
         normals, and is random for vertical ones.
         """
         (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()

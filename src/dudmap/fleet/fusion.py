@@ -29,7 +29,7 @@ from dudmap.io.exporting.mesh_files import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Rotation of tiles from map axes (x right, y down) to glTF (y up); it undoes the turn by readers of 3D Tiles, and
+"""Rotation of tiles from map axes (x right, y down) to glTF (y up). It undoes the turn by readers of 3D Tiles, and
 turns the z-up tileset."""
 BITS_PER_LEVEL = 3
 

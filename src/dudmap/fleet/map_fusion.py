@@ -193,7 +193,7 @@ def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) ->
     """Divide the sums.
 
     Emptiness in one map where another has voxels counts as an observation at ``free_steps`` (truncation in steps) with
-    weight ``carve_rate``, so that objects that left disappear. A block that is then empty everywhere, by ``free_after``
+    weight ``carve_rate``. Objects that left thus disappear. A block that is then empty everywhere, by ``free_after``
     observations, loses its voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
@@ -283,8 +283,8 @@ def fused_blocks(
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first;
-    identity poses are copied exactly, others interpolated."""
+    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first.
+    Identity poses are copied exactly, others interpolated."""
     reached = [
         ReachedBlocks.of(one.coords[:n], one.slot_of[:n] >= 0, T, volumes[0].block_size)
         for one, n, T in ((v.blocks, v.blocks.num_entries, T) for v, T in zip(volumes, Ts_world_volume, strict=True))

@@ -1,9 +1,9 @@
 """Relative poses of runs, in rounds: similar runs first, then runs that overlap at the poses found so far.
 
-Places are recognised by VLAD (Jegou et al. 2010): the differences of a keyframe's features to their nearest visual
-words are summed per word, normalised per word (Arandjelovic and Zisserman 2013) and as a whole. The words are k-means
-centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components, because many places
-share doors and wallpaper.
+Places are recognised by VLAD (Jegou et al. 2010). The differences of a keyframe's features to their nearest visual
+words are summed per word. They are normalised per word (Arandjelovic and Zisserman 2013) and as a whole. The words are
+k-means centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components, because many
+places share doors and wallpaper.
 """
 
 import logging
@@ -189,8 +189,8 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
 def registered_runs(runs: Sequence[Path], workers: Workers) -> tuple[Pairs, RunGraph]:
     """Relative poses of pairs of runs, and the poses of all runs.
 
-    The first round compares each run with its most similar runs, further ones the runs that overlap at the current
-    poses and smaller groups with the next similar runs.
+    The first round compares each run with its most similar runs. Further rounds compare the runs that overlap at the
+    current poses and smaller groups with the next similar runs.
 
     Raises:
         MapError: A file is damaged.

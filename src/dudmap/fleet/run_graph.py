@@ -156,7 +156,7 @@ def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
 
 
 def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[Join]:
-    """Remove joins that at least as many pairs of runs deny: false joins bring groups of runs to a wrong place,
+    """Remove joins that at least as many pairs of runs deny. False joins bring groups of runs to a wrong place,
     where runs of both groups disagree."""
     left = list(joins)
     while cut := best_cut([(join.a, join.b) for join in left], denied):

@@ -38,7 +38,7 @@ NEIGHBOURHOOD = 41
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
 """Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, MAYBE, SIGNIFICANT = 0.04, 3.5, 5.0
-"""Limits for a turn of depth against colour: smallest gain in edge correlation; smallest correlations for a possible
+"""Limits for a turn of depth against colour: smallest gain in edge correlation. Smallest correlations for a possible
 and a certain turn, standard deviations of accidental ones. Of 360 unrelated pairs 3 exceed the first and none the
 second; of 261 turned excerpts 257 and 243 do."""
 APART = 12

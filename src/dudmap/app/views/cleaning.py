@@ -30,7 +30,7 @@ SHADOW = 48 / 640
 """Largest width of the projector's shadow, share of the image width: 0.075 m * 525 / 0.8 m for a Kinect."""
 LEFT_OVER = 5.0
 """A pixel near a mask is dynamic if its colour differs by this many standard deviations (1.48 median absolute
-deviations), such as feet on the floor."""
+deviations). This finds feet on the floor."""
 LEAST_DIFFERENCE = 40.0
 """Smallest such difference, of 255; shadows and exposure cause smaller ones."""
 SOURCES = 150

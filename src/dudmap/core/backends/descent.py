@@ -52,8 +52,8 @@ def descend(
 ) -> Descent:
     """Accelerated Levenberg-Marquardt steps; a step is accepted if it decreases the cost.
 
-    The change is estimated from the mean of the gradients before and after the step (trapezoidal rule), because pixels
-    that enter or leave the map change costs more than short steps do. The CPU has the same loop as one compiled call
+    The change is estimated from the mean of the gradients before and after the step (trapezoidal rule). Pixels that
+    enter or leave the map change the costs more than short steps do. The CPU has the same loop as one compiled call
     (``cpu/registration.py``).
 
     Args:

@@ -1,7 +1,7 @@
 """Thread pool for bands of rows, and the decorators that compile kernels.
 
-Kernels are serial and release the GIL. Bands do not depend on the number of threads, and sums are added in band order,
-so that results are bit for bit the same on any number of cores.
+Kernels are serial and release the GIL. Bands do not depend on the number of threads, and sums are added in band order.
+Results are therefore bit for bit the same on any number of cores.
 """
 
 import atexit

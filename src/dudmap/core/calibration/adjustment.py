@@ -115,9 +115,9 @@ def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> f
 
 
 PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
-"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share
-of the width. Colour cameras are 15 to 32 mm from depth cameras, mostly sideways; focal lengths differ by up to 10 %;
-a frame at 30 Hz takes 33 ms."""
+"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share of
+the width. Colour cameras are 15 to 32 mm from depth cameras, mostly sideways. Focal lengths differ by up to 10 %; a
+frame at 30 Hz takes 33 ms."""
 POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
 """Standard deviation of a tracked pose, metres and radians, for directions that the images do not observe."""
 LIGHT_SIGMA = np.array([0.3, 0.1])

@@ -47,7 +47,7 @@ MATERIAL = {"timing": 0.01, "lens": 0.01, "center": 0.01, "geometry": 0.1, SHUTT
 camera. Measured: it lets the geometry gain up to 7 %, a camera 25 mm away 19 to 30 %."""
 EVIDENCE = 3.0
 """Smallest decrease of the cost for a group, standard errors, of estimates on each half of the time tested on the
-other; chance exceeds it once in 700 times."""
+other. Chance exceeds it once in 700 times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +123,9 @@ class CalibrationEstimator:
 
         r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
 
-    An error of theta rotates with the camera and varies with its velocity. theta is common to all pairs, T follows from
-    the unknown poses of both frames, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to
-    fine, with priors at the given values. The covariance has three parts:
+    An error of theta rotates with the camera and varies with its velocity. The calibration is common to all pairs, and
+    T follows from the unknown poses of both frames. Gain g and offset o belong to the pair (``Adjustment``). Robust
+    Gauss-Newton, coarse to fine, with priors at the given values. The covariance has three parts:
 
     * A sandwich with one score per frame, the sum over its pairs, whose errors are correlated (Aronow, Samii and
       Assenova 2015, without the correction for pairs counted twice).

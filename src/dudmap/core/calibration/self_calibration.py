@@ -32,8 +32,8 @@ USED_AFTER = 60
 class SelfCalibration(Stateful):
     """Estimates the calibration repeatedly during tracking, in another process.
 
-    Each estimate starts from the given calibration and uses all keyframes of the current submap with recorded colours,
-    so that it does not depend on the calibration at tracking time.
+    Each estimate starts from the given calibration and uses all keyframes of the current submap with recorded colours.
+    It does not depend on the calibration at tracking time.
 
     Attributes:
         estimate: The last finished estimate; None before.

@@ -24,7 +24,7 @@ class Brightness:
     """Brightness of common surfaces in both frames of P pairs.
 
     The log ratio of both brightnesses is the log ratio of the exposures minus the vignetting times the difference of
-    the squared distances to the image centre; on an untextured wall even for wrong poses.
+    the squared distances to the image centre. On an untextured wall this holds even for wrong poses.
 
     Attributes:
         numbers: (P, 2) int64, the frames of every pair.

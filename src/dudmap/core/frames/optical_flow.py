@@ -122,7 +122,7 @@ def consistent_with_static(
 ) -> NDArray[np.bool_]:
     """Whether corners (n,) found elsewhere match as well at the position of a static point.
 
-    The coarse levels of the search may follow a nearer surface, and textures may repeat: the search is repeated from
+    The coarse levels of the search may follow a nearer surface, and textures may repeat. The search is repeated from
     the static position at full resolution alone.
 
     Args:

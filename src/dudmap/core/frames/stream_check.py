@@ -43,7 +43,7 @@ class StreamCheck(Stateful):
     """Checks the stamp and the images of every frame against the previous frames, before registration.
 
     Stamps must increase. The clock counts as reset if ``AGREEING`` consecutive frames increase among themselves but not
-    after the last used one; their stamps are then shifted to follow it by the usual interval. An image that equals the
+    after the last used one. Their stamps are then shifted to follow it by the usual interval. An image that equals the
     previous one bit for bit is a repetition. A change of the depth unit multiplies all depths by one factor between two
     images; frames are rejected until it is reversed.
 

@@ -111,7 +111,7 @@ class FineBlocks(Stateful):
     def take_colors(
         self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
     ) -> None:
-        """Give blocks (n,) the colours and intensities of this level of another map, or where it has none, the
+        """Give blocks (n,) the colours and intensities of this level of another map. Missing ones take the
         ``interpolated`` voxels and colours (n, 512) of its coarser level."""
         blocks, (voxels, colors) = self.blocks, interpolated
         there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))

@@ -76,7 +76,7 @@ Chunk = tuple[int, int, int]
 class IncrementalMesh:
     """Mesh of a volume, kept up to date for a live view while the map grows.
 
-    An update extracts the chunks of 4x4x4 blocks that contain or touch a block written since the last update: its time
+    An update extracts the chunks of 4x4x4 blocks that contain or touch a block written since the last update. Its time
     grows with the view, not with the map. All chunks together are the surface of ``TsdfVolume.extract_mesh``, with
     duplicate vertices between chunks. Updates and ``integrate`` must not run at the same time.
 

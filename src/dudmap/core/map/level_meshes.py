@@ -1,7 +1,7 @@
 """Mesh of a map with several voxel sizes: marching cubes level by level, on one field shared by all levels.
 
 A lattice point has the value of the smallest voxel observed there. At the border of a level its voxels take the linear
-interpolation of the next coarser level, so that both surfaces share their points on the edges of the larger cells.
+interpolation of the next coarser level. Both surfaces then share their points on the edges of the larger cells.
 Inside the faces of these cells they differ by the curvature of the field.
 """
 

@@ -359,8 +359,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        ``slots`` (n,) are the blocks to mesh and all that touch them; ``chunks`` (n,) the group of each from 0, -1 for
-        blocks that only provide borders.
+        ``slots`` (n,) are the blocks to mesh and all that touch them. ``chunks`` (n,) is the group of each from 0, -1
+        for blocks that only provide borders.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbourhood(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(

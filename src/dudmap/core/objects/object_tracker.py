@@ -100,12 +100,12 @@ class _Track:
 class ObjectTracker(Stateful):
     """Segments the moving pixels of each frame into objects and associates them with earlier objects.
 
-    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel,
-    and split the region of touching objects. Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
+    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel.
+    They also split the region of touching objects. Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
 
     * A fully visible object: slope of a line through its positions (the surface of a rolling ball is faster).
-    * An object cut off by the image border or an occluder: mean of its frame-to-frame displacements without outliers,
-      each the median over pixels matched by forward-backward optical flow (Lucas and Kanade 1981).
+    * An object cut off by the image border or an occluder: mean of its frame-to-frame displacements without outliers.
+      Each is the median over pixels matched by forward-backward optical flow (Lucas and Kanade 1981).
     """
 
     _tracks: Remembered[list[_Track]]

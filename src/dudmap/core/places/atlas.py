@@ -279,7 +279,7 @@ class Atlas(Stateful):
         """Set new poses of the stored frames of the current submap, and replace its map.
 
         Trajectory and keyframes receive the correction interpolated in time. ``volume`` was built from the stored
-        frames ``nodes`` at their new poses (n, 4, 4); if only from ``fused``, it is provisional until the map is
+        frames ``nodes`` at their new poses (n, 4, 4). If only from ``fused``, it is provisional until the map is
         complete. Returns the motion (4, 4) of the newest stored frame.
         """
         assert self.history is not None

@@ -63,8 +63,8 @@ class SiftExtractor:
 
 
 def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows that are each other's nearest neighbours and pass the ratio test from ``a`` to ``b``;
-    none if ``b`` has fewer than two rows."""
+    """Pairs (m, 2) of rows that are each other's nearest neighbours and pass the ratio test from ``a`` to ``b``. None
+    if ``b`` has fewer than two rows."""
     if len(a) == 0 or len(b) < 2:
         return np.empty((0, 2), dtype=np.int64)
     squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)

@@ -71,9 +71,9 @@ class FrameStore(Stateful):
     """Selected fused frames in a temporary file, which the operating system removes.
 
     A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
-    frame, ``gap`` frames were fused since then, or the submap is another. Other frames increase the count of the last
-    stored frame. A background thread encodes the frames (depth RVL, colour JPEG, mask PNG). Frames are numbered in
-    order of time; a frame without images keeps its number and pose. Not thread-safe.
+    frame. It is also stored if ``gap`` frames were fused since then, or if the submap is another. Other frames increase
+    the count of the last stored frame. A background thread encodes the frames (depth RVL, colour JPEG, mask PNG).
+    Frames are numbered in order of time; a frame without images keeps its number and pose. Not thread-safe.
 
     Attributes:
         registered: Registers recorded colour to the depth image; None if colour is registered already.

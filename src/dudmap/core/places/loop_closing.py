@@ -52,9 +52,9 @@ class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
     A match is accepted if features (3D-3D RANSAC), distances and intensities of the local map of the matched time give
-    the same camera pose, a second frame confirms the correction, and the newest frame has not been registered to the
-    older surfaces meanwhile. A background thread matches features; the result is evaluated ``CHECK_INTERVAL`` frames
-    later, independent of timing. ``closed`` is the number of corrections and joins.
+    the same camera pose. A second frame must confirm the correction. The newest frame must not have been registered to
+    the older surfaces meanwhile. A background thread matches features; the result is evaluated ``CHECK_INTERVAL``
+    frames later, independent of timing. ``closed`` is the number of corrections and joins.
     """
 
     corrector: Remembered[LoopCorrector]

@@ -20,7 +20,7 @@ path."""
 LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a motion measured at a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
-"""Largest misfit of the new pass to the map of the old pass: the ratio times its misfit to its own map, plus the
+"""Largest misfit of the new pass to the map of the old pass. It is the ratio times its misfit to its own map, plus the
 offset (reference depths; intensities 0..1). Measured: a correct correction has the ratio 1.1, errors of 5 cm, or of
 2 cm and 1 degree, more than 2."""
 
@@ -58,8 +58,8 @@ class LoopCorrector(Stateful):
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
         """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
 
-        Returns the motion (4, 4) of the newest pose, or None: the poses are not finite, or the misfit of the new pass
-        to the map of the old pass exceeds the misfit to its own map.
+        Returns the motion (4, 4) of the newest pose. Returns None if the poses are not finite, or if the new pass fits
+        the map of the old pass clearly worse than its own map (``MAX_RATIO``).
         """
         history = self.atlas.history
         assert history is not None

@@ -29,8 +29,8 @@ LOCAL_FRAMES = 8
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
 """Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
 DRIFT_ALLOWANCE, DRIFT_SHARE = 0.05, 0.1
-"""Drift that is plausible after any path, reference depths and radians, and further drift as a share of the path
-since the last visit; 1 rad counts as one reference depth."""
+"""Drift that is plausible after any path, reference depths and radians. Further drift as a share of the path since the
+last visit; 1 rad counts as one reference depth."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Rebuilding of a map from the stored frames of its submap, a few with every new frame.
 
-ElasticFusion (Whelan et al. 2015) deforms the surface; BundleFusion (Dai et al. 2017) re-integrates frame by frame, as
+ElasticFusion (Whelan et al. 2015) deforms the surface. BundleFusion (Dai et al. 2017) re-integrates frame by frame, as
 here, in order of time, because later frames carve. Until the new map is complete, frames are registered to a
 provisional map of stored frames with the present view.
 """

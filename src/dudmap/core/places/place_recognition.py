@@ -303,8 +303,8 @@ def _nothing() -> None:
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
     """The keyframes whose strongest features are most similar to the frame's, best first.
 
-    A score sums, over the frame's features, the excess of its best cosine similarity over the median of all keyframes:
-    features of many places do not count.
+    A score sums, over the frame's features, the excess of its best cosine similarity over the median of all keyframes.
+    Features of many places do not count.
     """
     if len(among) <= MAX_MATCHED:
         return among

@@ -55,7 +55,7 @@ class RedundantViews(Stateful):
         static surface, except for
 
         * a surface with fewer than 2 ``volume.free_after`` observations: the space before it is not yet known to be
-          free (each frame observes every second plane of blocks)
+          free. Each frame observes every second plane of blocks
         * measurements off the surface of the map: a new object
         * measurements behind the last fused depth of their pixel, until they are fused as often: an object left and is
           carved

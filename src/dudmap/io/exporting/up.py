@@ -25,8 +25,8 @@ LEVEL = np.cos(np.radians(15))
 UPSIDE_DOWN = 2.0
 """Ratio of surface facing down to up from which the map may be upside down: cameras look down on furniture."""
 TURNED, STEADY = 0.64, 0.9
-"""Singular values of the mean rotation matrix: the second is below ``TURNED`` (sin(x) / x at a quarter turn) if the
-cameras turn by half a turn, the first above ``STEADY`` if they nod by less than 25 degrees."""
+"""Singular values of the mean rotation matrix. The second is below ``TURNED`` (sin(x) / x at a quarter turn) if the
+cameras turn by half a turn. The first is above ``STEADY`` if they nod by less than 25 degrees."""
 ASSUMED = "assumed: the camera is upright"
 
 

@@ -1,7 +1,7 @@
 """Read a bag with the package rosbags: topics, message times from the index, and single messages.
 
 rosbags trusts its input. This module limits decompression, accepts SQLite files with plain tables only, and decodes
-messages by the published ROS definitions: rosbags would turn definitions in a bag into Python code.
+messages by the published ROS definitions. rosbags itself would turn definitions in a bag into Python code.
 """
 
 import os

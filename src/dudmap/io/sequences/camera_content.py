@@ -1,7 +1,7 @@
 """Cameras in the content of a file of any name: text, JSON, YAML, NumPy arrays.
 
-A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths with a principal point under any usual
-name. The caller tests whether the numbers fit the images.
+A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1. Or it is focal lengths with a principal point under any
+usual name. The caller tests whether the numbers fit the images.
 """
 
 import re

@@ -29,8 +29,8 @@ FRAME_RATE = 30.0
 class ImageFolder(Recording):
     """Base class of recordings whose frames are a colour file and a depth file each, or a depth file alone.
 
-    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``); optionally
-    its cameras (``published``), its ground truth (``_find_ground_truth``) and ``_read_depth``.
+    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``). Optionally
+    it defines its cameras (``published``), its ground truth (``_find_ground_truth``) and ``_read_depth``.
 
     Args:
         camera: Intrinsics that replace the recording's, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``. Colour

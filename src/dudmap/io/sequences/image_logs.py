@@ -221,7 +221,7 @@ LARGEST_COMMAND = 315 + 2359
 class Record3DRecording(Recording):
     """Recording in a ``.r3d`` file.
 
-    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place: the
+    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place. The
     depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Depth of confidence 0 is
     omitted. ARKit's poses are no ground truth.
     """

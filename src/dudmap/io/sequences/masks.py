@@ -21,8 +21,8 @@ Images = Sequence[tuple[Path, Path]]
 class MaskFolder:
     """Folder of masks (PNG, 255 = dynamic), assigned to frames by name, by number or by time.
 
-    ``000030.png``, ``30.png``, ``rgb_000030.png`` or ``frame-000030.mask.png`` belongs to the frame of colour image 30,
-    a time in any unit to the nearest frame, at most 20 ms away.
+    ``000030.png``, ``30.png``, ``rgb_000030.png`` or ``frame-000030.mask.png`` belongs to the frame of colour image 30.
+    A time in any unit belongs to the nearest frame, at most 20 ms away.
 
     Args:
         path: The folder.

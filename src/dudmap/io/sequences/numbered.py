@@ -28,8 +28,8 @@ class NumberedSequence(ImageFolder):
 
     Words in names, the content, or two patterns tell which images are depth and colour (``image_series``). Equal
     numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms. The ground truth is
-    groundtruth.txt, or matrices camera to world: one per frame in poses.txt, or numbered like the images in a folder
-    ``pose`` or ``poses``.
+    groundtruth.txt, or matrices camera to world. These are one per frame in poses.txt, or numbered like the images in a
+    folder ``pose`` or ``poses``.
 
     Args:
         color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, for ambiguous names.

@@ -261,8 +261,8 @@ class NerfstudioSequence(ImageFolder):
     """Folder in nerfstudio's form: transforms.json names ``file_path``, ``depth_file_path`` and ``transform_matrix``.
 
     Frames are ordered by image name, at 30 Hz, unless each has a ``timestamp``. Depth has 16 bits,
-    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file, in the view of the
-    colour image, often smaller. Intrinsics are the median. Matrices are camera to world with OpenGL axes. Poses of
+    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file. It has the view of
+    the colour image, often smaller. Intrinsics are the median. Matrices are camera to world with OpenGL axes. Poses of
     structure from motion are no ground truth: they lack scale.
     """
 

@@ -28,7 +28,7 @@ FACTORS = (2, 3, 5, 7, 11, 13)
 PLAUSIBLE = (256, 8000)
 """Range of the median distance, mm: from 8-bit depth times 8 to the limit of a camera for rooms."""
 DENSE = 0.9
-"""Largest share of the millimetres in a range that occur in rotated depth: steps of a camera grow with distance,
+"""Largest share of the millimetres in a range that occur in rotated depth. Steps of a camera grow with distance,
 steps of a unit are constant."""
 SAMPLED = 5
 SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"

@@ -30,7 +30,7 @@ class TumSequence(ImageFolder):
 
     Intrinsics come from ``camera``, else from a file, else from freiburg1-3 in the name of the folder, or of the bag in
     rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``). Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are applied
-    to both images. The published distortion of freiburg1 and 2 is not used: it describes the colour lens, but the
+    to both images. The published distortion of freiburg1 and 2 is not used. It describes the colour lens, but the
     driver reprojected the depth for a lens without distortion.
     """
 

@@ -1,7 +1,7 @@
 """Bags that were not closed: the recorder was killed, the power failed, or a copy was cut off.
 
-A new index, which an MCAP file or ROS 1 bag has at its end, is made from the complete chunks and read as if it followed
-them. Content that violates the format raises a ``ValueError``.
+An MCAP file or ROS 1 bag has its index at the end. A new one is made from the complete chunks and read as if it
+followed them. Content that violates the format raises a ``ValueError``.
 """
 
 import io

@@ -255,7 +255,7 @@ def linearize_pair(
     """Normal equations of the differences between two frames at the points of the first.
 
     Both intensities show the same texture, so its gradient g in the second image is the mean of both images' gradients.
-    With the affinity A of the surface tangents, a step d_i in the first image is a step A d_i in the second, and the
+    With the affinity A of the surface tangents, a step d_i in the first image is a step A d_i in the second. The
     derivative by a parameter is g (d_j - A d_i). The difference of separate derivatives would be mostly noise, which
     makes steps and covariances too small.
 

@@ -47,10 +47,10 @@ def _moved(t, x, z):
 def color_places(v, depth, intrinsics, projection, size, first, across, down, gain):
     """Positions of a row of depth pixels in the colour image, clamped at its borders.
 
-    A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera: T_color_depth
-    exp(-tau xi) X to the second order. tau and row depend on each other. One fixed-point step from the row of the depth
-    image contracts the error by readout times image speed over height. 20 rows, 30 ms and 1 rad/s at 480 rows leave
-    0.02 pixels.
+    A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera. This is
+    T_color_depth exp(-tau xi) X to the second order. The time tau and row depend on each other. One fixed-point step
+    from the row of the depth image contracts the error by readout times image speed over height. With 20 rows between
+    the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels remain.
 
     Args:
         v: Row.

@@ -24,7 +24,7 @@ def fit_exposure(
     """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit without
     saturated pixels.
 
-    A change of the median or the contrast by more than LARGE_GAIN makes the fit unreliable: its prior outweighs a dark
+    A change of the median or the contrast by more than LARGE_GAIN makes the fit unreliable. Its prior outweighs a dark
     image, and misaligned pixels flatten it. A second candidate then comes from the quartiles of both images, corrected
     by a second fit if that correction is below LARGE_GAIN. The smaller median error wins.
 

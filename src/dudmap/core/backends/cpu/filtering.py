@@ -43,8 +43,8 @@ def between(z, a, b, gap):
 def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
     """Remove flying pixels, which measure a depth between foreground and background; they become 0.
 
-    Such a pixel lies behind one neighbour and in front of the other, one or two pixels away in its row or column, by
-    more than ``max(noise_floor, noise z^2) + slope z``, which no measurable surface does.
+    Such a pixel lies behind one neighbour and in front of the other, one or two pixels away in its row or column. Both
+    differences exceed ``max(noise_floor, noise z^2) + slope z``, which no measurable surface reaches.
 
     Args:
         noise, noise_floor: Tolerance, 1/m and metres.
@@ -97,7 +97,7 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
 
     A missing pixel is filled if its run of missing pixels, in the row or the column, is at most LONGEST_RUN long and
-    ends on one surface, and its 5x5 neighbourhood has at least MIN_NEIGHBOURS measurements within ``max(noise_floor,
+    ends on one surface. Its 5x5 neighbourhood must have at least MIN_NEIGHBOURS measurements within ``max(noise_floor,
     slope z^2)``. Depth edges are thus not bridged, and large holes keep their border.
 
     Args:

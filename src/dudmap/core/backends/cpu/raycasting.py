@@ -272,7 +272,7 @@ def raycast(
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface at each pixel of an image (H, W).
 
-    A surface is a change of the signed distance from positive to negative between trusted voxels; a ray from unknown
+    A surface is a change of the signed distance from positive to negative between trusted voxels. A ray from unknown
     space into the inside hits none. ``grid`` holds the largest of several voxel sizes; the smallest known voxels are
     used.
     """

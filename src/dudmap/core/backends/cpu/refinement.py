@@ -65,9 +65,9 @@ def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, textur
     """Octants of blocks ``start`` to ``stop``; the other arguments and results as for ``examine``.
 
     With the distance f in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
-    a; steps of two voxels divide the noise by four. On a surface of curvature k the sum over the axes is about k times
-    the voxel size, and the error of linear interpolation an eighth of it. The bend is the root mean square of |D| over
-    the voxels near the surface; the texture is the same for the intensity, with steps of one voxel.
+    a. Steps of two voxels divide the noise by four. On a surface of curvature k the sum over the axes is about k times
+    the voxel size. The error of linear interpolation is an eighth of it. The bend is the root mean square of |D| over
+    the voxels near the surface. The texture is the same for the intensity, with steps of one voxel.
     """
     words = np.empty((SIZE, SIZE, SIZE), np.int32)
     flat = words.reshape(-1)

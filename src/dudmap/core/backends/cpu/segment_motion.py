@@ -166,8 +166,8 @@ def classify_segments(evidence, before, min_pixels):
     A segment of at least ``min_pixels`` is dynamic
 
     - if at least NEARLY_ALL of its pixels are dynamic, or
-    - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and its static pixels
-      have moved as well.
+    - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and the others have
+      moved as well.
 
     With the mean distance s and the intensity mismatch m, static pixels have moved if
 

@@ -3,7 +3,7 @@
 Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz). Bit k of a case is set if corner k is inside (sdf <
 0). An edge is a pair (corner, axis) of its lower end and its direction.
 
-On each face the surface is one or two segments between crossed edges, which depend on the signs of that face only; on
+On each face the surface is one or two segments between crossed edges, which depend on the signs of that face only. On
 an ambiguous face each inside corner gets its own. Neighbours therefore agree, and the mesh has no cracks. The segments
 form closed loops, triangulated without diagonals inside a face: these could coincide with the neighbour's.
 """

@@ -1,7 +1,7 @@
 """Threads that share the bands of consecutive steps inside one compiled call.
 
 One thread leads: it announces a step, works on its bands, and waits until all are done. Taking a band adds 1 to a
-ticket that also holds the step number, so that a late thread finds no band or one of a later step.
+ticket that also holds the step number. A late thread therefore finds no band or one of a later step.
 """
 
 import sys

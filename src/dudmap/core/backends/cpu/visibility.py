@@ -20,7 +20,7 @@ def mark_blocks(
 ):  # fmt: skip
     """Window cells of blocks without voxels that the truncation bands of a depth image touch.
 
-    A known free block gets voxels only within the fixed part of the band: in the part that grows with the noise, blocks
+    A known free block gets voxels only within the fixed part of the band. In the part that grows with the noise, blocks
     would appear and vanish. Addresses of a whole row are computed before cells are read.
 
     Args:
@@ -115,7 +115,7 @@ def visible_slots(
 ):  # fmt: skip
     """Slots of the blocks that a depth image can change and that are updated in this frame.
 
-    A block alternates if the sensor noise is wider than the band and SETTLED frames have been fused into it: it is
+    A block alternates if the sensor noise is wider than the band and SETTLED frames have been fused into it. It is
     updated in every second frame with double weight, half of these blocks in even frames.
 
     Args:

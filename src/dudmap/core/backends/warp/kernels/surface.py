@@ -1,7 +1,7 @@
 """Loops that read the map: normal equations, samples at points.
 
-The sums equal ``cpu/registration.py``. Each thread adds a fixed set of pixels, and partial sums are added in order, so
-that two runs on one device are equal, unlike with atomic additions.
+The sums equal ``cpu/registration.py``. Each thread adds a fixed set of pixels, and partial sums are added in order. Two
+runs on one device are therefore equal, unlike with atomic additions.
 """
 
 import warp as wp
