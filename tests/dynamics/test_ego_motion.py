@@ -70,7 +70,7 @@ def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
     assert np.count_nonzero(motion.moving_before & ~mask) < 0.05 * mask.size
 
 
-@pytest.mark.parametrize("width", [160, 320, 640])
+@pytest.mark.parametrize("width", [160, 640])
 def test_motion_and_labels_agree_at_any_resolution(width):
     full = synthetic.sequence("room", coverage=0.5, start_dynamic=True, frames=8, noise="kinect", seed=2)
     slam = Slam(full.camera, Config().override([f"tracker.widths=[{width // 4}, {width // 2}, {width}]"]))
@@ -257,6 +257,7 @@ def test_a_second_pass_of_a_short_recording_knows_who_stood_in_its_first_frame(c
     assert overlaps(twice).mean() > overlaps(once)[1:].mean()
 
 
+@pytest.mark.slow
 def test_a_second_pass_knows_what_the_first_frames_could_not():
     people = synthetic.sequence("room", coverage=0.3, start_dynamic=True, frames=60, camera=CAMERA, noise="kinect")
     frames, masks = [people[index] for index in range(40)], [people.mask(index) for index in range(40)]
@@ -305,7 +306,7 @@ def uncertain_frames(sequence):
 
 
 # the camera followed people of 0.3 m/s for a while, and those of 0.1 m/s, over half of the image, for good
-@pytest.mark.parametrize(("coverage", "speed", "seed"), [(0.42, 0.3, 0), (0.42, 0.3, 1), (0.5, 0.1, 20)])
+@pytest.mark.parametrize(("coverage", "speed", "seed"), [(0.42, 0.3, 0), (0.5, 0.1, 20)])
 def test_a_young_map_with_a_slow_crowd_is_uncertain_and_begins_anew_without_it(coverage, speed, seed, monkeypatch):
     camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
     sequence = synthetic.sequence(

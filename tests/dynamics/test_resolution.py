@@ -90,7 +90,7 @@ def test_results_do_not_depend_on_the_label_width(label_width):
     assert_agreement(320, 240, label_width)
 
 
-@pytest.mark.parametrize(("width", "height"), [(640, 480), (848, 480), pytest.param(1280, 720, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("width", "height"), [(848, 480), pytest.param(1280, 720, marks=pytest.mark.slow)])
 def test_results_do_not_depend_on_the_image_size(width, height):
     assert_agreement(width, height, 160)
 

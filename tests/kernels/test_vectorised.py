@@ -38,6 +38,7 @@ from dudmap.core.slam import Slam
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
+pytestmark = pytest.mark.slow
 PAIRS = color_pairs, "linearize_pairs"
 FEWEST = {
     (registration, "linearize_rows"): {"loops": 2, "fma": 66, "packed": 180, "converted": 18},
@@ -78,7 +79,7 @@ def signatures():
     given = Calibration.registered(camera)
     collector, still = KeyframeCollector(given), np.zeros(camera.shape, bool)
     for index in range(3):
-        slam.process(recording[index])
+        assert slam.process(recording[index]).dynamic_mask is not None  # upsamples the labels
         collector.add(slam.preprocess(recording[index]), np.eye(4), still)
     pairs = PairSet([Pair(collector.keyframes[0], collector.keyframes[0])])
     Adjustment(given, SensorConfig()).with_poses(pairs, Fit.tracked(pairs, given))
