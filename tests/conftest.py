@@ -1,5 +1,6 @@
 """Settings of the test processes (pytest-xdist's workers; OpenCV's for tests/processors.py), shared fixtures."""
 
+import gc
 import os
 import sys
 import types
@@ -31,11 +32,28 @@ def pytest_addoption(parser):
     parser.addoption("--costs", action="store_true", help="print the processor seconds of each test file")
 
 
+def pytest_collection_finish():
+    gc.freeze()
+
+
 def pytest_configure(config):
     if config.getoption("--costs"):
         from costs import Costs
 
         config.pluginmanager.register(Costs())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Free the systems of each test, which refer to themselves: Python seldom does while so many objects live.
+
+    After each file all objects that are left are no longer examined.
+    """
+    found = yield
+    gc.collect()
+    if nextitem is None or nextitem.path != item.path:
+        gc.freeze()
+    return found
 
 
 @pytest.fixture(autouse=True)

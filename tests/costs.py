@@ -80,5 +80,5 @@ class Costs:
             terminalreporter.write_line("".join(cells) + f"{peak:>9}  {file}")
         for title, seconds in (("test", self.tests), ("compiled kernel", self.kernels)):
             terminalreporter.write_line(f"\n      all  {title}")
-            for name in sorted(seconds, key=lambda name: -seconds[name])[:40]:
+            for name in sorted(seconds, key=lambda name: -seconds[name])[:25]:
                 terminalreporter.write_line(f"{seconds[name]:9.2f}  {name}")

@@ -53,13 +53,13 @@ def without_colors(room):
     return run(room, 1.0, ["tracker.color_weight=0"])[1]
 
 
-@pytest.mark.parametrize("gain", [0.01, 0.05, 0.1, 0.2, 2.0, 3.0])
+@pytest.mark.parametrize("gain", [0.01, 0.1, 3.0])
 def test_no_frame_is_lost_where_the_light_changes_and_the_map_keeps_its_colours(
     room, undisturbed, without_colors, gain
 ):
     results, error, slam = run(room, gain)
     assert [result.lost_reason for result in results if result.state == "lost"] == []
-    told = gain in (0.1, 0.2)  # else hardly any grey levels are left, or many pixels are saturated
+    told = gain == 0.1  # else hardly any grey levels are left, or many pixels are saturated
     assert error < (2 * undisturbed[1] if told else without_colors)
     assert [result.blind for result in results[DARK_FROM:DARK_TO]] == [gain < 0.1] * (DARK_TO - DARK_FROM)
     meshes = [one.volume.extract_mesh() for one in (undisturbed[2], slam)]
@@ -78,7 +78,7 @@ def test_the_exposure_is_found_in_spite_of_saturation_and_low_contrast(gain, con
     assert np.median(np.abs(found * image + offset - of_map)[shown]) < 0.02 + 0.3 / 255 / gain
 
 
-@pytest.mark.parametrize("gain", [0.1, 0.2, 2.0, 3.0])
+@pytest.mark.parametrize("gain", [0.1, 3.0])
 def test_two_images_of_one_pose_lie_upon_each_other_in_any_light(room, gain):
     sequence, frames = room
     slam, images = Slam(CAMERA), ImageConsistency(Config(), MotionModel(Config().tracker))
