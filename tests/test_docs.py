@@ -75,6 +75,46 @@ def test_every_page_is_in_the_index():
         assert page.name == "README.md" or f"({page.name})" in index
 
 
+def read(*patterns):
+    """Text of all files of these patterns."""
+    return "\n".join(path.read_text(encoding="utf-8") for pattern in patterns for path in sorted(ROOT.glob(pattern)))
+
+
+TEXT = read("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs/*.md", "ros/*.md")
+
+
+def test_named_files_exist():
+    files = {path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.*") if ".venv" not in path.parts}
+    named = re.findall(r"`([\w./-]+\.(?:py|yml|ipynb|cff))`", TEXT)
+    missing = {name for name in named if not any(f"/{file}".endswith(f"/{name}") for file in files)}
+    assert missing - ELSEWHERE == set()
+
+
+def test_named_functions_classes_and_parameters_exist():
+    words = set(re.findall(r"\w+", read("src/**/*.py", "tests/**/*.py", "ros/**/*.py")))
+    text = re.sub(r"```.*?```", "", TEXT, flags=re.DOTALL)
+    named = {name.rstrip("()") for name in re.findall(r"`([A-Za-z_][\w.]*(?:\(\))?)`", text)}
+    commits = {name for name in named if re.fullmatch(r"[0-9a-f]{7,8}", name)}
+    assert {name for name in named - commits - ELSEWHERE if name.rpartition(".")[2] not in words} == set()
+
+
+ELSEWHERE = {
+    *("_mb", "_px", "color_k1", "overlap_min", "residual_mm_max"),  # endings, and names that are put together
+    *("camera_configuration.calibration_parameters.left_cam", "prange", "associate.py"),  # of other programs
+    *("fr1", "kitchen_filinha"),  # recordings
+    "_evidence",  # on the page that is rewritten with the cues
+}
+
+
+def test_every_command_example_variable_and_picture_is_on_a_page():
+    variables = set(re.findall(r"DUDMAP_[A-Z]+", read("src/**/*.py")))
+    examples = {path.name for path in (ROOT / "examples").iterdir()}
+    assert {name for name in {*variables, *examples} if name not in TEXT} == set()
+    assert {name for name in COMMANDS if f"dudmap {name}" not in TEXT} == set()
+    pictures = [path for kind in ("jpg", "png", "webp", "svg") for path in (ROOT / "docs").rglob(f"*.{kind}")]
+    assert [path.name for path in pictures if f"{path.name})" not in TEXT and "_build" not in path.parts] == []
+
+
 def test_every_format_is_in_the_table_of_formats():
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     assert [reader.format for reader in readers() if f"| {reader.format}" not in text] == []

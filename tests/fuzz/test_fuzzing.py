@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from loaders import LOADERS
 from trial import Finding, Subject, TooSlow
 
+import layouts
 from dudmap.errors import DatasetError
+from dudmap.io.sequences import reader_of, readers
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -34,6 +36,18 @@ def test_random_inputs(name, subjects):
         subject.trial(seed)
 
     read()
+
+
+def test_every_reader_has_an_input(tmp_path):
+    """Every reader takes one of the inputs, which the tests of the formats compare with what was written."""
+    tested = set()
+    for layout in layouts.LAYOUTS:
+        tested.add(reader_of(layouts.write(layout, tmp_path / layout.__name__)[0]))
+    for name in ("klg", "sens", "record3d", "Azure Kinect", "bag of ROS 1", "RealSense file"):
+        folder = tmp_path / f"file {name}"
+        folder.mkdir()
+        tested.add(reader_of(LOADERS[name].write(folder)))
+    assert [reader.__name__ for reader in readers() if reader not in tested] == []
 
 
 CASES = sorted(path for path in CORPUS.glob("*/*"))

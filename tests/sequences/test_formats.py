@@ -13,7 +13,7 @@ import pytest
 from device_layouts import nerfstudio, realsense, zed
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.io.sequences import Recording, open_sequence, readers
+from dudmap.io.sequences import Recording, open_sequence, reader_of
 from layout_images import color, millimetres, pose
 from layouts import LAYOUTS, corbs, icl_nuim, replica, scannet, seven_scenes, tum, write
 
@@ -101,13 +101,10 @@ def test_its_archive(layout, suffix, written, tmp_path, cache):
     check(open_sequence(pack(folder, tmp_path / f"packed{suffix}")), expected)
 
 
-def test_every_reader_is_tested(written):
-    known = ", ".join(reader.format for reader in readers())
-    assert all(written(layout)[1].format in known for layout in LAYOUTS)
-    for layout in LAYOUTS:
-        folder, expected = written(layout)
-        recognising = [reader.format for reader in readers() if reader.recognises(folder)]
-        assert expected.format in recognising[0]
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.__name__)
+def test_no_other_reader_takes_a_layout(layout, written):
+    folder, expected = written(layout)
+    assert expected.format in reader_of(folder).format
 
 
 def test_a_given_camera_replaces_that_of_the_depth_images(written):
