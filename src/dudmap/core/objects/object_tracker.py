@@ -12,13 +12,11 @@ from dudmap.config import MoversConfig
 from dudmap.core.backends.median import median
 from dudmap.core.frames.observation import Level
 from dudmap.core.geometry import se3
-from dudmap.core.geometry.camera import Camera
 from dudmap.core.objects.regions import (
     MIN_SHARE,
-    MovingPixels,
-    Region,
     connected_regions,
     is_fully_visible,
+    measured_regions,
     split_between,
     trimmed_box,
 )
@@ -36,6 +34,10 @@ MEMORY = 0.7
 """Time for which an object out of view keeps its identity, seconds."""
 VELOCITY_WINDOW = 0.2
 """Time over which the velocity is averaged, seconds."""
+MAX_TRACKS = 255
+"""Largest number of tracked objects, whose numbers in an image are bytes."""
+ESTABLISHED_SHARE = 0.3
+"""Smallest part of an established object that stays separate, relative to the object."""
 ESTABLISHED = 0.5
 """Age after which separate objects stay separate when they touch, seconds."""
 
@@ -72,29 +74,52 @@ class Mover:
 class _Measurement:
     """Motion of an object in one frame.
 
-    ``duration``: seconds since it was last seen. ``displacement``: (3,) m since then by optical flow, None if unknown.
-    ``positions``: (2, 3) m, of its centroid and of the centre of its box.
+    ``velocity``: (3,) m/s since the last frame by optical flow, None if unknown. ``positions``: (2, 3) m, of its
+    centroid and of the centre of its box.
     """
 
     time: float
-    duration: float
-    displacement: NDArray[np.float64] | None
+    velocity: NDArray[np.float64] | None
     positions: NDArray[np.float64]
     fully_visible: bool
 
 
 @dataclass(eq=False)
 class _Track:
-    """State of an object over time: times in seconds, last centroid and box (m), area in square metres."""
+    """State of an object over time.
+
+    ``first_seen``, ``last_seen``: seconds. ``size``, ``centroid``, ``box``, ``area``: in its last frame, in pixels, m
+    and square metres. ``velocity``: m/s.
+    """
 
     id: int
     first_seen: float
     last_seen: float
+    size: int
     centroid: NDArray[np.float64]
     box: NDArray[np.float64]
-    area: float = 0.0
+    area: float
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     measurements: list[_Measurement] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """An object in one frame: indices of its pixels (n,), its points (n, 3), centroid and box, m, its surface, m^2."""
+
+    pixels: NDArray[np.intp]
+    area: float
+    points: NDArray[np.float32]
+    centroid: NDArray[np.float64]
+    box: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, pixels: NDArray[np.intp], area: float, level: Level, T_world_camera: NDArray[np.float32]) -> "_Shape":
+        """Object with the given pixels and surface."""
+        v, u = np.divmod(pixels, level.camera.width)
+        points = level.camera.points(u, v, level.depth.reshape(-1)[pixels])
+        points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        return cls(pixels, area, points, points.mean(axis=0, dtype=np.float64), trimmed_box(points))
 
 
 class ObjectTracker(Stateful):
@@ -121,159 +146,139 @@ class ObjectTracker(Stateful):
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]
     ) -> list[Mover]:
         """Moving objects of a tracked frame, by number; ``dynamic`` (h, w) marks the moving pixels of ``level``."""
-        self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= MEMORY]
-        predicted_ids = self._predicted_ids(timestamp, level.camera, T_world_camera)
-        pixels = connected_regions(dynamic, level, T_world_camera, predicted_ids)
-        objects = [] if pixels is None else self._segment(pixels)
-        if pixels is None or not objects:
-            self._last = None
-            return []
-        clouds = [pixels.points[indices] for indices in objects]
-        boxes = [trimmed_box(points) for points in clouds]
-        centroids = [points.mean(axis=0, dtype=np.float64) for points in clouds]
-        tracks = self._associate(timestamp, objects, centroids, boxes, pixels.predicted_id)
-        frame = _instance_frame(timestamp, level, pixels, objects, tracks)
-        known_displacements: dict[int, NDArray[np.float64]] = {}
-        if self._last is not None and self._last.ids.shape == frame.ids.shape:
-            known = [track.id for track in self._tracks if track.last_seen == self._last.timestamp]
-            known_displacements = displacements(self._last, frame, known, MAX_JUMP * self.reference_depth)
+        self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= MEMORY][:MAX_TRACKS]
+        predicted = self._predicted(timestamp, level, T_world_camera)
+        numbers = self._split(connected_regions(dynamic & (level.depth > 0), level), predicted)
+        T = T_world_camera.astype(np.float32)
+        objects = [_Shape.of(pixels, area, level, T) for pixels, area in self._joined(numbers, predicted, level)]
+        tracks = self._associate(timestamp, objects, predicted)
+        frame = InstanceFrame(timestamp, level, T_world_camera, np.zeros(level.camera.shape, dtype=np.int32))
+        for shape, track in zip(objects, tracks, strict=True):
+            frame.ids.reshape(-1)[shape.pixels] = track.id
+        last, moved = self._last, {}
+        if objects and last is not None and last.ids.shape == frame.ids.shape:
+            seen = {track.id: shape.pixels for shape, track in zip(objects, tracks, strict=True)}
+            moved = displacements(last, frame, seen, MAX_JUMP * self.reference_depth)
+        self._last = frame if objects else None
         movers = []
-        for indices, track, centroid, box in zip(objects, tracks, centroids, boxes, strict=True):
+        for shape, track in zip(objects, tracks, strict=True):
             mask = frame.ids == track.id
-            measurement = _Measurement(
-                timestamp,
-                timestamp - track.last_seen,
-                known_displacements.get(track.id),
-                np.stack([centroid, box.mean(axis=0)]),
-                is_fully_visible(mask, level.depth, self.reference_depth),
-            )
-            self._update_velocity(track, measurement)
-            track.centroid, track.box, track.last_seen = centroid, box, timestamp
-            track.area = float(pixels.area[indices].sum())
-            age = timestamp - track.first_seen
-            movers.append(Mover(track.id, mask, frame.points[mask], centroid, box, track.velocity.copy(), age))
-        self._last = frame
+            velocity = moved[track.id] / (timestamp - track.last_seen) if track.id in moved else None
+            visible = is_fully_visible(mask, level.depth, self.reference_depth)
+            positions = np.stack([shape.centroid, shape.box.mean(axis=0)])
+            self._update_velocity(track, _Measurement(timestamp, velocity, positions, visible))
+            track.size, track.area = len(shape.pixels), shape.area
+            track.centroid, track.box = shape.centroid, shape.box
+            track.last_seen, age = timestamp, timestamp - track.first_seen
+            movers.append(Mover(track.id, mask, shape.points, shape.centroid, shape.box, track.velocity.copy(), age))
         return sorted(movers, key=lambda mover: mover.id)
 
-    def _predicted_ids(
-        self, timestamp: float, camera: Camera, T_world_camera: NDArray[np.float64]
-    ) -> NDArray[np.int32]:
-        """Object predicted at constant velocity in each 2x2 pixels: ((h + 1) // 2, (w + 1) // 2), 0 = none."""
-        h, w = (camera.height + 1) // 2, (camera.width + 1) // 2
-        out = np.zeros((h, w), dtype=np.int32)
-        last = self._last
-        if last is None or last.ids.shape != camera.shape:
-            return out
-        number = last.ids[::2, ::2]
-        occupied = number > 0
-        number = number[occupied]
-        shift = np.zeros((self._next_id, 3), dtype=np.float32)
-        for track in self._tracks:
-            shift[track.id] = track.velocity * (timestamp - last.timestamp)
-        T = se3.inverse(T_world_camera).astype(np.float32)
-        points = (last.points[::2, ::2][occupied] + shift[number]) @ T[:3, :3].T + T[:3, 3]
+    def _predicted(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """1 + index of the track predicted in each pixel (h, w) at constant velocity, 0 = none; by blocks of 2x2."""
+        last, (h, w) = self._last, level.camera.shape
+        if last is None or last.ids.shape != (h, w):
+            return np.zeros((h, w), dtype=np.uint8)
+        half = level.camera.resized((w + 1) // 2, (h + 1) // 2)
+        out, index_of_id = np.zeros(half.shape, dtype=np.uint8), np.zeros(self._next_id, dtype=np.uint8)
+        shifts = np.zeros((len(self._tracks) + 1, 3))
+        for index, track in enumerate(self._tracks, start=1):
+            index_of_id[track.id] = index
+            shifts[index] = track.velocity * (timestamp - last.timestamp)
+        pixels = 2 * np.stack(np.nonzero(last.ids[::2, ::2])[::-1], axis=1)
+        index = index_of_id[last.ids[pixels[:, 1], pixels[:, 0]]]
+        T = se3.inverse(T_world_camera)
+        points = (last.points(pixels, pixels) + shifts[index]) @ T[:3, :3].T + T[:3, 3]
         order = np.argsort(-points[:, 2])  # the nearest point is written last
-        order = order[: np.count_nonzero(points[:, 2] > 0)]
-        number = number[order]
-        u, v = ((camera.project(points[order]) + 0.5) / 2).astype(np.int64).T
-        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-        out[v[inside], u[inside]] = number[inside]
-        return out
+        inside, u, v = half.nearest_pixels(points[order])
+        out[v, u] = index[order[inside]]
+        return out.repeat(2, axis=0).repeat(2, axis=1)[:h, :w]
 
-    def _segment(self, pixels: MovingPixels) -> list[NDArray[np.int64]]:
-        """Pixels (k,) of each object, after splitting regions of touching objects and joining fragments."""
-        regions = [
-            Region.of(pixels, indices)
-            for start, stop in pixels.ranges
-            for indices in self._split(np.arange(start, stop), pixels)
-        ]
-        regions.sort(key=lambda region: -region.area)
-        groups: list[list[Region]] = []
-        for region in regions:
-            fitting = next((group for group in self._candidates(region, groups) if self._is_near(region, group)), None)
-            groups.append([region]) if fitting is None else fitting.append(region)
-        return [
-            np.concatenate([region.indices for region in group])
-            for group in groups
-            if sum(region.area for region in group) >= self.config.min_area
-        ]
+    def _split(self, numbers: NDArray[np.int32], predicted: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Regions (h, w) of which each contains at most one established object."""
+        established = [i + 1 for i, track in enumerate(self._tracks) if self._is_old(track)]
+        if len(established) < 2:
+            return numbers
+        count = int(numbers.max()) + 1
+        votes = np.bincount(numbers.reshape(-1) * np.int64(256) + predicted.reshape(-1), minlength=256 * count)
+        votes = votes.reshape(count, 256)[:, established]
+        sizes = [self._tracks[i - 1].size for i in established]
+        contained = votes >= np.maximum(MIN_SHARE * numbers.size, ESTABLISHED_SHARE * np.array(sizes))
+        contained[0] = False
+        for number in np.flatnonzero(contained.sum(axis=1) > 1):
+            region = numbers == number
+            owners = split_between(region, predicted, [established[j] for j in np.flatnonzero(contained[number])])
+            numbers[region] = numbers.max() + owners
+        return numbers
 
-    def _split(self, indices: NDArray[np.int64], pixels: MovingPixels) -> list[NDArray[np.int64]]:
-        """Parts of a region that contains several established objects; otherwise the region alone."""
-        least = MIN_SHARE * pixels.shape[0] * pixels.shape[1]
-        if len(indices) < 2 * least or len(self._tracks) < 2:
-            return [indices]
-        predicted = pixels.predicted_id[indices]
-        counts = np.bincount(predicted)
-        ids = [
-            track.id
-            for track in self._tracks
-            if track.id < len(counts)
-            and counts[track.id] >= least
-            and self._is_established(track, float(pixels.area[indices[predicted == track.id]].sum()))
-        ]
-        return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)
+    def _joined(
+        self, numbers: NDArray[np.int32], predicted: NDArray[np.uint8], level: Level
+    ) -> list[tuple[NDArray[np.intp], float]]:
+        """Pixels (n,) and surface of each object: a region with its fragments.
 
-    def _candidates(self, region: Region, groups: list[list[Region]]) -> list[list[Region]]:
-        """Objects that may include a region: same prediction, or much larger."""
-        same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
-        track = next((track for track in self._tracks if track.id == region.predicted_id), None)
-        if track and self._is_established(track, region.area):
-            return same
-        return same + [group for group in groups if region.area < 0.5 * sum(part.area for part in group)]
+        A fragment is near the object, and either has the same prediction or is much smaller.
+        """
+        regions = measured_regions(numbers, level)
+        if regions is None:
+            return []
+        near = regions.gaps < MERGE_DISTANCE * self.reference_depth
+        owners = [int(np.argmax(np.bincount(predicted.reshape(-1)[pixels]))) for pixels in regions.pixels]
+        groups: list[list[int]] = []
+        areas = regions.areas
+        for i in sorted(range(len(areas)), key=lambda i: -areas[i]):
+            track = self._tracks[owners[i] - 1] if owners[i] else None
+            own = track is not None and self._is_old(track) and areas[i] >= ESTABLISHED_SHARE * track.area
+            for group in groups:
+                same = owners[i] and owners[i] == owners[group[0]]
+                small = not own and areas[i] < 0.5 * sum(areas[j] for j in group)
+                if (same or small) and near[i, group].any():
+                    group.append(i)
+                    break
+            else:
+                groups.append([i])
+        objects = [(np.concatenate([regions.pixels[i] for i in of]), sum(areas[i] for i in of)) for of in groups]
+        return [(np.sort(pixels), area) for pixels, area in objects if area >= self.config.min_area]
 
-    def _is_near(self, region: Region, group: list[Region]) -> bool:
-        return any(region.is_near(part, MERGE_DISTANCE * self.reference_depth) for part in group)
+    def _is_old(self, track: _Track) -> bool:
+        """Whether an object has been seen for some time."""
+        return track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
 
-    def _is_established(self, track: _Track, area: float) -> bool:
-        known = track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
-        return known and area >= 0.3 * track.area
-
-    def _associate(
-        self,
-        timestamp: float,
-        objects: list[NDArray[np.int64]],
-        centroids: list[NDArray[np.float64]],
-        boxes: list[NDArray[np.float64]],
-        predicted_id: NDArray[np.int32],
-    ) -> list[_Track]:
+    def _associate(self, timestamp: float, objects: list[_Shape], predicted: NDArray[np.uint8]) -> list[_Track]:
         """Track of each object, greedily by increasing cost: distance from the prediction - max_jump * shared pixels.
 
         Candidates share more than 0.3 of the pixels, lie closer than ``max_jump`` or have overlapping boxes.
         """
-        candidates, max_jump = [], MAX_JUMP * self.reference_depth
-        if self._tracks:
-            ids = [track.id for track in self._tracks]
-            shifts = np.array([track.velocity * (timestamp - track.last_seen) for track in self._tracks])
-            expected = np.array([track.centroid for track in self._tracks]) + shifts
-            expected_boxes = np.array([track.box for track in self._tracks]) + shifts[:, None]
-            for i, (indices, centroid, box) in enumerate(zip(objects, centroids, boxes, strict=True)):
-                shared = np.bincount(predicted_id[indices], minlength=self._next_id)[ids] / len(indices)
-                distances = np.linalg.norm(expected - centroid, axis=1)
-                overlapping = np.all((expected_boxes[:, 0] <= box[1]) & (box[0] <= expected_boxes[:, 1]), axis=1)
-                possible = np.flatnonzero((shared > 0.3) | (distances < max_jump) | overlapping)
-                candidates += [(distances[j] - max_jump * shared[j], i, int(j)) for j in possible]
-        tracks: dict[int, _Track] = {}
-        assigned: set[int] = set()
-        for _, i, j in sorted(candidates):
-            if i not in tracks and j not in assigned:
-                tracks[i] = self._tracks[j]
-                assigned.add(j)
-        for i in range(len(objects)):
-            if i not in tracks:
-                tracks[i] = _Track(self._next_id, timestamp, timestamp, centroids[i], boxes[i])
-                self._tracks.append(tracks[i])
+        known, max_jump = list(self._tracks), MAX_JUMP * self.reference_depth
+        found: dict[int, _Track] = {}
+        if objects and known:
+            shifts = np.array([track.velocity * (timestamp - track.last_seen) for track in known])
+            boxes = np.array([shape.box for shape in objects])[:, None]
+            expected = np.array([track.box for track in known]) + shifts[:, None]
+            overlapping = np.all((expected[:, 0] <= boxes[:, :, 1]) & (boxes[:, :, 0] <= expected[:, 1]), axis=2)
+            centroids = np.array([shape.centroid for shape in objects])[:, None]
+            distance = np.linalg.norm(np.array([track.centroid for track in known]) + shifts - centroids, axis=2)
+            votes = [np.bincount(predicted.reshape(-1)[shape.pixels], minlength=len(known) + 1) for shape in objects]
+            shared = np.array([vote[1:] / vote.sum() for vote in votes])
+            possible = (shared > 0.3) | (distance < max_jump) | overlapping
+            cost = np.where(possible, distance - max_jump * shared, np.inf)
+            while cost.min() < np.inf:
+                i, j = divmod(int(np.argmin(cost)), len(known))
+                found[i] = known[j]
+                cost[i], cost[:, j] = np.inf, np.inf
+        for i, shape in enumerate(objects):
+            if i not in found:
+                found[i] = _Track(
+                    self._next_id, timestamp, timestamp, len(shape.pixels), shape.centroid, shape.box, shape.area
+                )
+                self._tracks.append(found[i])
                 self._next_id += 1
-        return [tracks[i] for i in range(len(objects))]
+        return [found[i] for i in range(len(objects))]
 
     def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
         """Velocity: median of estimates from displacements and from slopes of positions."""
         recent = [m for m in track.measurements if measurement.time - m.time < VELOCITY_WINDOW]
         track.measurements = [*recent, measurement]
         estimates = []
-        velocities = np.array(
-            [m.displacement / m.duration for m in track.measurements if m.displacement is not None and m.duration > 0]
-        )
+        velocities = np.array([m.velocity for m in track.measurements if m.velocity is not None])
         if len(velocities):
             deviation = np.linalg.norm(velocities - median(velocities), axis=1)
             largest = max(OUTLIER_SPEED * self.reference_depth, float(np.median(deviation)))
@@ -283,18 +288,6 @@ class ObjectTracker(Stateful):
             times = np.array([m.time for m in usable])
             times = times - times.mean()
             positions = np.stack([m.positions for m in usable])
-            estimates += list(np.einsum("t,tij->ij", times, positions) / np.sum(times**2))
+            estimates += list(np.tensordot(times, positions, 1) / np.sum(times**2))
         if estimates:
             track.velocity = median(np.array(estimates))
-
-
-def _instance_frame(
-    timestamp: float, level: Level, pixels: MovingPixels, objects: list[NDArray[np.int64]], tracks: list[_Track]
-) -> InstanceFrame:
-    """Images of the ids and points of the moving objects of a frame."""
-    ids = np.zeros(pixels.shape, dtype=np.int32)
-    points = np.zeros((*pixels.shape, 3), dtype=np.float32)
-    points.reshape(-1, 3)[pixels.flat] = pixels.points
-    for indices, track in zip(objects, tracks, strict=True):
-        ids.reshape(-1)[pixels.flat[indices]] = track.id
-    return InstanceFrame(timestamp, level.grey, ids, points)

@@ -1,18 +1,18 @@
-"""Connected regions of moving pixels: the candidates for moving objects in one frame."""
+"""Connected regions of moving pixels: the parts of which the moving objects of one frame consist."""
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.cpu import labeling
+from dudmap.core.backends.cpu.labeling import grow_regions
 from dudmap.core.frames.observation import Level
 
-SAMPLES = 60
-"""Number of points per region for the distance to another region."""
+SAMPLES = 50
+"""Number of points that determine the box of a region."""
 MAX_REGIONS = 24
-"""Largest number of regions per frame; the largest regions are used."""
+"""Largest number of regions per frame; the regions with the most pixels are used."""
 MIN_SHARE = 12 / (160 * 120)
 """Smallest region as a share of the image; smaller ones are noise: 12 pixels of a default label image."""
 OCCLUSION_GAP = 0.1
@@ -20,124 +20,68 @@ OCCLUSION_GAP = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class MovingPixels:
-    """Moving pixels of a frame, sorted by connected region.
+class Regions:
+    """Regions of moving pixels, connected in the image and in depth, the one with the most pixels first.
 
     Attributes:
-        flat: (n,) int, index of each pixel in the flattened image.
-        points: (n, 3) float32, metres, world frame.
-        area: (n,) float32, surface of each pixel across the line of sight, square metres.
-        predicted_id: (n,) int32, number of the predicted object, 0 = none.
-        shape: Height and width of the image.
+        pixels: Per region (n,) indices into the flattened image, ascending.
+        areas: Per region the visible surface across the line of sight, square metres.
+        gaps: (R, R) distance between the boxes of two regions, metres.
     """
 
-    flat: NDArray[np.int64]
-    points: NDArray[np.float32]
-    area: NDArray[np.float32]
-    predicted_id: NDArray[np.int32]
-    ranges: list[tuple[int, int]]
-    shape: tuple[int, int]
+    pixels: list[NDArray[np.intp]]
+    areas: list[float]
+    gaps: NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Summary of a connected set of moving pixels.
-
-    Attributes:
-        indices: (k,) int, into ``MovingPixels``.
-        area: Visible surface, square metres.
-        predicted_id: Most frequent predicted number, 0 = none.
-        sample: (m, 3) float32, some of its points, metres, world frame; ``box``: their extreme coordinates.
-    """
-
-    indices: NDArray[np.int64]
-    area: float
-    predicted_id: int
-    sample: NDArray[np.float32]
-    box: list[list[float]]
-
-    @classmethod
-    def of(cls, pixels: MovingPixels, indices: NDArray[np.int64]) -> "Region":
-        """Summary of the given pixels (k,)."""
-        predicted_id = int(np.argmax(np.bincount(pixels.predicted_id[indices])))
-        sample = pixels.points[indices[:: max(1, len(indices) // SAMPLES)]]
-        box = [sample.min(axis=0).tolist(), sample.max(axis=0).tolist()]
-        return cls(indices, float(pixels.area[indices].sum()), predicted_id, sample, box)
-
-    def is_near(self, other: "Region", distance: float) -> bool:
-        """Whether sampled points of the two regions are closer than ``distance``, metres."""
-        for low, high, other_low, other_high in zip(*self.box, *other.box, strict=True):
-            if low - other_high > distance or other_low - high > distance:
-                return False
-        corner = np.array(self.box[0], np.float32)
-        p, q = self.sample - corner, other.sample - corner
-        squared = np.einsum("ij,ij->i", p, p)[:, None] + np.einsum("ij,ij->i", q, q) - 2 * p @ q.T
-        return float(squared.min()) < distance**2
-
-
-def connected_regions(
-    dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64], predicted_ids: NDArray[np.int32]
-) -> MovingPixels | None:
-    """Moving pixels (h, w) grouped into regions connected in the image and in depth; None if all regions are too small.
-
-    ``predicted_ids``: object predicted in each 2x2 block, 0 = none.
-    """
-    moving = dynamic & (level.depth > 0)
-    if not moving.any():
-        return None
+def connected_regions(moving: NDArray[np.bool_], level: Level) -> NDArray[np.int32]:
+    """Number of the region of each moving pixel (h, w) that has a depth; from 1, 0 elsewhere."""
     tolerance = np.float32(0.02) + np.float32(0.02) * level.depth
-    regions, count = labeling.grow_regions(moving, moving, level.depth, tolerance)
-    flat = np.flatnonzero(moving)
-    number, depth = regions.reshape(-1)[flat], level.depth.reshape(-1)[flat]
-    sizes = np.bincount(number, minlength=count + 1)
-    area = np.square(depth) / np.float32(level.camera.fx * level.camera.fy)
-    areas = np.bincount(number, area, minlength=count + 1)
-    areas[sizes < MIN_SHARE * moving.size] = 0
-    kept = np.argsort(-areas, kind="stable")[:MAX_REGIONS]
-    kept = kept[areas[kept] > 0]
+    return grow_regions(moving, moving, level.depth, tolerance)[0]
+
+
+def measured_regions(numbers: NDArray[np.int32], level: Level) -> Regions | None:
+    """The regions with numbers (h, w) above 0, without specks; None if there are none."""
+    flat = np.flatnonzero(numbers)
+    number = numbers.reshape(-1)[flat]
+    sizes = np.bincount(number, minlength=1)
+    kept = np.argsort(-sizes, kind="stable")[:MAX_REGIONS]
+    kept = kept[sizes[kept] >= MIN_SHARE * numbers.size]
     if len(kept) == 0:
         return None
-    rank = np.full(count + 1, len(kept), dtype=np.int64)
+    rank = np.full(len(sizes), len(kept))
     rank[kept] = np.arange(len(kept))
-    order = np.argsort(rank[number], kind="stable")[: sizes[kept].sum()]
-    flat = flat[order]
-    stops = np.cumsum(sizes[kept])
-    ranges = [(int(stop - size), int(stop)) for stop, size in zip(stops, sizes[kept], strict=True)]
-    v, u = np.divmod(flat, moving.shape[1])
-    T = T_world_camera.astype(np.float32)
-    points = level.camera.points(u, v, depth[order]) @ T[:3, :3].T + T[:3, 3]
-    return MovingPixels(
-        flat,
-        np.asarray(points, np.float32),
-        np.asarray(area[order], np.float32),
-        predicted_ids[v // 2, u // 2],
-        ranges,
-        level.camera.shape,
-    )
+    flat = flat[np.argsort(rank[number], kind="stable")[: sizes[kept].sum()]]
+    starts = np.append(0, np.cumsum(sizes[kept])[:-1])
+    z = level.depth.reshape(-1)[flat]
+    areas = np.add.reduceat(z * z, starts) / (level.camera.fx * level.camera.fy)
+    sample = (starts[:, None] + sizes[kept][:, None] * np.arange(SAMPLES) // SAMPLES).reshape(-1)
+    v, u = np.divmod(flat[sample], numbers.shape[1])
+    points = np.sort(level.camera.points(u, v, z[sample]).reshape(len(kept), SAMPLES, 3), axis=1)
+    low, high = points[:, 1], points[:, -2]  # without the outermost 2 %, which mix measurements of two surfaces
+    gaps = np.linalg.norm(np.maximum(np.maximum(low[:, None] - high, low - high[:, None]), 0), axis=2)
+    return Regions(np.split(flat, starts[1:]), areas.tolist(), gaps)
 
 
-def split_between(pixels: MovingPixels, indices: NDArray[np.int64], ids: Collection[int]) -> list[NDArray[np.int64]]:
-    """Pixels (k,) of a region per object of ``ids``, each predicted in it: a pixel belongs to the object of the
-    nearest predicted pixel."""
+def split_between(region: NDArray[np.bool_], predicted: NDArray[np.uint8], objects: Sequence[int]) -> NDArray[np.int32]:
+    """Object of each pixel of a region (h, w): that of the nearest pixel in which one of ``objects`` is predicted."""
     import cv2
 
-    predicted = pixels.predicted_id[indices]
-    certain = np.isin(predicted, list(ids))
-    seeds = np.ones(pixels.shape, dtype=np.uint8)
-    seeds.reshape(-1)[pixels.flat[indices[certain]]] = 0
-    _, nearest = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    nearest = np.asarray(nearest, dtype=np.int64).reshape(-1)
-    owner_of_seed = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    owner_of_seed[nearest[pixels.flat[indices[certain]]]] = predicted[certain]
-    owner = owner_of_seed[nearest[pixels.flat[indices]]]
-    return [indices[owner == number] for number in ids]
+    certain = region & np.isin(predicted, objects)
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~certain).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(nearest, dtype=np.int64)
+    owner_of_seed = np.zeros(int(nearest.max()) + 1, dtype=np.uint8)
+    owner_of_seed[nearest[certain]] = predicted[certain]
+    return owner_of_seed[nearest[region]].astype(np.int32)
 
 
 def trimmed_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """Extent (2, 3) of points (n, 3) without the outermost 1 % on each side, which mix measurements of two surfaces."""
-    cut = len(points) // 100
-    order = np.partition(points, (cut, len(points) - 1 - cut), axis=0)
-    return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)
+    sample = np.sort(points[:: 1 + len(points) // 300], axis=0)
+    cut = len(sample) // 100
+    return sample[[cut, -1 - cut]].astype(np.float64)
 
 
 def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32], reference_depth: float = 1.0) -> bool:
