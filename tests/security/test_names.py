@@ -15,9 +15,8 @@ from recordings import write_recording
 from viewing.test_report import Page
 
 NAMES = {
-    "title": "seq\x1b]0;PWNED\a", "colours": "\x1b[31mred\x1b[0m", "markup": "[red]x[/bold]", "closing": "a[/]",
-    "emoji": ":smile:", "line": "a\nb", "bidi": "a\u202egnp.exe", "math": "a$x_^{$", "html": "<img src=x>",
-    "braces": "{x}{0}",
+    "terminal": "seq\x1b]0;PWNED\a\x1b[31mred\x1b[0m", "markup": "[red]x[/bold]", "line": "a\nb",
+    "bidi": "a\u202egnp.exe", "others": ":smile:a$x_^{$<img src=x>{x}{0}",
 }  # fmt: skip
 if sys.platform == "linux":
     NAMES["bytes"] = os.fsdecode(b"caf\xe9")
