@@ -1,6 +1,7 @@
 """Imports between the parts of the package run one way: down."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import dudmap
@@ -53,3 +54,20 @@ def test_the_foundation_imports_nothing_above_it():
     assert modules == FOUNDATION
     assert {path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()} == set(DOORS)
     assert not {name for module in FOUNDATION for name in imports(ROOT / f"{module}.py") - FOUNDATION}
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    """Imports inside functions and for types alone count, too."""
+    files = {".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in ROOT.rglob("*.py")}
+    files = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    graph = {}
+    for module, path in files.items():
+        names = []
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names += [f"{node.module}.{alias.name}" for alias in node.names]
+        found = {name if name in files else name.rpartition(".")[0] for name in names}
+        graph[module] = (found & files.keys()) - {module}
+    TopologicalSorter(graph).prepare()  # raises an error that names a circle

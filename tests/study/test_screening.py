@@ -8,10 +8,10 @@ import pytest
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.lab.study.designs import DesignOptions, configured, make_factors, points_of
+from dudmap.lab.study.designs import DesignOptions, bounds_of, configured, make_factors, points_of
 from dudmap.lab.study.plan import make_plan
 from dudmap.lab.study.report import Report
-from dudmap.lab.study.screening import bounds_of, describe_screening, screen, summary
+from dudmap.lab.study.screening import describe_screening, screen, summary
 
 
 def factors_of(**changed):

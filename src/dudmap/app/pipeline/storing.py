@@ -16,6 +16,7 @@ from dudmap.app.pipeline.background import Background
 from dudmap.app.pipeline.environment import versions
 from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.state.blocks import Snapshot
 from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.system import (
     check_code,
@@ -27,7 +28,7 @@ from dudmap.app.state.system import (
     recording_fingerprint,
     take_snapshot,
 )
-from dudmap.app.state.tree import NotSettledError, Snapshot, TreeReader
+from dudmap.app.state.tree import NotSettledError, TreeReader
 from dudmap.atomic_file import bring_to_disk
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError

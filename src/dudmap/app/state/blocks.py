@@ -1,7 +1,7 @@
 """Changed map blocks and stored frames between memory and database."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,3 +143,21 @@ class StoredFrames:
         while len(self._stores) <= number:
             self._stores.append((store, set()))
         self._stores[number] = store, set(store.kept)
+
+
+Node = Any
+
+
+@dataclass(eq=False)
+class Snapshot:
+    """Immutable state of a system at one moment.
+
+    Attributes:
+        arrays: Copies of arrays, constant arrays themselves, or lists of plain values.
+    """
+
+    tree: dict[str, Node] = field(default_factory=dict)
+    arrays: list[NDArray | list[Any]] = field(default_factory=list)
+    constant: set[int] = field(default_factory=set)
+    maps: list[MapSnapshot] = field(default_factory=list)
+    frames: list[FrameSnapshot] = field(default_factory=list)

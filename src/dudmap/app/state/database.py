@@ -20,8 +20,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.blocks import VOXELS, FrameSnapshot, MapSnapshot, StoredFrames, StoredMaps
-from dudmap.app.state.tree import Snapshot
+from dudmap.app.state.blocks import VOXELS, FrameSnapshot, MapSnapshot, Snapshot, StoredFrames, StoredMaps
 from dudmap.core.map.block_pager import Region
 from dudmap.core.map.voxel_blocks import COLUMNS, BlockRecords, blobs_of, records_of
 from dudmap.core.places.frame_store import EncodedFrame

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.app.pipeline.environment import versions
+from dudmap.app.state.blocks import Snapshot
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.tree import Snapshot, TreeReader, TreeWriter
+from dudmap.app.state.tree import TreeReader, TreeWriter
 from dudmap.config import Config
 from dudmap.errors import FrameError, StateError
 

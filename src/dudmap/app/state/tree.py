@@ -12,7 +12,6 @@ A node is a number, a text, None, or an object with an ``id`` for references.
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from dudmap.app.state.annotations import PLAIN, RECORD, content_type, fields_of, fits, is_frozen, item_hints
-from dudmap.app.state.blocks import VOXELS, MapSettings, MapSnapshot, StoredMaps
+from dudmap.app.state.blocks import VOXELS, MapSettings, Node, Snapshot, StoredMaps
 from dudmap.core.backends.device import make_backend
 from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.volume import TsdfVolume
@@ -30,29 +29,13 @@ from dudmap.errors import ConfigError, DatasetError, StateError
 from dudmap.input_files import DAMAGE, parse_json
 
 if TYPE_CHECKING:
-    from dudmap.app.state.blocks import FrameSnapshot, StoredFrames
+    from dudmap.app.state.blocks import StoredFrames
     from dudmap.app.state.database import StateDatabase, StateReader
 
-Node = Any
 LONG = 32
 """Shortest list of equal things stored as one array."""
 LARGEST_COUNT = 2**23
 """Largest number of equal things stored as one array."""
-
-
-@dataclass(eq=False)
-class Snapshot:
-    """Immutable state of a system at one moment.
-
-    Attributes:
-        arrays: Copies of arrays, constant arrays themselves, or lists of plain values.
-    """
-
-    tree: dict[str, Node] = field(default_factory=dict)
-    arrays: list[NDArray | list[Any]] = field(default_factory=list)
-    constant: set[int] = field(default_factory=set)
-    maps: list[MapSnapshot] = field(default_factory=list)
-    frames: "list[FrameSnapshot]" = field(default_factory=list)
 
 
 class NotSettledError(Exception):

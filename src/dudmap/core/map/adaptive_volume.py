@@ -31,8 +31,7 @@ def make_volume(
     max_blocks: int | MemoryLimit | None = None,
 ) -> TsdfVolume:
     """An empty map with one voxel size, or several with ``volume.adaptive``; arguments as of ``TsdfVolume``."""
-    kind = AdaptiveVolume if config.adaptive else TsdfVolume
-    return kind(camera, config, sensor, depth_max, backend, max_blocks)
+    return TsdfVolume.kinds[config.adaptive](camera, config, sensor, depth_max, backend, max_blocks)
 
 
 class AdaptiveVolume(TsdfVolume):
@@ -137,3 +136,6 @@ class AdaptiveVolume(TsdfVolume):
     ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are slots of the coarsest level."""
         return level_meshes(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))
+
+
+TsdfVolume.kinds[True] = AdaptiveVolume

@@ -12,6 +12,7 @@ from dudmap.core.backends.mirror import grown
 from dudmap.core.backends.parameters import VoxelGrid
 from dudmap.core.map.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
 from dudmap.core.state import Remembered, Stateful
+from dudmap.errors import MapError
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
@@ -212,6 +213,24 @@ class BlockTree:
         self.blocks.insert(records, frame_number)
         for level, parents, part in zip(self.levels, self.parents, records.finer, strict=False):
             level.insert(parents, part, frame_number)
+        for level, parents in zip(self.levels, self.parents, strict=True):
+            level.make_room(parents)
+
+    def restore(self, finer: Sequence[VoxelBlocks]) -> None:
+        """Fill the finer levels with read blocks, level by level.
+
+        Raises:
+            MapError: The blocks do not fit the levels or each other.
+        """
+        if len(finer) > len(self.levels):
+            raise MapError(
+                f"the map is damaged: it has {len(finer)} levels of smaller voxels, its configuration allows "
+                f"{len(self.levels)}"
+            )
+        for number, level in enumerate(self.levels[: len(finer)]):
+            level.blocks = finer[number]
+            if not np.all(level.link(self.parents[number])):  # the parents were just read
+                raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m have no parent block")
         for level, parents in zip(self.levels, self.parents, strict=True):
             level.make_room(parents)
 

@@ -2,9 +2,9 @@
 
 import json
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -12,13 +12,10 @@ from numpy.typing import DTypeLike, NDArray
 from dudmap.atomic_file import atomic_file
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
 from dudmap.errors import MapError
 from dudmap.gone_keys import without_gone
 from dudmap.input_files import DAMAGE, open_arrays
-
-if TYPE_CHECKING:
-    from dudmap.core.map.volume import TsdfVolume
 
 FORMAT = "dudmap map 1"
 VOXELS = "geometry", "colors"
@@ -26,16 +23,47 @@ LARGEST_DEPTH = 1000.0
 """Largest depth range of a map file, metres: the steps of a ray cast grow with it."""
 
 
-def write_map(path: str | Path, volume: "TsdfVolume") -> None:
+class MapParameters(NamedTuple):
+    """Arguments of a map: camera, configuration, sensor, and largest depth in metres."""
+
+    camera: Camera
+    config: VolumeConfig
+    sensor: SensorConfig
+    depth_max: float
+
+
+class MapContent(NamedTuple):
+    """Content of a map file; ``finer``: blocks with smaller voxels, level by level."""
+
+    parameters: MapParameters
+    num_frames: int
+    blocks: VoxelBlocks
+    finer: list[VoxelBlocks]
+
+
+def write_map(
+    path: str | Path,
+    parameters: MapParameters,
+    num_frames: int,
+    num_levels: int,
+    records: Callable[[], Iterable[BlockRecords]],
+) -> None:
     """Write a map; an older file is replaced when the new one is complete.
+
+    Args:
+        path: The file.
+        parameters: Arguments of the map.
+        num_frames: Number of its integrated frames.
+        num_levels: Number of its levels of smaller voxels.
+        records: Gives all blocks in parts, the same at each call.
 
     Raises:
         MapError: The file cannot be written.
     """
-    camera = volume.camera
+    camera = parameters.camera
     coords, free_count, entries, first = [], [], [], 0
-    finer: list[list[NDArray[np.int32]]] = [[] for _ in volume.levels]
-    for part in volume.records():
+    finer: list[list[NDArray[np.int32]]] = [[] for _ in range(num_levels)]
+    for part in records():
         for level, blocks in zip(finer, part.finer, strict=False):
             level.append(blocks.coords)
         coords.append(part.coords.astype(np.int32))
@@ -47,10 +75,10 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
         "format": FORMAT,
         "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         "image": np.array([camera.width, camera.height]),
-        "config": volume.config.model_dump_json(),
-        "sensor": volume.sensor.model_dump_json(),
-        "depth_max": volume.depth_max,
-        "frames": volume.num_frames,
+        "config": parameters.config.model_dump_json(),
+        "sensor": parameters.sensor.model_dump_json(),
+        "depth_max": parameters.depth_max,
+        "frames": num_frames,
         "coords": np.concatenate(coords),
         "free_count": np.concatenate(free_count),
         "entries": np.concatenate(entries),
@@ -62,12 +90,12 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
                 array = np.asanyarray(value)
                 _write_array(archive, name, array.dtype, array.shape, iter([array]))
             for name in VOXELS:
-                _write_array(archive, name, np.int32, shape, (getattr(part, name) for part in volume.records()))
+                _write_array(archive, name, np.int32, shape, (getattr(part, name) for part in records()))
             for n, level in enumerate(finer):
                 places = np.concatenate(level)
                 _write_array(archive, f"slot_coords{n + 1}", np.int32, places.shape, iter([places]))
                 for name in VOXELS:
-                    parts = (getattr(part.finer[n], name) for part in volume.records() if n < len(part.finer))
+                    parts = (getattr(part.finer[n], name) for part in records() if n < len(part.finer))
                     _write_array(archive, f"{name}{n + 1}", np.int32, (len(places), BLOCK**3), parts)
     except OSError as error:
         raise MapError(f"cannot write the map to {path}: {error}") from error
@@ -84,39 +112,23 @@ def _write_array(
             member.write(np.ascontiguousarray(part).data)
 
 
-def read_map(path: str | Path) -> "TsdfVolume":
+def read_map(path: str | Path) -> MapContent:
     """Read a map that ``write_map`` wrote.
 
     Raises:
         MapError: The file is missing, damaged or not a map of this version.
     """
-    from dudmap.core.map.adaptive_volume import make_volume
-
     try:
         with open_arrays(path) as data:
             parameters = read_parameters(data, path)
             blocks = VoxelBlocks.restored(*(data[name] for name in ("coords", "free_count", "entries", *VOXELS)))
-            finer = _read_levels(data)
             frames = int(data["frames"]) if "frames" in set(data) else 0
+            return MapContent(parameters, max(frames, 0), blocks, _read_levels(data))
     except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error
-    volume = make_volume(*parameters)
-    volume.blocks, volume.num_frames = blocks, max(frames, 0)
-    if len(finer) > len(volume.levels):
-        raise MapError(
-            f"the map is damaged: it has {len(finer)} levels of smaller voxels, its configuration allows "
-            f"{len(volume.levels)}"
-        )
-    for number, level in enumerate(volume.levels[: len(finer)]):
-        level.blocks = finer[number]
-        if not np.all(level.link(volume.all_blocks.parents[number])):  # the parents were just read
-            raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m have no parent block")
-    for level, parents in zip(volume.levels, volume.all_blocks.parents, strict=True):
-        level.make_room(parents)
-    return volume
 
 
-def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Camera, VolumeConfig, SensorConfig, float]:
+def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> MapParameters:
     """Camera, configuration, sensor and largest depth (m) of an open map file.
 
     Raises:
@@ -131,7 +143,7 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Came
     width, height = (int(value) for value in data["image"])
     config = VolumeConfig.model_validate(without_gone({"volume": json.loads(str(data["config"]))})["volume"])
     sensor = SensorConfig.model_validate_json(str(data["sensor"]))
-    return Camera(fx, fy, cx, cy, width, height), config, sensor, float(data["depth_max"])
+    return MapParameters(Camera(fx, fy, cx, cy, width, height), config, sensor, float(data["depth_max"]))
 
 
 def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:

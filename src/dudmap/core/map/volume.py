@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import two_levels
-from dudmap.core.map.map_file import read_map, write_map
+from dudmap.core.map.map_file import MapParameters, read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
 from dudmap.core.map.voxel_blocks import BLOCK
@@ -108,6 +109,9 @@ class TsdfVolume(PagedMap):
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
+
+    kinds: ClassVar[dict[bool, type["TsdfVolume"]]] = {}
+    """Class of a map by ``volume.adaptive``; the package imports both."""
 
     def __init__(
         self,
@@ -375,7 +379,8 @@ class TsdfVolume(PagedMap):
         Raises:
             MapError: The file cannot be written.
         """
-        write_map(path, self)
+        parameters = MapParameters(self.camera, self.config, self.sensor, self.depth_max)
+        write_map(path, parameters, self.num_frames, len(self.levels), self.records)
 
     @classmethod
     def load(cls, path: str | Path) -> "TsdfVolume":
@@ -384,4 +389,11 @@ class TsdfVolume(PagedMap):
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        return read_map(path)
+        content = read_map(path)
+        volume = TsdfVolume.kinds[content.parameters.config.adaptive](*content.parameters)
+        volume.blocks, volume.num_frames = content.blocks, content.num_frames
+        volume.all_blocks.restore(content.finer)
+        return volume
+
+
+TsdfVolume.kinds[False] = TsdfVolume

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
 from dudmap.input_files import LARGEST_TOML, load_array, open_arrays, parse_json, read_text
-from dudmap.io.sequences.camera_files import depth_scale, read_yaml, values_of
+from dudmap.io.sequences.camera_values import depth_scale, read_yaml, values_of
 
 Values = dict[str, float]
 

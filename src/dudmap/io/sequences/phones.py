@@ -20,7 +20,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import damaged, read_json, read_text
 from dudmap.io.sequences import images
-from dudmap.io.sequences.camera_files import values_of
+from dudmap.io.sequences.camera_values import values_of
 from dudmap.io.sequences.gravity import Gravity
 from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, size
 from dudmap.io.sequences.intrinsics import Intrinsics, camera_values

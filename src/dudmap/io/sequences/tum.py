@@ -16,7 +16,7 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_text
 from dudmap.io.sequences import images, intrinsics
 from dudmap.io.sequences.archive import origin, unpack
-from dudmap.io.sequences.camera_files import read_yaml
+from dudmap.io.sequences.camera_values import read_yaml
 from dudmap.io.sequences.image_folder import ImageFolder, size
 from dudmap.io.sequences.intrinsics import camera_values
 

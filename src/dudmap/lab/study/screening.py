@@ -3,16 +3,14 @@
 A malformed table, or too few runs for all factors, raises a ``ConfigError``.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from operator import attrgetter
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
 from dudmap.lab.study import report as figures
-from dudmap.lab.study.designs import Factor, Table, is_number
+from dudmap.lab.study.designs import Factor, Table
 
 if TYPE_CHECKING:
     from dudmap.lab.study.report import Report
@@ -20,67 +18,6 @@ if TYPE_CHECKING:
 FALSE_SHARE = 0.05
 """Share of the effects called significant that may be due to chance (Benjamini and Hochberg 1995)."""
 MOST_SHOWN = 16
-
-
-def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:
-    """Every numeric key as a factor between its value divided by a ratio and its value times the ratio.
-
-    - Both ends are kept inside the bounds of the key; for an exclusive bound, the end lies halfway between value and
-      bound.
-    - A whole number changes by 1 at least.
-    - All elements of a list change together, with two levels.
-    - Keys with the value 0, keys ``chosen`` by the design file, and keys in its table (``ratio``, ``without``) are
-      skipped.
-    """
-    if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
-        raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
-    ratio, without = given.get("ratio", 1.5), given.get("without", [])
-    if not is_number(ratio) or not ratio > 1:
-        raise ConfigError(f"ratio of all_numeric is {ratio!r}; expected a number above 1")
-    if not isinstance(without, list):
-        raise ConfigError(f"without of all_numeric is {without!r}; expected a list of configuration keys")
-    for key in without:
-        if key not in keys():
-            raise ConfigError(f"all_numeric leaves out {key!r}, which is no configuration key")
-    out = []
-    for key in keys():
-        value = attrgetter(key)(base)
-        foreign = key.startswith("thesis.") != (base.system == "thesis")
-        if key in without or key in chosen or foreign:
-            continue
-        if isinstance(value, tuple):
-            ends = [[_scaled(element, factor) for element in value] for factor in (1 / ratio, ratio)]
-            out.append(Factor(key, tuple(ends)))
-        elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0:
-            low, high = _ends(key, value, ratio)
-            whole = isinstance(value, int)
-            out.append(Factor(key, (), low, high, "linear" if whole or low <= 0 else "log", whole))
-    return tuple(out)
-
-
-def _ends(key: str, value: float, ratio: float) -> tuple[float, float]:
-    low, high = sorted((_scaled(value, 1 / ratio), _scaled(value, ratio)))
-    if isinstance(value, int):
-        low, high = min(low, value - 1), max(high, value + 1)
-    bounds = bounds_of(key)
-    low = max(low, bounds.get("ge", low))
-    high = min(high, bounds.get("le", high))
-    if low <= bounds.get("gt", -np.inf):
-        low = (value + bounds["gt"]) / 2
-    if high >= bounds.get("lt", np.inf):
-        high = (value + bounds["lt"]) / 2
-    return float(low), float(high)
-
-
-def _scaled(value: float, factor: float) -> float:
-    return max(round(value * factor), 1) if isinstance(value, int) else float(f"{value * factor:.6g}")
-
-
-def bounds_of(key: str) -> dict[str, float]:
-    """Bounds of a numeric key by their kind: ``ge``, ``gt``, ``le``, ``lt``."""
-    section, _, name = key.rpartition(".")
-    found = type(getattr(Config(), section)).model_fields[name].metadata
-    return {kind: getattr(item, kind) for item in found for kind in ("ge", "gt", "le", "lt") if hasattr(item, kind)}
 
 
 def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
