@@ -39,17 +39,14 @@ def processed(corridor, max_blocks=None, dark=(), settings=()):
     return slam, most
 
 
-@pytest.mark.parametrize("submaps", [1, 2])
-def test_the_result_is_that_of_a_run_in_memory(corridor, submaps, monkeypatch):
+def test_the_result_is_that_of_a_run_in_memory(corridor, monkeypatch):
     """Also with a second submap, begun in the dark: the first then waits on disk as a whole."""
-    dark = range(23, 31) if submaps == 2 else ()
-    if submaps == 2:
-        monkeypatch.setattr("dudmap.core.places.place_recognition.MAX_CORRECTION", 1e-6)
-    options = {"dark": dark, "settings": ["submaps.patience=0.2"] if submaps == 2 else ()}
+    monkeypatch.setattr("dudmap.core.places.place_recognition.MAX_CORRECTION", 1e-6)
+    options = {"dark": range(23, 31), "settings": ["submaps.patience=0.2"]}
     whole, all_blocks = processed(corridor, **options)
     paged, most = processed(corridor, max_blocks=6000, **options)
     assert most < 0.9 * all_blocks
-    assert len(whole.maps) == len(paged.maps) == submaps
+    assert len(whole.maps) == len(paged.maps) == 2
     assert min(len(trajectory) for trajectory, _ in whole.maps) > 10
     for (path, volume), (expected_path, expected) in zip(paged.maps, whole.maps, strict=True):
         assert np.array_equal(path.Ts_world_camera, expected_path.Ts_world_camera)

@@ -14,6 +14,8 @@ from dudmap.lab.benchmark import gate
 HERE = Path(__file__).parents[1]
 RECORDED = gate.load_figures(HERE / "gate.toml")
 ENTRIES = {entry.name: entry for entry in gate.gate_entries(HERE / "fixtures")}
+QUICK = {"room-people-at-start", gate.EXCERPT}
+"""Recordings of each ``make test``: one world with people from the first frame on, and real images."""
 
 
 def failures(rows, recorded=RECORDED):
@@ -38,7 +40,9 @@ def _rooms_are_built_once():
         yield
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in ENTRIES]
+)
 def test_accuracy_is_no_worse_than_recorded(name):
     checks = gate.compare(gate.measure_gate([ENTRIES[name]], Config()), RECORDED)
     assert all(check["passed"] for check in checks), "\n" + gate.verdict(checks)
@@ -47,6 +51,7 @@ def test_accuracy_is_no_worse_than_recorded(name):
         assert {"lost", "ate_rmse_m", "mask_iou_mean", "mesh_completeness", "ghost_area_m2"} <= measured
 
 
+@pytest.mark.slow
 def test_a_spoiled_tracker_does_not_pass():
     spoiled = Config().override(["tracker.iterations=[1,0,0]", "dynamics.start_seconds=0"])
     rows = gate.measure_gate([ENTRIES["desk-fast-camera"]], spoiled)
