@@ -39,7 +39,7 @@ def test_random_inputs(name, subjects):
 
 
 def test_every_reader_has_an_input(tmp_path):
-    """Every reader takes one of the inputs, which the tests of the formats compare with what was written."""
+    """Every reader takes an input, whose frames the tests of its format compare with the written ones."""
     tested = set()
     for layout in layouts.LAYOUTS:
         tested.add(reader_of(layouts.write(layout, tmp_path / layout.__name__)[0]))

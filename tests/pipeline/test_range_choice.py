@@ -84,7 +84,7 @@ def stored(folder: Path) -> Config:
 
 def test_a_run_chooses_says_and_obeys(slam, tmp_path):
     near = recording_from(tmp_path / "near", 0.11, 0.22)
-    done = call("run", near, "--out", tmp_path / "a", "--quiet")
+    done = call("run", near, "--out", tmp_path / "a")
     assert done.exit_code == 0, done.output
     assert "voxels of 2 mm, depth from 0.04 to 1.2 m, chosen from the depth images" in done.stderr
     assert stored(tmp_path / "a").override(["sensor.self_calibration=true"]) == Config.for_range("near")
@@ -92,13 +92,13 @@ def test_a_run_chooses_says_and_obeys(slam, tmp_path):
     assert metrics["readings"] == {"too_near": 0.0, "too_far": 0.0}
     assert metrics["warnings"] == [warning for warning in metrics["warnings"] if "depth unit" not in warning]
 
-    done = call("run", near, "--range", "room", "--out", tmp_path / "b", "--quiet")
+    done = call("run", near, "--range", "room", "--out", tmp_path / "b")
     assert "chosen" not in done.stderr
     assert stored(tmp_path / "b").override(["sensor.self_calibration=true"]) == Config()
     metrics = json.loads((tmp_path / "b" / "metrics.json").read_text())
     assert metrics["readings"]["too_near"] == pytest.approx((0.2 - 0.11) / 0.11, abs=0.05)
 
-    call("run", near, "--set", "volume.voxel_size=0.004", "--out", tmp_path / "c", "--quiet")
+    call("run", near, "--set", "volume.voxel_size=0.004", "--out", tmp_path / "c")
     assert (stored(tmp_path / "c").volume.voxel_size, stored(tmp_path / "c").preprocess.depth_max) == (0.004, 1.2)
 
     done = call("run", near, "--range", "close", "--out", tmp_path / "d")
@@ -115,10 +115,10 @@ def test_a_range_that_changes_nothing_is_refused(slam, tmp_path):
 
 def test_a_camera_chooses_from_its_first_frames(slam, tmp_path):
     far = recording_from(tmp_path / "far", 6.3, 12.5)
-    done = call("live", f"replay:{far}", "--out", tmp_path / "a", "--quiet")
+    done = call("live", f"replay:{far}", "--out", tmp_path / "a")
     assert "chosen from the depth images" in done.stderr
     assert stored(tmp_path / "a").volume.voxel_size == 0.021
-    call("live", f"replay:{far}", "--range", "far", "--out", tmp_path / "b", "--quiet")
+    call("live", f"replay:{far}", "--range", "far", "--out", tmp_path / "b")
     assert stored(tmp_path / "b").preprocess.depth_max == 15
 
 

@@ -75,7 +75,7 @@ def camera_names(incomplete: str) -> list[str]:
 
 
 JsonOption = Annotated[bool, Option("--json", help="Print the result as one JSON object, and nothing else.")]
-QuietOption = Annotated[bool, Option("--quiet", help="No progress bar and no table.")]
+QuietOption = Annotated[bool, Option("--quiet", help="Print warnings and errors alone.")]
 RunArgument = Annotated[Path, Argument(help="Run folder of dudmap run.", metavar="RUN")]
 SequenceArgument = Annotated[Path, Argument(help="Recording: folder, file or archive.", metavar="SEQUENCE")]
 CameraOption = Annotated[
