@@ -221,19 +221,8 @@ class SlamResults:
         """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of rigid objects."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
-    def finish(self) -> int:
-        """Fuse the frames that a young map holds back, because no later frame of an ended stream shows slow motion.
-
-        Only a map younger than 0.4 s holds frames back. Frames may follow.
-
-        Returns:
-            Number of fused frames.
-        """
-        return self.mapper.finish()
-
     def as_prior_map(self) -> PriorMap:
         """The largest submap and the state that a second pass over the same recording needs."""
-        self.finish()
         self.atlas.complete()
         self.atlas.keyframes.settle()
         main = self.atlas.by_size()[0]

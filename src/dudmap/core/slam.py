@@ -12,18 +12,19 @@ from dudmap.core.arrays import copied
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.ego_motion import Restart
 from dudmap.core.frame_log import log_changes
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
+from dudmap.core.frames.observation import reduced
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.rolling_shutter import recorded_mask
 from dudmap.core.frames.stream_check import StreamCheck
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.mapper import Bootstrap, Mapper
+from dudmap.core.mapper import Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.loop_closing import LoopCloser
@@ -35,13 +36,14 @@ from dudmap.core.result import FrameResult, SlamArguments, SlamResults
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, StageTimer
 from dudmap.core.tracking.front_end import FrontEnd
 from dudmap.core.tracking.motion_model import GivenRole, MotionModel
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.core.verdict import Verdict
+from dudmap.core.young_map import StartFrame, YoungMap
 
 
 class Slam(SlamResults, Stateful):
@@ -75,7 +77,7 @@ class Slam(SlamResults, Stateful):
     predictor: Remembered[PosePredictor]
     atlas: Remembered[Atlas]
     color_calibration: Remembered[ColorCalibration]
-    bootstrap: Remembered[Bootstrap]
+    young_map: Remembered[YoungMap]
     relocalizer: Remembered[Relocalizer]
     redundancy: Remembered[RedundantViews]
     loops: Remembered[LoopCloser]
@@ -117,17 +119,18 @@ class Slam(SlamResults, Stateful):
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
         self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
-        self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
+        self.predictor = PosePredictor(config, self.motion, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         refines = prior is None and not live and poses != "given"
-        self.bootstrap = Bootstrap(refines=refines, second_pass=prior is not None)
+        decides = prior is None and config.dynamics.enabled and config.dynamics.start_seconds > 0
+        self.young_map = YoungMap(refines=refines, decides=decides, reference_depth=config.sensor.reference_depth)
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize, self.live = localize, live
-        parts = self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy
+        parts = self.atlas, self.young_map, self.color_motion, self.redundancy
         self.mapper = Mapper(config, self.camera, *parts, localize=localize)
         if prior is not None:
             self.detector.import_from(prior.detector, prior.Ts_world_camera)
@@ -151,7 +154,7 @@ class Slam(SlamResults, Stateful):
         if isinstance(frame, Frame):
             start, now = time.perf_counter(), not self.color_motion.rectifies
             frame = FrameView.of(self.preprocess(frame), self.config, self.detector, now=now)
-            if now and self.predictor.ego_motion.active and self.color_motion.is_prepared(frame.observation):
+            if now and self.predictor.image_motion.active and self.color_motion.is_prepared(frame.observation):
                 _ = frame.pyramid.corners  # cached for the comparison with other images
             frame.timer.timings["preprocess"] = 1000 * (time.perf_counter() - start)
         if dynamic_mask is not None:
@@ -202,16 +205,15 @@ class Slam(SlamResults, Stateful):
         if self.reference.is_empty:
             return self._start_map(view)
         blind = view.textureless or self.stream.repeats == "color"  # the colours carry no information
-        view = replace(view, blind=blind and not self.bootstrap.textureless)
+        view = replace(view, blind=blind and not self.young_map.textureless)
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
             if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
                 self.motion.apply_correction(correction)
-        prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
-        self.mapper.revise_first_frame(view, prediction)
-        if prediction.restart is not None and self.prior_map is None:
-            return self._restart_map(view, prediction.restart)
-        last = self.predictor.ego_motion.last
+        prediction = self.predictor.predict(self.reference, view)
+        if self._decide_start(view, prediction):
+            prediction = self.predictor.predict(self.reference, view)
+        last = self.predictor.image_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
         registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         verdict = self.relocalizer.verdict + verdict
@@ -223,7 +225,7 @@ class Slam(SlamResults, Stateful):
         view = registered if relocalized is None else self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = estimate.doubt(view) or self.predictor.ambiguity(view, prediction, estimate)
+        uncertain = estimate.doubt(view)
         fuse = self._adds_information(view, estimate, uncertain)
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
@@ -280,18 +282,18 @@ class Slam(SlamResults, Stateful):
         T_start = self.motion.start if T_world_camera is None else T_world_camera
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
-        self.bootstrap.textureless = view.textureless
-        verdict = self.bootstrap.verdict(view, mask)
+        self.young_map.textureless = view.textureless
+        verdict = self.young_map.verdict(view, mask)
         if not verdict.accepted:
             return self._result(view, None, mask, reason=verdict.reason, verdict=verdict)
         self.motion.restart(view.timestamp, estimate.T_world_camera)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
+        self.young_map.start(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=True)
-        self.bootstrap.start(view, estimate, mask)
         self.color_motion.start(view)
         if self.config.dynamics.enabled:
-            self.predictor.start(view)
+            self.predictor.image_motion.start(view.timestamp)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
         restarted = T_world_camera is not None
@@ -309,13 +311,12 @@ class Slam(SlamResults, Stateful):
         if found is None:
             return None
         self.atlas.switch_to(found.submap)
-        self.bootstrap.abandon()
+        self.young_map.abandon()
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
         return found
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
-        mostly_dynamic = self.predictor.is_mostly_dynamic(view, self.front_end.last_dynamic)
-        self.relocalizer.lost(view.timestamp, mostly_dynamic=mostly_dynamic)
+        self.relocalizer.lost(view.timestamp, mostly_dynamic=self.predictor.mostly_dynamic)
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.start_verdict(view).accepted:
@@ -327,19 +328,47 @@ class Slam(SlamResults, Stateful):
         self._forget_map()
         return self._start_map(view)
 
-    def _restart_map(self, view: FrameView, restart: Restart) -> FrameResult:
-        """Restart the young map with this frame, and correct the poses of its earlier frames."""
-        self.atlas.clear_map()
-        self.atlas.move(restart.stamps, restart.corrections)
-        self._forget_map()
-        result = self._start_map(view.with_dynamic(restart.moving), restart.T_world_camera)
-        self.predictor.ego_motion.start_verified = True
-        return result
+    def _decide_start(self, view: FrameView, prediction: PosePrediction) -> bool:
+        """Register and fuse the first frames of a map again, if slow motion that is now visible contradicts the map."""
+        if self.young_map.first is None:
+            return False
+        with view.timer("parallax"):
+            moving = prediction.moving
+            if view.known_dynamic is not None:
+                known = reduced(view.known_dynamic, view.labelled)
+                moving = known if moving is None else moving | known
+            frames = self.young_map.decide(view.tracked_at(prediction.T_world_camera, moving=moving))
+        if frames:
+            self._replay(frames, view.timer)
+        return bool(frames)
+
+    def _replay(self, frames: list[StartFrame], timer: StageTimer) -> None:
+        """Process the first frames of a map again, with the poses and moving pixels that are known now."""
+        first, replayed = frames[0], [frames[0]]
+        corrections = [first.T_world_camera @ se3.inverse(first.estimate.T_world_camera)]
+        self.monitor.reset()
+        self.detector.reset()
+        self.mapper.begin_anew(first, timer)
+        self.detector.start(first.view.timestamp, first.view.labelled, first.T_world_camera)
+        self.motion.restart(first.view.timestamp, first.T_world_camera)
+        for frame in frames[1:]:
+            view = replace(frame.view, timer=timer)
+            prediction = PosePrediction.known(frame.T_world_camera, frame.moving, frame.undecided)
+            estimate = self.front_end.register_from(self.reference, view, prediction, frame.T_world_camera)
+            if not estimate.tracking.converged:
+                estimate = self.front_end.at_given(self.reference, view, prediction)
+            self.front_end.update(view, estimate)
+            self.predictor.update(view, estimate)
+            self.mapper.integrate(view, estimate, estimate.dynamic_mask(view) | frame.undecided_mask)
+            replayed.append(frame.registered(estimate))
+            corrections.append(estimate.T_world_camera @ se3.inverse(frame.estimate.T_world_camera))
+        self.young_map.replace_frames(replayed)
+        self.atlas.move(np.array([frame.view.timestamp for frame in frames]), np.stack(corrections))
 
     def _forget_map(self) -> None:
         """Reset the state learnt from the frames of a map that ends."""
         self.color_calibration.interrupt()
-        for remembered in (self.monitor, self.detector, self.predictor.ego_motion, self.redundancy):
+        for remembered in (self.monitor, self.detector, self.predictor.image_motion, self.redundancy):
             remembered.reset()
         self.relocalizer.found()
 
@@ -363,12 +392,12 @@ class Slam(SlamResults, Stateful):
         if self.atlas.history is None or view.without_image or self.motion.is_given:
             return T_world_camera, False
         with view.timer("loops"):
-            levels, unverified = view.pyramid.tracked, estimate.unverified_mask
-            query = LoopQuery(view.colored(), levels, estimate.tracking, dynamic_mask, estimate.labels, unverified)
+            levels = view.pyramid.tracked
+            query = LoopQuery(view.colored(), levels, estimate.tracking, dynamic_mask, estimate.labels)
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
-        self.bootstrap.abandon()  # the poses of held-back frames are outdated
+        self.young_map.abandon()  # the poses of held-back frames are outdated
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
         self.detector.apply_correction(correction)
@@ -380,8 +409,8 @@ class Slam(SlamResults, Stateful):
         """Update the calibration of the colour camera; returns whether the next frame uses a new one."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
         if calibrated:  # earlier images have colours registered with another calibration
-            self.predictor.ego_motion.reset()
-            self.bootstrap.abandon()
+            self.predictor.image_motion.reset()
+            self.young_map.abandon()
         return calibrated
 
     def _result(

@@ -1,7 +1,6 @@
 """Process a recording or a camera: read frames, run the system, record metrics, write the run folder."""
 
 import logging
-import sys
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
 from dudmap.app.terminal import counted
 from dudmap.config import Config
-from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, MapError
+from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError
 from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 from dudmap.io.cameras.replay import ReplayCamera
@@ -318,7 +317,6 @@ class Job:
                     interruption.check()
                     if len(state.record.rows) == options.max_frames:
                         break
-            self._fuse_held(state)
         if store is not None:
             store.end(state)
 
@@ -353,8 +351,6 @@ class Job:
             slam, record = slam.first_pass or slam, state.first_record or record
         complete = False
         try:
-            if not defect and not isinstance(sys.exception(), DeviceError | MapError | OSError | MemoryError):
-                self._fuse_held(state)  # of a stopped run; a map that cannot be written stays as it is
             config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
                 self.out, slam, record, self.sequence, config, stopped,
@@ -369,19 +365,6 @@ class Job:
             if store is not None:
                 store.close(finished=complete)
         return report
-
-    def _fuse_held(self, state: RunState) -> None:
-        """Fuse and report the frames that a young map holds back."""
-        held, stamps = state.slam.finish(), [float(row["timestamp"]) for row in state.record.rows]
-        state.record.fused_at_end += held
-        if held:
-            from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
-
-            log.warning(
-                f"{held} frames were fused at the end, although motion in them may become visible only after "
-                f"{LONGEST_BASELINE:g} s; the recording has {len(stamps)} frames in {stamps[-1] - stamps[0]:.2f} s: "
-                f"expected {LONGEST_BASELINE:g} s or more"
-            )
 
 
 def _saved(state: RunState) -> str:

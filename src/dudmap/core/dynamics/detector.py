@@ -141,7 +141,6 @@ class DynamicDetector(Stateful):
         segmentation: Callable[[], Segmentation],
         moving: NDArray[np.bool_] | None = None,
         exposure: tuple[float, float] = (1.0, 0.0),
-        slow: NDArray[np.bool_] | None = None,
     ) -> Labels:
         """Labels of a frame that is registered to a map.
 
@@ -153,7 +152,6 @@ class DynamicDetector(Stateful):
             segmentation: Returns the segments of the image, see ``segment``.
             moving: (h, w) bool, moving pixels by comparison of images; None without comparison.
             exposure: Gain and offset from the image's intensities to the map's.
-            slow: (h, w) bool, the part of ``moving`` found with an older image; None for none.
         """
         depth = level.depth
         noise = noise_parameters(self.sensor, level, volume.voxel_size)
@@ -178,8 +176,7 @@ class DynamicDetector(Stateful):
         )  # fmt: skip
         dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
         if moving is not None and moving.any():
-            fast = moving if slow is None else moving & ~slow
-            dynamic = dynamic | (moving & ~self._stands_on_map(frame, fast, segmentation()))
+            dynamic = dynamic | (moving & ~self._stands_on_map(frame, moving, segmentation()))
         # pixels outside moving regions fit badly for another reason, which the robust weights handle
         probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = self.background.hidden(timestamp, unsaturated(level, exposure), T_world_camera)
@@ -247,7 +244,7 @@ class DynamicDetector(Stateful):
 
         Corners are mismatched on silhouettes, in blur and on repetitive patterns. The moving part of a segment that
         lies on the map decides for the whole segment, because the rest has come into view. A part below MAPPED_SHARE
-        decides nothing. Not applicable to slow motion, because the map may be too young.
+        decides nothing.
         """
         sample, (gain, offset) = frame.sample, frame.exposure
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))

@@ -22,6 +22,7 @@ from dudmap.core.frames.optical_flow import (
     lengths,
     track_forward_backward,
 )
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
@@ -125,8 +126,9 @@ FEWEST_MOVING = 3
 """Smallest number of moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
 AGREED = 0.7
 """Smallest share of moving corners of a segment that moves, and of the surface that clearly follows one motion."""
-SAME_SURFACE = 0.02
-"""Largest relative change of depth between neighbouring measurements of one surface, and by noise at 5 m."""
+TIGHTER = 0.5
+"""Largest error of the static corners of a motion that replaces the expected one, as a share of the error of the
+corners that rest with the latter. The static world is rigid; a pose that followed people fits them loosely."""
 NOISE_SHARE = 0.02
 """Largest share of moving measurements that is noise."""
 
@@ -166,11 +168,13 @@ class DominantMotion:
 
     Attributes:
         T_after_before: (4, 4) motion of the static world from the first camera's frame to the second's.
+        covariance: (6, 6) of its twist: m, rad; axes of the second camera.
         share: Share of the surface that follows it, sampled by corners not known to move.
         before, after: The corners in the first and in the second image; moving corners do not follow the motion.
     """
 
     T_after_before: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     share: float
     before: LabelledCorners
     after: LabelledCorners
@@ -202,7 +206,9 @@ def dominant_motion(
     segmentations: tuple[Segmentation, Segmentation],
     moving: NDArray[np.bool_] | None = None,
     T_expected: NDArray[np.float64] | None = None,
-    intervals: float = np.inf,
+    *,
+    consecutive: bool = True,
+    doubtful: bool = False,
 ) -> DominantMotion | None:
     """Motion of the static world between two images, and the corners that do not follow it.
 
@@ -227,11 +233,10 @@ def dominant_motion(
         segmentations: Segments of both, at the resolution of the labels.
         moving: (h, w) bool at that resolution, known moving pixels of the first image, excluded from the motion
             estimate.
-        T_expected: (4, 4) predicted motion: start of the corner search, and between consecutive images the prior of the
-            estimate. None: the identity.
-        intervals: Number of frame intervals between the images. Corners that exceed the limit by more than this factor,
-            or whose depth changed by more, are dropped. Slower motion is hidden between consecutive images; faster
-            corners are mismatches, for example on surface that a person uncovers, or are known already.
+        T_expected: (4, 4) predicted motion, from which the corner search starts. None: the identity.
+        consecutive: Whether the images follow each other, so that the expected motion is a prior. A pose that followed
+            a crowd expects the crowd to be static over longer times.
+        doubtful: The expected motion is the result unless another one fits its static corners clearly more tightly.
 
     Returns:
         None if too few corners follow one motion.
@@ -250,13 +255,20 @@ def dominant_motion(
     candidate = np.ones(len(points), bool) if moving is None else ~moving[labelled[:, 1], labelled[:, 0]]
     if np.count_nonzero(candidate) < FEWEST:
         return None
-    # no prior: a pose that followed a crowd expects the crowd to be static
-    near_px = NEAR_PX if np.isinf(intervals) else np.inf
+    near_px = NEAR_PX if consecutive else np.inf
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected, near_px)
-    predicted = reproject(T, points, camera)
+    predicted, flow, areas = reproject(T, points, camera), lengths(targets - pixels), points[:, 2] ** 2
+    if doubtful and not consecutive:
+        limit = pixels_at_width(MOVES_PX, camera) + MOVES_SHARE * flow
+        nearest = _refined(T_expected, points[candidate], targets[candidate], limit[candidate], camera)
+        by_found, by_expected = (
+            _misfit(there, targets, limit, candidate) for there in (predicted, reproject(nearest, points, camera))
+        )
+        if by_found > TIGHTER * by_expected:
+            T, predicted = T_expected, expected[found]
     error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
-    inlier, areas = error < threshold, points[:, 2] ** 2
+    inlier = error < threshold
     fitted = candidate & inlier
     if np.count_nonzero(fitted) < FEWEST:
         return None
@@ -264,17 +276,19 @@ def dominant_motion(
     near = error < MOVES_SIGMAS * threshold
     sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
-    limit = least + MOVES_SHARE * lengths(targets - pixels)
+    limit = least + MOVES_SHARE * flow
     rests = error <= limit
     new = ~rests & candidate
     unclear = np.zeros(len(points), bool)
-    unclear[new] = error[new] <= MOVES_SIGMAS * _deviations(T, points[new], points[fitted], error[fitted], camera)
-    too_fast = (error > intervals * limit) | (_depth_change(T, points, targets, fine_after) > intervals * limit)
-    kept, moves = rests | ~too_fast, ~rests & ~too_fast
+    covariance = _covariance(T, points[fitted], error[fitted], camera)
+    unclear[new] = error[new] <= MOVES_SIGMAS * _deviations(T, points[new], covariance, camera)
+    kept, moves = np.ones(len(points), bool), ~rests
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
     moves &= ~unclear
+    if not consecutive:  # known motion may be too slow for this pair of images
+        moves, rests = moves | ~candidate, rests & candidate
     targets, points, moves, rests = targets[kept], points[kept], moves[kept], rests[kept]
     columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
@@ -282,6 +296,7 @@ def dominant_motion(
     points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], z)[seen]
     return DominantMotion(
         T,
+        covariance,
         share,
         LabelledCorners(before.labelled, segmentations[0], points, labelled[kept], moves, rests),
         LabelledCorners(
@@ -295,28 +310,60 @@ def dominant_motion(
     )
 
 
-def _deviations(
+def _misfit(
+    predicted: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    limit: NDArray[np.float64],
+    candidate: NDArray[np.bool_],
+) -> float:
+    """Median error, px, of the candidates (n,) whose predicted pixels (n, 2) are within ``limit`` (n,) px."""
+    error = lengths(predicted - targets)
+    rests = candidate & (error <= limit)
+    return float(np.median(error[rests])) if rests.any() else np.inf
+
+
+def _refined(
     T: NDArray[np.float64],
     points: NDArray[np.float64],
-    inliers: NDArray[np.float64],
-    error: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    limit: NDArray[np.float64],
     camera: Camera,
 ) -> NDArray[np.float64]:
-    """Standard deviations (n,) px per coordinate of the pixels of points (n, 3) m after a fitted motion T (4, 4).
+    """Motion (4, 4) of the corners that rest with a motion T (4, 4), by reweighted least squares."""
+    for _ in range(5):
+        residual = targets - reproject(T, points, camera)
+        error = lengths(residual)
+        rests = error <= limit
+        if np.count_nonzero(rests) < FEWEST:
+            return T
+        weights = np.repeat(1 / (1 + (error[rests] / pixels_at_width(NOISE_PX / 2, camera)) ** 2), 2)
+        J = _pixel_jacobian(T, points[rests], camera).reshape(-1, 6)
+        step = np.linalg.lstsq(J.T @ (J * weights[:, None]), J.T @ (weights * residual[rests].reshape(-1)), rcond=None)
+        T = se3.exp(np.asarray(step[0], np.float64)) @ T
+    return T
 
-    The covariance follows from the normal equations of the inliers (m, 3) with errors (m,) px. J (2, 6) is the
-    derivative of a pixel by the twist of the motion:
 
-        sigma_n^2 = sigma^2 tr(J_n (sum J^T J)^-1 J_n^T) / 2
+def _covariance(
+    T: NDArray[np.float64], inliers: NDArray[np.float64], error: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Covariance (6, 6) of the twist (m, rad; axes of the second camera) of a motion T (4, 4) fitted to inliers (m, 3).
+
+    It follows from their normal equations and errors (m,) px: sigma^2 (sum J^T J)^-1 with J (2, 6) the derivative of a
+    pixel by the twist.
     """
-    if len(points) == 0:
-        return np.empty(0)
     rows = _pixel_jacobian(T, inliers, camera).reshape(-1, 6)
-    covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)
     sigma = weighted_median(error, inliers[:, 2] ** 2) / np.sqrt(2 * np.log(2))
     sigma = max(sigma, pixels_at_width(LEAST_SIGMA_PX, camera))
+    return sigma * sigma * np.linalg.pinv(rows.T @ rows, hermitian=True)
+
+
+def _deviations(
+    T: NDArray[np.float64], points: NDArray[np.float64], covariance: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Standard deviations (n,) px per coordinate of the pixels of points (n, 3) m after a motion T (4, 4) with a
+    covariance (6, 6): sigma_n^2 = tr(J_n Sigma J_n^T) / 2."""
     J = _pixel_jacobian(T, points, camera)
-    return sigma * np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
+    return np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
 
 
 def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
@@ -326,20 +373,6 @@ def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera:
     u = np.stack([by_z, none, -x * by_z, -x * y, 1 + x * x, -y], axis=1)
     v = np.stack([none, by_z, -y * by_z, -1 - y * y, x * y, x], axis=1)
     return camera.focal[:, None] * np.stack([u, v], axis=1)
-
-
-def _depth_change(
-    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], level: Level
-) -> NDArray[np.float64]:
-    """Change of depth (n,) of corners (n, 3) m, in pixels of an equal motion across the line of sight.
-
-    ``T``: (4, 4) motion of the static world. ``targets``: (n, 2) pixels of the corners in ``level``, the second image;
-    the change is 0 without depth.
-    """
-    u, v = _nearest_pixels(targets, level).T
-    found, expected = level.depth[v, u], points @ T[2, :3] + T[2, 3]
-    change = np.maximum(np.abs(found - expected) - SAME_SURFACE * expected, 0) / np.maximum(expected, 1e-6)
-    return np.where(found > 0, change * level.camera.fx, 0.0)
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:

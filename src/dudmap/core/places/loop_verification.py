@@ -39,7 +39,7 @@ class LoopQuery:
 
     Attributes:
         dynamic_mask: (H, W) bool.
-        labels, unverified_mask: See ``PoseEstimate``.
+        labels: See ``PoseEstimate``.
     """
 
     observation: Observation
@@ -47,12 +47,11 @@ class LoopQuery:
     tracking: TrackingResult
     dynamic_mask: NDArray[np.bool_]
     labels: Labels | None = None
-    unverified_mask: NDArray[np.bool_] | None = None
 
     @cached_property
     def static_weights(self) -> list[NDArray[np.float32]] | None:
         """Per level (h, w), weights of the pixels in a registration; None = 1."""
-        return None if self.labels is None else static_weights(self.labels, self.levels, self.unverified_mask)
+        return None if self.labels is None else static_weights(self.labels, self.levels)
 
 
 class LoopVerifier:

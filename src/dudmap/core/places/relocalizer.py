@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
-from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Pyramid, is_majority_dynamic
 from dudmap.core.map.volume import TsdfVolume
@@ -19,6 +18,7 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.core.verdict import Outcome, Verdict
+from dudmap.core.young_map import UNDECIDED
 
 MIN_READINGS = 0.2
 """Smallest share of valid depth pixels in the first frame of a submap."""
@@ -45,7 +45,7 @@ class Relocalizer(Stateful):
 
     _lost_since: Remembered[float | None] = None
     _mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
-    # time, images and segments of the lost frames of the last LONGEST_BASELINE seconds
+    # time, images and segments of the lost frames of the last UNDECIDED seconds
     _recent: Remembered[deque[tuple[float, Pyramid, Segmentation]]]
     _place_unknown: Remembered[bool] = False
     _counted: Remembered[tuple[float, int]]
@@ -124,7 +124,7 @@ class Relocalizer(Stateful):
         * The camera has been lost for ``submaps.patience`` seconds.
         * The frame has enough depth for a map and, if it has colour, enough features for a keyframe.
         * The image motion is camera motion (``_shows_static_world``), by the last lost image (fast people) and an image
-          LONGEST_BASELINE older (slow people).
+          UNDECIDED older (slow people).
         """
         return Verdict.of(self._start_outcomes(view))
 
@@ -133,7 +133,7 @@ class Relocalizer(Stateful):
         possible = self.may_start_submaps and since is not None
         yield Outcome.of("may_start", possible, 1, "no other map may be started", at_least=True)
         assert since is not None
-        while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > LONGEST_BASELINE:
+        while len(self._recent) > 1 and observation.timestamp - self._recent[0][0] > UNDECIDED[0]:
             self._recent.popleft()
         recent = [(pyramid, segmentation) for _, pyramid, segmentation in self._recent]
         if self._compares_images:

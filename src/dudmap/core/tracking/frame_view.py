@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.core.dynamics.detector import DynamicDetector
-from dudmap.core.dynamics.ego_motion import TrackedImage
+from dudmap.core.dynamics.image_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask, full_size
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced, saturated
@@ -161,8 +161,8 @@ class FrameView:
         return bool(deviation[0, 0] < TEXTURELESS)
 
 
-PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
-"""Weight of previously dynamic pixels in the first registration."""
+DOUBTFUL_WEIGHT = 0.1
+"""Weight of previously dynamic and of undecided pixels in a registration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,15 +172,12 @@ class PoseEstimate:
     Attributes:
         tracking: Result of the last registration.
         labels: Static probabilities and dynamic pixels; None without labelling or for the first frame of a map.
-        unverified_mask: (h, w) bool, label resolution, pixels not verified as static while most of the view moves; None
-            for none.
         view: The frame with the registered colours; None if they did not change.
         from_corners: Whether the corners of the last image determine the directions that the view does not observe.
     """
 
     tracking: TrackingResult
     labels: Labels | None = None
-    unverified_mask: NDArray[np.bool_] | None = None
     view: FrameView | None = None
     from_corners: bool = False
 
@@ -232,14 +229,14 @@ class PoseEstimate:
 
 
 def static_weights(
-    labels: Labels, levels: list[Level], unverified_mask: NDArray[np.bool_] | None = None
+    labels: Labels, levels: list[Level], undecided: NDArray[np.bool_] | None = None
 ) -> list[NDArray[np.float32]]:
-    """Weights (h, w) of the second registration at each level: the static probability, 0 for unverified pixels."""
+    """Weights (h, w) of the second registration at each level: the static probability, less for undecided pixels."""
     import cv2
 
     static = labels.static_probability
-    if unverified_mask is not None:
-        static = static * ~unverified_mask
+    if undecided is not None:
+        static = static * ~undecided
     return [
         np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
         for level in levels
@@ -247,24 +244,24 @@ def static_weights(
 
 
 def initial_weights(
-    levels: list[Level], previously_dynamic: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
+    levels: list[Level], doubtful: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
 ) -> list[NDArray[np.float32]] | None:
     """Weights of the first registration, before the frame is labelled; None = 1 for every pixel.
 
     Args:
         levels: Pyramid levels.
-        previously_dynamic: (h, w) bool, dynamic pixels of the previous frame, whose weight is reduced.
+        doubtful: (h, w) bool, dynamic pixels of the previous frame, whose weight is reduced.
         excluded: Masks of any size of pixels without weight.
     """
-    if previously_dynamic is None and not excluded:
+    if doubtful is None and not excluded:
         return None
     out = []
     for level in levels:
-        if previously_dynamic is None:
+        if doubtful is None:
             weights = np.ones(level.depth.shape, np.float32)
         else:
-            reduction = np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT)
-            weights = np.float32(1) - reduction * reduced(previously_dynamic, level)
+            reduction = np.float32(1 - DOUBTFUL_WEIGHT)
+            weights = np.float32(1) - reduction * reduced(doubtful, level)
         for mask in excluded:
             weights *= ~reduced(mask, level)
         out.append(weights)

@@ -10,7 +10,7 @@ from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.median import median
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.dominant_motion import AGREED, exceeds_noise_share
-from dudmap.core.dynamics.ego_motion import TrackedImage
+from dudmap.core.dynamics.image_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import is_majority_dynamic, reduced
 from dudmap.core.geometry.se3 import agree
@@ -19,11 +19,13 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, SAME_POSE, PosePrediction
+from dudmap.core.tracking.pose_prediction import PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 from dudmap.core.verdict import Verdict
+from dudmap.core.young_map import SAME_POSE
 
+CLEARLY_BETTER = 0.95
 NO_CHANCE = 3
 """Significance of an improvement: excess of improved over worsened measurements, in standard deviations of chance."""
 UNCHANGED_SHARE = 0.02
@@ -74,19 +76,23 @@ class FrontEnd(Stateful):
 
         A frame that the checks reject is judged once more by other evidence:
 
-        * if the light has changed, registered by its distances alone, because the change differs from place to place;
+        * if pixels are undecided, registered with them;
+        * else if the light has changed, registered by its distances alone, because the change differs between places;
         * else at the pose by the corners of the last image, if these clearly follow one motion.
         """
         estimate = self.register(volume, view, prediction)
         verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
         if verdict.accepted or view.blind:
             return view, estimate, verdict
-        if self._brightness is not None and self._is_relit(view):
+        if prediction.undecided is not None:
+            other_view = view
+            other = self.register(volume, view, replace(prediction, undecided=None))
+        elif self._brightness is not None and self._is_relit(view):
             other_view = replace(view, blind=True)
             other = self.register(volume, other_view, prediction)
         elif (T_image := self._clear_image_pose(view, prediction)) is not None:
             other_view = view
-            other = self._at_given(volume, view, replace(prediction, T_world_camera=T_image))
+            other = self.at_given(volume, view, replace(prediction, T_world_camera=T_image))
             other = replace(other, from_corners=True)
         else:
             return view, estimate, verdict
@@ -110,7 +116,7 @@ class FrontEnd(Stateful):
         floor fits the map at any camera position; only its colours contradict.
         """
         if self.motion.is_given:
-            return self._at_given(volume, view, prediction)
+            return self.at_given(volume, view, prediction)
         estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
         if not estimate.is_observed:  # along these directions, a registration keeps its initial pose
             T_image = self._clear_image_pose(view, prediction)
@@ -151,9 +157,9 @@ class FrontEnd(Stateful):
         The coarse levels give a pose for labelling; the fine levels are registered with the static weights of the
         labels.
         """
-        levels, unverified = view.pyramid.tracked, prediction.unverified_mask
+        levels = view.pyramid.tracked
         tracker = self.blind_tracker if view.without_image else self.tracker
-        excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
+        excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.undecided) if m is not None]
         split, relit = max(1, len(levels) - 1), self._is_relit(view)
         if not self.config.dynamics.enabled:
             with view.timer("track"):
@@ -164,7 +170,7 @@ class FrontEnd(Stateful):
                 fine, exposure = view.pyramid.tracked[split - 1 :], found.exposure
                 weights = initial_weights(fine, None, excluded)
                 tracking = tracker.align(volume, fine, found.T_world_camera, weights, split - 1, exposure)
-            return PoseEstimate(tracking, None, unverified, view)
+            return PoseEstimate(tracking, None, view)
         with view.timer("track"):
             coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
             found = tracker.minimize(volume, coarse, T_init, weights, relit=relit)
@@ -174,7 +180,7 @@ class FrontEnd(Stateful):
         with view.timer("track_again"):
             finest_suffices = split < len(levels) and found.settled and self._labels_unchanged(labels)
             first = split if finest_suffices else split - 1
-            weights = static_weights(labels, levels[first:], unverified)
+            weights = static_weights(labels, levels[first:], prediction.undecided)
             pose, exposure = found.T_world_camera, found.exposure
             velocity = self.motion.velocity_to(view.timestamp, pose)
             time_sigma = self.color_motion.time_sigma(self.config.sensor.color_time_sigma)
@@ -184,13 +190,13 @@ class FrontEnd(Stateful):
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.without_image:
             tracking = replace(tracking, color_residual=np.nan)
-        return PoseEstimate(tracking, labels, unverified, view)
+        return PoseEstimate(tracking, labels, view)
 
-    def _at_given(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
+    def at_given(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Labels of a frame with a given pose, which is not registered."""
         coarse, fine = view.pyramid.coarse, view.pyramid.fine
-        T_world_camera, unverified = prediction.T_world_camera, prediction.unverified_mask
-        excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
+        T_world_camera = prediction.T_world_camera
+        excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.undecided) if m is not None]
         tracker = self.blind_tracker if view.blind else self.tracker
         with view.timer("track"):
             [weights] = initial_weights([coarse], self.last_dynamic, excluded) or [np.ones_like(coarse.depth)]
@@ -200,9 +206,9 @@ class FrontEnd(Stateful):
             if labels is None:
                 [weights] = initial_weights([fine], None, excluded) or [np.ones_like(fine.depth)]
             else:
-                [weights] = static_weights(labels, [fine], unverified)
+                [weights] = static_weights(labels, [fine], prediction.undecided)
             tracking = tracker.judge(volume, fine, T_world_camera, weights, found.exposure)
-        return PoseEstimate(tracking, labels, unverified)
+        return PoseEstimate(tracking, labels)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Accept the pose and labels of a frame, and update velocity and detector."""
@@ -250,7 +256,7 @@ class FrontEnd(Stateful):
         if isinstance(found, Minimum) and found.level.depth is level.depth:
             weights, before = found.weights, found.equations.residuals[0]
         else:
-            excluded = [m for m in (view.known_dynamic, prediction.unverified_mask) if m is not None]
+            excluded = [m for m in (view.known_dynamic, prediction.undecided) if m is not None]
             [weights] = initial_weights([level], self.last_dynamic, excluded) or [np.ones_like(level.depth)]
             before = self.blind_tracker.linearize(volume, level, T_world_camera, weights).residuals[0]
         T_nearest, after = self.blind_tracker.nearest(volume, level, T_world_camera, weights)
@@ -280,7 +286,6 @@ class FrontEnd(Stateful):
                 view.segmentation,
                 prediction.moving,
                 tracking.exposure,
-                prediction.slow,
             )
             if view.without_image:
                 labels = replace(labels, hidden=None)

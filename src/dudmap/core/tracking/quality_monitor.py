@@ -17,7 +17,7 @@ from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.cpu.reprojection import compare_images, reproject
 from dudmap.core.dynamics.detector import noise_parameters
 from dudmap.core.dynamics.dominant_motion import MANY
-from dudmap.core.dynamics.ego_motion import ImagePose, TrackedImage
+from dudmap.core.dynamics.image_motion import ImagePose, TrackedImage
 from dudmap.core.frames.observation import Level, reduced
 from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful

@@ -166,6 +166,7 @@ def classify_segments(evidence, before, min_pixels):
     A segment of at least ``min_pixels`` is dynamic
 
     - if at least NEARLY_ALL of its pixels are dynamic, or
+    - if most of it was dynamic in the last frame, and most of it is not near a surface of the map, or
     - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and the others have
       moved as well.
 
@@ -196,7 +197,8 @@ def classify_segments(evidence, before, min_pixels):
         moved = far * far + unlike * unlike >= (0.5 if before[n] > 0.5 else 1.0)
         small = evidence[n, SIZE] <= MAX_SHARE * readings
         nearly_all, some = evidence[n, DYNAMIC] >= NEARLY_ALL, evidence[n, DYNAMIC] >= MIN_DYNAMIC
-        moving[n] = evidence[n, SIZE] >= min_pixels and (nearly_all or (small and moved and some))
+        unseen = before[n] > 0.5 and evidence[n, COMPARED] < 0.5  # nothing tells that it has stopped
+        moving[n] = evidence[n, SIZE] >= min_pixels and (nearly_all or unseen or (small and moved and some))
     return moving
 
 
