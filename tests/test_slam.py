@@ -136,13 +136,13 @@ def test_a_camera_that_is_blinded_goes_on_by_distances_and_fuses_nothing(recordi
     sequence, frames = recording
     slam = Slam(sequence.camera)
     results = [slam.process(frame) for frame in frames[:14]]
-    before = slam.volume.num_blocks  # with the frames held back in the first 0.4 s
+    before = slam.volume.num_blocks
     for frame in frames[14:18]:
         results.append(slam.process(replace(frame, color=np.full_like(frame.color, grey))))
     assert all(result.state == "tracked" for result in results), [result.lost_reason for result in results]
     assert [(result.blind, result.fused) for result in results[14:]] == [(True, False)] * 4
     assert slam.volume.num_blocks == before
-    assert not slam.predictor.ego_motion.active  # the last image with something to see was taken from elsewhere
+    assert not slam.predictor.image_motion.active  # the last image with something to see was taken from elsewhere
     results.append(slam.process(frames[18]))
     assert (results[-1].blind, results[-1].fused) == (False, True)
     assert share(sequence, results) < LIMIT

@@ -61,9 +61,7 @@ def tracked():
     results = [slam.process(room[index]) for index in range(8)]
     assert len(results) > MIN_HISTORY
     view = slam.prepare(room[8])
-    estimate = slam.front_end.register(
-        slam.volume, view, slam.predictor.predict(slam.volume, view, slam.front_end.last_dynamic)
-    )
+    estimate = slam.front_end.register(slam.volume, view, slam.predictor.predict(slam.volume, view))
     return slam, results, view, estimate
 
 

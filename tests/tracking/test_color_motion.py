@@ -96,7 +96,7 @@ def test_the_second_frame_is_remembered_with_the_colours_of_its_velocity():
     for n in (0, 1):
         slam.process(faulty[n])
     inside, sharp = np.s_[10:-10, 10:-10], smooth(plain.prepare(exact[1]).pyramid.fine.intensity)
-    remembered, recorded = slam.predictor.ego_motion.last.pyramid, plain.prepare(faulty[1]).pyramid
+    remembered, recorded = slam.predictor.image_motion.last.pyramid, plain.prepare(faulty[1]).pyramid
     after, before = (np.abs(smooth(images.fine.intensity) - sharp)[inside].mean() for images in (remembered, recorded))
     assert after < 0.7 * before
 

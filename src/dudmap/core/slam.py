@@ -211,7 +211,8 @@ class Slam(SlamResults, Stateful):
             if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
                 self.motion.apply_correction(correction)
         prediction = self.predictor.predict(self.reference, view)
-        if self._decide_start(view, prediction):
+        restarted = self._decide_start(view, prediction)
+        if restarted:
             prediction = self.predictor.predict(self.reference, view)
         last = self.predictor.image_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
@@ -230,6 +231,7 @@ class Slam(SlamResults, Stateful):
         mask = estimate.dynamic_mask(view)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
+        corrected |= restarted
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
@@ -277,9 +279,9 @@ class Slam(SlamResults, Stateful):
             self.front_end.lose(view.timestamp)
         return view
 
-    def _start_map(self, view: FrameView, T_world_camera: NDArray[np.float64] | None = None) -> FrameResult:
-        """Start a map with a single frame at a pose (4, 4); None: its camera frame becomes the world frame."""
-        T_start = self.motion.start if T_world_camera is None else T_world_camera
+    def _start_map(self, view: FrameView) -> FrameResult:
+        """Start a map with a single frame, at its given pose or in its camera frame."""
+        T_start = self.motion.start
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
         self.young_map.textureless = view.textureless
@@ -296,8 +298,7 @@ class Slam(SlamResults, Stateful):
             self.predictor.image_motion.start(view.timestamp)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-        restarted = T_world_camera is not None
-        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True, corrected=restarted)
+        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> Relocalization | None:
         """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
@@ -338,16 +339,15 @@ class Slam(SlamResults, Stateful):
                 known = reduced(view.known_dynamic, view.labelled)
                 moving = known if moving is None else moving | known
             frames = self.young_map.decide(view.tracked_at(prediction.T_world_camera, moving=moving))
-        if frames:
-            self._replay(frames, view.timer)
-        return bool(frames)
+        return bool(frames) and self._replay(frames, view.timer)
 
-    def _replay(self, frames: list[StartFrame], timer: StageTimer) -> None:
-        """Process the first frames of a map again, with the poses and moving pixels that are known now."""
+    def _replay(self, frames: list[StartFrame], timer: StageTimer) -> bool:
+        """Process the first frames of a map again, with the poses and moving pixels that are known now; returns whether
+        poses changed."""
         first, replayed = frames[0], [frames[0]]
         corrections = [first.T_world_camera @ se3.inverse(first.estimate.T_world_camera)]
-        self.monitor.reset()
-        self.detector.reset()
+        for remembered in (self.monitor, self.detector, self.redundancy):
+            remembered.reset()
         self.mapper.begin_anew(first, timer)
         self.detector.start(first.view.timestamp, first.view.labelled, first.T_world_camera)
         self.motion.restart(first.view.timestamp, first.T_world_camera)
@@ -355,7 +355,7 @@ class Slam(SlamResults, Stateful):
             view = replace(frame.view, timer=timer)
             prediction = PosePrediction.known(frame.T_world_camera, frame.moving, frame.undecided)
             estimate = self.front_end.register_from(self.reference, view, prediction, frame.T_world_camera)
-            if not estimate.tracking.converged:
+            if not estimate.tracking.accepted:
                 estimate = self.front_end.at_given(self.reference, view, prediction)
             self.front_end.update(view, estimate)
             self.predictor.update(view, estimate)
@@ -364,6 +364,7 @@ class Slam(SlamResults, Stateful):
             corrections.append(estimate.T_world_camera @ se3.inverse(frame.estimate.T_world_camera))
         self.young_map.replace_frames(replayed)
         self.atlas.move(np.array([frame.view.timestamp for frame in frames]), np.stack(corrections))
+        return len(frames) > 1
 
     def _forget_map(self) -> None:
         """Reset the state learnt from the frames of a map that ends."""

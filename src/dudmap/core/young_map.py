@@ -129,6 +129,7 @@ class YoungMap(Stateful):
     _decisions: Remembered[int] = 0  # about slow motion
     _num_fused: Remembered[int] = 0
     _mostly: Remembered[bool] = False  # most of the view has moved in one of the first frames
+    _shown: Remembered[bool] = False  # the labels of the first frames showed it at once
     _collects: Remembered[bool] = False  # fused frames are kept for the second registration
 
     def __init__(self, *, refines: bool, decides: bool, reference_depth: float) -> None:
@@ -148,7 +149,7 @@ class YoungMap(Stateful):
     def start(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Record the frame that starts a map, before it is fused."""
         self._frames = [StartFrame.of(view, estimate)] if self._decides else []
-        self._mostly, self._decisions = False, 0
+        self._mostly, self._shown, self._decisions = False, False, 0
         self.restart_window()
 
     def restart_window(self) -> None:
@@ -208,6 +209,8 @@ class YoungMap(Stateful):
         if len(frames) > 1 and now.timestamp < frames[0].view.timestamp + UNDECIDED[self._decisions]:
             return []
         self._decisions += len(frames) > 1
+        if self._decisions == 1 and (last := frames[-1]).moving is not None:
+            self._shown = is_majority_dynamic(last.moving, last.view.labelled)
         self._frames = [] if self._decisions == len(UNDECIDED) else frames[::2]
         self._slow, self._interval = len(frames) > 1, (now.timestamp - frames[0].view.timestamp) / len(frames)
         rest, anchor, T_anchor, contradicted = frames, now, now.T_world_camera, False
@@ -261,13 +264,13 @@ class YoungMap(Stateful):
     def _compared(self, now: TrackedImage, frame: StartFrame) -> StartFrame | None:
         """An older frame as its comparison with an image shows it; None if unknown.
 
-        In a slow crowd, pixels that are not verified as static are undecided.
+        In a crowd that was too slow for consecutive images, pixels that are not verified as static are undecided.
         """
         motion = self._motion(now, frame, doubtful=False)
         if motion is None:
             return None
         T = now.T_world_camera @ se3.inverse(motion.T_after_before)
-        undecided = ~static_segments(motion.after) if self._mostly and self._slow else None
+        undecided = ~static_segments(motion.after) if self._mostly and self._slow and not self._shown else None
         return replace(frame, T_world_camera=T, moving=propagate_to_segments(motion.after), undecided=undecided)
 
     def _contradicts(self, motion: DominantMotion, now: TrackedImage, older: StartFrame) -> bool:

@@ -66,10 +66,6 @@ class ThesisSlam:
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._timings: dict[str, float] = {}
 
-    def finish(self) -> int:
-        """Number of frames that were held back: none."""
-        return 0
-
     @property
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""

@@ -62,7 +62,6 @@ class RunRecord:
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
-    fused_at_end: int = 0
     dropped: int | None = None
     spent: tuple[float, float] = (0.0, 0.0)
     _since: tuple[float, float] = field(
@@ -177,8 +176,7 @@ class RunRecord:
             "tracked": sum(row["state"] == "tracked" for row in self.rows),
             "repeated": sum(row["state"] == "repeated" for row in self.rows),
             **self.counts,
-            "fused": self.counts["fused"] + self.fused_at_end,
-            "fused_at_end": self.fused_at_end,
+            "fused": self.counts["fused"],
             "lost": len(self.lost),
             "unreadable": len(self.unreadable),
             "frames_rejected": dict(sorted(self.rejected.items())),

@@ -31,7 +31,6 @@ GROUPS = {
         "relocalized": Named("relocalised"),
         "corrected": Named("loop closures and joined submaps"),
         "fused": Named("changed the map"),
-        "fused_at_end": Named("of these held back until the end"),
         "skipped_similar": Named("redundant views"),
         "uncertain": Named("uncertain poses or labels"),
         "blind": Named("images told too little"),

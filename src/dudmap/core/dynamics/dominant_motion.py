@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu import consensus
 from dudmap.core.backends.cpu.consensus import ConsensusParams
 from dudmap.core.dynamics.segments import Segmentation
-from dudmap.core.frames.observation import FLOW_WIDTH, WINDOW, Level, Pyramid, scaled_window
+from dudmap.core.frames.observation import FLOW_WIDTH, WINDOW, Level, Pyramid, is_majority_dynamic, scaled_window
 from dudmap.core.frames.optical_flow import (
     RETURN_PX,
     consistent_with_static,
@@ -129,6 +129,9 @@ AGREED = 0.7
 TIGHTER = 0.5
 """Largest error of the static corners of a motion that replaces the expected one, as a share of the error of the
 corners that rest with the latter. The static world is rigid; a pose that followed people fits them loosely."""
+SUPPORTED = 0.8
+"""Smallest number of resting corners of a motion that replaces the expected one, as a share of the number that rests
+with the latter; alternative to TIGHTER."""
 NOISE_SHARE = 0.02
 """Largest share of moving measurements that is noise."""
 
@@ -261,10 +264,13 @@ def dominant_motion(
     if doubtful and not consecutive:
         limit = pixels_at_width(MOVES_PX, camera) + MOVES_SHARE * flow
         nearest = _refined(T_expected, points[candidate], targets[candidate], limit[candidate], camera)
-        by_found, by_expected = (
-            _misfit(there, targets, limit, candidate) for there in (predicted, reproject(nearest, points, camera))
+        by_found, by_nearest, by_expected = (
+            lengths(there - targets)[candidate]
+            for there in (predicted, reproject(nearest, points, camera), expected[found])
         )
-        if by_found > TIGHTER * by_expected:
+        supported = np.count_nonzero(by_found <= limit[candidate]), np.count_nonzero(by_expected <= limit[candidate])
+        tight = _misfit(by_found, limit[candidate]) <= TIGHTER * _misfit(by_nearest, limit[candidate])
+        if not tight and supported[0] < SUPPORTED * supported[1]:
             T, predicted = T_expected, expected[found]
     error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
@@ -287,8 +293,9 @@ def dominant_motion(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
     moves &= ~unclear
-    if not consecutive:  # known motion may be too slow for this pair of images
-        moves, rests = moves | ~candidate, rests & candidate
+    mostly = moving is not None and is_majority_dynamic(moving, before.labelled)
+    if not consecutive or (mostly and np.count_nonzero(rests & ~candidate) > 0.5 * np.count_nonzero(~candidate)):
+        moves, rests = moves | ~candidate, rests & candidate  # known motion is too slow for this pair of images
     targets, points, moves, rests = targets[kept], points[kept], moves[kept], rests[kept]
     columns, rows = _nearest_pixels(targets, fine_after).T
     z = fine_after.depth[rows, columns].astype(np.float64)
@@ -310,15 +317,9 @@ def dominant_motion(
     )
 
 
-def _misfit(
-    predicted: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    candidate: NDArray[np.bool_],
-) -> float:
-    """Median error, px, of the candidates (n,) whose predicted pixels (n, 2) are within ``limit`` (n,) px."""
-    error = lengths(predicted - targets)
-    rests = candidate & (error <= limit)
+def _misfit(error: NDArray[np.float64], limit: NDArray[np.float64]) -> float:
+    """Median of the errors (n,), px, within their limits (n,)."""
+    rests = error <= limit
     return float(np.median(error[rests])) if rests.any() else np.inf
 
 

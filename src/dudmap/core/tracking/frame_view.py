@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.image_motion import TrackedImage
-from dudmap.core.dynamics.masks import Labels, full_mask, full_size
+from dudmap.core.dynamics.masks import Labels, full_mask
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced, saturated
 from dudmap.core.state import CACHE
@@ -128,11 +128,6 @@ class FrameView:
     def labelled(self) -> Level:
         """Pyramid level whose pixels are labelled."""
         return self.pyramid.labelled
-
-    def with_dynamic(self, moving: NDArray[np.bool_]) -> "FrameView":
-        """The frame with additional known dynamic pixels: (h, w) bool, label resolution."""
-        known = full_size(moving, self.labelled.depth, self.observation.depth)
-        return replace(self, known_dynamic=known if self.known_dynamic is None else known | self.known_dynamic)
 
     def tracked_at(self, T_world_camera: NDArray[np.float64], **attributes: Any) -> TrackedImage:  # noqa: ANN401
         """Image of the frame at a pose (4, 4), for comparison with other images."""
