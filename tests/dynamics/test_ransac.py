@@ -130,7 +130,8 @@ def test_the_pixels_of_a_fitted_motion_are_as_uncertain_as_repeated_fits_show():
     for _ in range(300):
         T = refined(SLOW, far, targets + rng.normal(0, 0.2, targets.shape), 5.0, CAMERA)
         pixels.append(reproject(T, points, CAMERA))
-    found = dominant._deviations(SLOW, points, far, np.full(25, 0.2 * np.sqrt(2 * np.log(2))), CAMERA)
+    covariance = dominant._covariance(SLOW, far, np.full(25, 0.2 * np.sqrt(2 * np.log(2))), CAMERA)
+    found = dominant._deviations(SLOW, points, covariance, CAMERA)
     np.testing.assert_allclose(found, np.sqrt(np.var(pixels, axis=0).mean(axis=1)), rtol=0.2)
     assert found[~inlier].min() > 10 * found[inlier].max()
 
