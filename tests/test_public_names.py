@@ -85,7 +85,6 @@ INSIDE = {
 def test_results_are_pickled_and_copied():
     slam = Slam(CAMERA)
     results = [slam.process(wall(1.5 + 0.01 * number, seed=number)) for number in range(3)]
-    slam.finish()
     for copied in (lambda value: pickle.loads(pickle.dumps(value)), copy.deepcopy, copy.copy):
         found = copied(results[-1])
         np.testing.assert_array_equal(found.T_world_camera, results[-1].T_world_camera)
