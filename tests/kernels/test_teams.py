@@ -83,7 +83,7 @@ def test_the_compiled_descent_is_the_loop_of_the_text(num_threads, known, column
     found = volume.backend.register(volume.grid, image, T, first, rules, parameters)
     expected = descend(lambda at: tracker.linearize(volume, level, at, weights), T, first, rules)
     assert found.iterations == expected.iterations > 2
-    assert found.settled == expected.settled
+    assert found.converged == expected.converged
     assert np.abs(found.T_world_camera - T).max() > 1e-3
     # both are compiled on their own: sums of float32 numbers are rounded in another order
     np.testing.assert_allclose(found.T_world_camera, expected.T_world_camera, atol=1e-6)

@@ -32,7 +32,7 @@ TRIANGLES = 1_000_000
 
 
 @dataclass
-class _News:
+class _Update:
     """Data that the page does not show yet: metrics of all frames, images of the latest one."""
 
     figures: list[FrameFigures] = field(default_factory=list)
@@ -54,7 +54,7 @@ class LiveView(RunObserver):
     def __init__(self, window: Window) -> None:
         self.costs: list[float] = []
         self._window = window
-        self._news = _News()
+        self._update = _Update()
         self._changed = threading.Condition()
         self._closed = False
         self._error: Exception | None = None
@@ -70,7 +70,7 @@ class LiveView(RunObserver):
         slam.live_volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
         self._window.set_camera(slam.camera)
         with self._changed:
-            self._news = _News(restart=True)
+            self._update = _Update(restart=True)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Put a frame into the slot."""
@@ -80,10 +80,10 @@ class LiveView(RunObserver):
         self._feed.offer(self._slam.live_volume)
         figures = FrameFigures.of(result, ms)
         with self._changed:
-            self._news.figures.append(figures)
-            self._news.images = images or self._news.images
+            self._update.figures.append(figures)
+            self._update.images = images or self._update.images
             if result.corrected:
-                self._news.poses = self._poses()
+                self._update.poses = self._poses()
             self._changed.notify()
         self.costs.append(1000 * (time.perf_counter() - start))
 
@@ -91,7 +91,7 @@ class LiveView(RunObserver):
         """Show a change since an earlier visit."""
         if name == "change":
             with self._changed:
-                self._news.changes.append(values)
+                self._update.changes.append(values)
                 self._changed.notify()
 
     def finish(self, out: Path) -> None:
@@ -99,7 +99,7 @@ class LiveView(RunObserver):
         if self._slam is not None and self._error is None:
             self._feed.offer(self._slam.live_volume, now=True)
             with self._changed:
-                self._news.poses = self._poses()
+                self._update.poses = self._poses()
                 self._changed.notify()
 
     def close(self) -> None:
@@ -120,31 +120,35 @@ class LiveView(RunObserver):
         path = self._slam.trajectory
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
 
-    def _take(self) -> _News | None:
-        """Wait for news; None once all is shown."""
+    def _take(self) -> _Update | None:
+        """Wait for an update; None once all is shown."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._has_news())
-            if not self._has_news():
+            self._changed.wait_for(lambda: self._closed or self._has_update())
+            if not self._has_update():
                 return None
-            news, self._news = self._news, _News()
-            return news
+            update, self._update = self._update, _Update()
+            return update
 
-    def _has_news(self) -> bool:
+    def _has_update(self) -> bool:
         return bool(
-            self._news.figures or self._news.restart or self._news.poses or self._news.changes or self._feed.has_copy
+            self._update.figures
+            or self._update.restart
+            or self._update.poses
+            or self._update.changes
+            or self._feed.has_copy
         )
 
     def _show(self) -> None:
         try:
-            while (news := self._take()) is not None:
-                if news.restart:
+            while (update := self._take()) is not None:
+                if update.restart:
                     self._window.clear()
                 self._window.show_mesh(self._feed.take())
-                self._window.add_frames(news.figures, news.poses)
-                for change in news.changes:
+                self._window.add_frames(update.figures, update.poses)
+                for change in update.changes:
                     self._window.show_change(change)
-                if news.images is not None and news.figures:
-                    self._window.add_images(news.figures[-1].timestamp, news.images.files())
+                if update.images is not None and update.figures:
+                    self._window.add_images(update.figures[-1].timestamp, update.images.files())
                 time.sleep(PERIOD)
         except Exception as error:  # close raises it in the thread of the run
             self._error = error

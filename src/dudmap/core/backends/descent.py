@@ -35,13 +35,13 @@ class Descent(NamedTuple):
         T_world_camera: (4, 4) the last accepted pose.
         equations: Normal equations of the last accepted step; the first ones if no step was accepted.
         iterations: Number of linearisations.
-        settled: Whether a stop criterion was met.
+        converged: Whether a stop criterion was met.
     """
 
     T_world_camera: NDArray[np.float64]
     equations: NormalEquations
     iterations: int
-    settled: bool
+    converged: bool
 
 
 def descend(
@@ -71,14 +71,14 @@ def descend(
         step = accelerated(plain, last, taken) if taken.any() else plain
         T_trial, length = moved(T, step), float(np.linalg.norm(step))
         if length < rules.stop:  # too short to need another linearisation
-            return Descent(T_trial, system, used, settled=True)
+            return Descent(T_trial, system, used, converged=True)
         trial = linearize(T_trial)
         used += 1
         change = float((system.b + trial.b) @ step) / 2
-        accepted, damping, settled = judged(change, system.cost, length, damping, rules)
+        accepted, damping, converged = judged(change, system.cost, length, damping, rules)
         if accepted:
             T, system = T_trial, trial
         last, taken = plain, step if accepted else np.zeros(6)
-        if settled:
-            return Descent(T, system, used, settled=True)
-    return Descent(T, system, used, settled=False)
+        if converged:
+            return Descent(T, system, used, converged=True)
+    return Descent(T, system, used, converged=False)

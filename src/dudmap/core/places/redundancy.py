@@ -68,8 +68,8 @@ class RedundantViews(Stateful):
         if not static.any() or known[static].mean() <= config.threshold:
             return False
         to_carve = self._is_behind(place, level, volume) | (place.to_carve > 0)
-        news = static & ((known < self._learnt / (self._learnt + 1)) | to_carve)
-        return bool(np.count_nonzero(opened_mask(news, level)) < MIN_REGION * news.size)
+        unfused = static & ((known < self._learnt / (self._learnt + 1)) | to_carve)
+        return bool(np.count_nonzero(opened_mask(unfused, level)) < MIN_REGION * unfused.size)
 
     def update(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> None:
         """Record a frame that was fused into a map."""

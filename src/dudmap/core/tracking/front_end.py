@@ -125,7 +125,7 @@ class FrontEnd(Stateful):
             return estimate
         tracking = estimate.tracking
         same_pose = SAME_POSE[0] * self.config.sensor.reference_depth, SAME_POSE[1]
-        arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *same_pose)
+        arrived = tracking.converged or agree(prediction.T_world_camera, tracking.T_world_camera, *same_pose)
         if arrived and not self.monitor.is_unusual(tracking):
             return estimate
         T_image, motion = prediction.image_pose(), prediction.image_motion()
@@ -178,7 +178,7 @@ class FrontEnd(Stateful):
         levels = view.pyramid.tracked
         labels = self._label(volume, view, prediction, found)
         with view.timer("track_again"):
-            finest_suffices = split < len(levels) and found.settled and self._labels_unchanged(labels)
+            finest_suffices = split < len(levels) and found.converged and self._labels_unchanged(labels)
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], prediction.undecided)
             pose, exposure = found.T_world_camera, found.exposure

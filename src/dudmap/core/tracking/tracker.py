@@ -58,7 +58,7 @@ class TrackingResult:
         iterations: Number of linearisations over all levels.
         color_residual: Median absolute intensity difference (0..1) to the map at the static measurements, after the
             best gain and offset; NaN for a textureless image.
-        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
+        converged: Whether the last level ended by a stop criterion and not at the iteration limit.
         unobservable: (k, 6) twists, camera axes, that the view does not determine and along which the initial pose was
             kept (``core/tracking/observability.py``).
         readings: Number of static measurements on the map, weighted.
@@ -72,7 +72,7 @@ class TrackingResult:
     condition: float
     iterations: int
     color_residual: float = 0.0
-    settled: bool = True
+    converged: bool = True
     unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
     readings: float = np.inf
 
@@ -100,7 +100,7 @@ class Minimum:
     """End of a registration.
 
     Attributes:
-        T_world_camera, exposure, iterations, settled: See ``TrackingResult``.
+        T_world_camera, exposure, iterations, converged: See ``TrackingResult``.
         equations: Normal equations at this pose.
         level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
         seen: Directions of motion that the view determines.
@@ -112,7 +112,7 @@ class Minimum:
     level: Level
     weights: NDArray[np.float32]
     iterations: int
-    settled: bool
+    converged: bool
     seen: Observability
 
 
@@ -182,7 +182,7 @@ class Tracker:
                 surface and is not applied.
         """
         volume.look_at(T_init)
-        T, iterations, system, settled, seen = T_init, 0, None, True, None
+        T, iterations, system, converged, seen = T_init, 0, None, True, None
         lit, weights = levels[-1], None
         limits, parameters = self.config.iterations[first_level:], self.parameters(volume.band, color_weight)
         for index, (level, limit) in enumerate(zip(levels, limits, strict=False)):
@@ -208,12 +208,12 @@ class Tracker:
                     seen = self._observability(volume, lit, T, weights, system, parameters)
                     rules = rules._replace(basis=np.ascontiguousarray(seen.observable))
                     found = self._descend(volume, lit, T, weights, system, rules, parameters)
-            T, system, settled = found.T_world_camera, found.equations, found.settled
+            T, system, converged = found.T_world_camera, found.equations, found.converged
             iterations += found.iterations
         if system is None or weights is None:  # all levels are skipped: the initial pose is judged
             weights = np.ones(lit.depth.shape, np.float32)
             system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
-        return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
+        return Minimum(T, exposure, system, lit, weights, iterations, converged, seen or COMPLETE)
 
     def judge(
         self,
@@ -359,6 +359,6 @@ class Tracker:
         color_residual = float(median(difference)) if len(difference) else 0.0
         result = TrackingResult(
             T_world_camera, found.exposure, ACCEPTED, share, residual, condition, found.iterations,
-            color_residual, found.settled, found.seen.unobservable, system.weight,
+            color_residual, found.converged, found.seen.unobservable, system.weight,
         )  # fmt: skip
         return replace(result, verdict=judged(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules)))

@@ -261,8 +261,8 @@ def open_sequence(
     for name, number in numbers.items():
         if number is not None and not (isfinite(number) and number > 0):
             raise DatasetError(f"found {_option(name)} {number:g}; expected a positive number")
-    asked = [*given, *(name for name, number in numbers.items() if number is not None)]
-    foreign = [_option(name) for name in asked if name not in reader.options]
+    named = [*given, *(name for name, number in numbers.items() if number is not None)]
+    foreign = [_option(name) for name in named if name not in reader.options]
     if foreign:
         raise DatasetError(
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"

@@ -108,7 +108,7 @@ def table(rows: list[Row]) -> str:
     head = ["recording", "voxel, cm", "device", "frame", *stages, "mesh", "view", "map, MB", "device, MB"]
     text, reason = grid(head, body), obstacle()
     if not any(row["device"].startswith("cuda") for row in rows):
-        text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not asked for'}.\n"
+        text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not requested'}.\n"
     for row in rows:
         what = f"{row['what']}, {100 * row['voxel']:g} cm, {row['device']}"
         text += f"\n{what}: {row['error']}\n" if "error" in row else ""

@@ -146,9 +146,9 @@ def sequence(
     special = find(situation, SITUATIONS, "situation") if situation is not None else Situation(("person",))
     names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
     path = special.camera_path if camera_path is None else camera_path
-    at_once = start_dynamic or special.start_dynamic
+    from_start = start_dynamic or special.start_dynamic
     times = faults.frame_times(frames, fps, seed)
-    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
+    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), from_start)
     if coverage is not None and coverage > 0:
         if movers is not None and set(names) - {"person", "people"}:
             raise ConfigError(f"coverage stands for people, but the movers are {', '.join(names)}; drop one of the two")
@@ -172,7 +172,7 @@ def sequence(
                           for spans in (special.covered, special.elsewhere))  # fmt: skip
     parameters: dict[str, object] = {
         "scene": scene, "movers": list(names), "camera_path": str(path), "frames": frames, "fps": fps,
-        "sensor_name": sensor, "noise": noise, "speed": speed, "coverage": coverage, "start_dynamic": at_once,
+        "sensor_name": sensor, "noise": noise, "speed": speed, "coverage": coverage, "start_dynamic": from_start,
         "situation": situation, "covered_s": covered, "elsewhere_s": elsewhere, "seed": seed,
         "motion_blur": motion_blur, "exposure_change": exposure_change,
     }  # fmt: skip
