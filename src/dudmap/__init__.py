@@ -12,6 +12,7 @@ _HOMES = {
     "CameraFrame": "io.cameras",
     "Config": "config",
     "ConfigError": "errors",
+    "Cue": "core.dynamics.cue",
     "DatasetError": "errors",
     "DeviceError": "errors",
     "DudmapError": "errors",
@@ -71,6 +72,7 @@ __all__ = [
     "CameraFrame",
     "Config",
     "ConfigError",
+    "Cue",
     "DatasetError",
     "DeviceError",
     "DudmapError",
@@ -146,6 +148,7 @@ if TYPE_CHECKING:
         VolumeConfig,
     )
     from dudmap.core.backends.parameters import MapSample, RaycastResult
+    from dudmap.core.dynamics.cue import Cue
     from dudmap.core.dynamics.masks import Labels
     from dudmap.core.frames.frame import Frame, FrameArrays
     from dudmap.core.geometry.calibration import Calibration

@@ -66,7 +66,7 @@ def test_regions_of_moving_pixels(scene, free):
     seen_free = (smooth(rng, 4) > 1.5) & (depth > 0)
     rules = RegionRules(6, 4, 4, 1, 15, 0.25)
     dynamic, seeds, probability = np.empty(SHAPE, bool), np.empty(SHAPE, bool), np.empty(SHAPE, np.float32)
-    given = seen_free if free else np.empty((0, 0), bool)
+    given = np.float32(12) * seen_free if free else np.empty((0, 0), np.float32)
     fit = np.float64(3.5), np.float32(-0.4)
     moving_pixels(
         depth, sample.distance, sample.occupancy, sigma, tolerance, given, *fit, NOISE, rules, dynamic, seeds,

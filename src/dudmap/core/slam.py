@@ -1,6 +1,7 @@
 """The algorithm: register a frame to the map, label moving pixels, fuse the static pixels (thesis algorithm 4)."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Unpack
 
@@ -11,6 +12,7 @@ from dudmap.config import Config
 from dudmap.core.arrays import copied
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.calibration.self_calibration import ColorCalibration
+from dudmap.core.dynamics.cue import Cue
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.frame_log import log_changes
 from dudmap.core.frames.frame import Frame, FrameArrays, given_frame
@@ -66,6 +68,7 @@ class Slam(SlamResults, Stateful):
         timed: Whether the times of the frames are measured; False for assumed times.
         poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
         ignore: (H, W) bool, pixels of the depth or colour image that are never used, fused or dynamic.
+        cues: Further evidence of motion, asked for each frame. They are not stored with the state.
     """
 
     stream: Remembered[StreamCheck]
@@ -98,6 +101,7 @@ class Slam(SlamResults, Stateful):
         timed: bool = True,
         ignore: NDArray[np.bool_] | None = None,
         poses: GivenRole = "estimated",
+        cues: Sequence[Cue] = (),
     ) -> None:
         self.config = config = config or Config()
         ignore = None if ignore is None else copied(ignore, "mask of ignored pixels", dtype=None)
@@ -118,7 +122,9 @@ class Slam(SlamResults, Stateful):
         self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
-        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
+        self.front_end = FrontEnd(
+            config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion, cues
+        )
         self.predictor = PosePredictor(config, self.motion, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)

@@ -51,8 +51,8 @@ MAPPED_SHARE = 0.3
 """Smallest share of a segment's moving pixels on the map that lets the map decide about the rest."""
 MIN_REGION = 0.0008
 """Smallest moving region, as a share of the image: 15 pixels at 160x120."""
-NONE = np.empty((0, 0), dtype=np.bool_)
-"""No pixels."""
+NONE = np.empty((0, 0), np.float32)
+"""No further evidence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +141,7 @@ class DynamicDetector(Stateful):
         segmentation: Callable[[], Segmentation],
         moving: NDArray[np.bool_] | None = None,
         exposure: tuple[float, float] = (1.0, 0.0),
+        added: NDArray[np.float32] = NONE,
     ) -> Labels:
         """Labels of a frame that is registered to a map.
 
@@ -152,6 +153,7 @@ class DynamicDetector(Stateful):
             segmentation: Returns the segments of the image, see ``segment``.
             moving: (h, w) bool, moving pixels by comparison of images; None without comparison.
             exposure: Gain and offset from the image's intensities to the map's.
+            added: (h, w) float32, log odds moving : static of further cues; of size 0 for none.
         """
         depth = level.depth
         noise = noise_parameters(self.sensor, level, volume.voxel_size)
@@ -171,7 +173,7 @@ class DynamicDetector(Stateful):
             MAX_LOG_ODDS, COUPLING, SWEEPS, scaled_length(SEAM, level), MIN_REGION * depth.size, STARTED_SHARE
         )  # fmt: skip
         moving_pixels(
-            depth, sample.distance, sample.occupancy, sigma, tolerance, self._seen_free(frame, unknown), offset,
+            depth, sample.distance, sample.occupancy, sigma, tolerance, self._evidence(frame, unknown, added), offset,
             np.float32(slope), noise, rules, dynamic, seeds, probability,
         )  # fmt: skip
         dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
@@ -207,15 +209,18 @@ class DynamicDetector(Stateful):
         self.memory.reset()
         self.background.reset()
 
-    def _seen_free(self, frame: _Comparison, unknown: float) -> NDArray[np.bool_]:
-        """Pixels (h, w) in space that single frames have seen to be free; size 0 if no frames apply.
+    def _evidence(self, frame: _Comparison, unknown: float, added: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Log odds moving : static (h, w) of space that single frames have seen to be free, and of further cues; size 0
+        for none.
 
         ``unknown``: share of the measurements in space unknown to the map.
         """
         if not (older := self.memory.free_space_frames(frame.timestamp, unknown)):
-            return NONE
+            return added
         gap = np.float32(MAX_GAP) * noise_threshold(self.sensor, frame.sigma)
-        return self.memory.seen_free(frame.level, frame.T_world_camera, gap, older)
+        free = self.memory.seen_free(frame.level, frame.T_world_camera, gap, older)
+        seen = np.float32(2 * MAX_LOG_ODDS) * free  # overrules the map
+        return seen if added.size == 0 else seen + added
 
     def _segments(
         self,

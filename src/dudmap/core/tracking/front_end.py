@@ -1,5 +1,6 @@
 """Alternating registration and labelling of a frame (thesis algorithm 4)."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.backends.cpu.exposure import LARGE_GAIN
 from dudmap.core.backends.median import median
-from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.cue import Cue
+from dudmap.core.dynamics.detector import NONE, DynamicDetector
 from dudmap.core.dynamics.dominant_motion import AGREED, exceeds_noise_share
 from dudmap.core.dynamics.image_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels
@@ -43,6 +45,7 @@ class FrontEnd(Stateful):
         motion: Velocity of the camera.
         monitor: Provides the residuals of the previous frames.
         color_motion: Registers the colours of a frame with the camera's motion.
+        cues: Further evidence of motion.
 
     Attributes:
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
@@ -59,7 +62,9 @@ class FrontEnd(Stateful):
         motion: MotionModel,
         monitor: QualityMonitor,
         color_motion: ColorMotion,
+        cues: Sequence[Cue] = (),
     ) -> None:
+        self.cues = cues
         self.config = config
         self.tracker = tracker
         distances_only = config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
@@ -278,14 +283,17 @@ class FrontEnd(Stateful):
         that fits at an indistinguishable pose is static.
         """
         with view.timer("label"):
+            T_world_camera = self._by_distances(volume, view, prediction, tracking)
+            added = [cue.log_odds(volume, view, T_world_camera) for cue in self.cues]
             labels = self.detector.detect(
                 volume,
                 view.labelled,
-                self._by_distances(volume, view, prediction, tracking),
+                T_world_camera,
                 view.timestamp,
                 view.segmentation,
                 prediction.moving,
                 tracking.exposure,
+                np.asarray(sum(added), np.float32) if added else NONE,
             )
             if view.without_image:
                 labels = replace(labels, hidden=None)

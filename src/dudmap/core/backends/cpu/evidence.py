@@ -153,7 +153,7 @@ def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tol
 
 @exact
 def moving_pixels(
-    depth, distance, occupancy, sigma, tolerance, seen_free, offset, slope, noise, rules, dynamic, seeds, probability
+    depth, distance, occupancy, sigma, tolerance, added, offset, slope, noise, rules, dynamic, seeds, probability
 ):  # fmt: skip
     """Pixels that move, alone or in regions that grow from them over the surface.
 
@@ -164,7 +164,7 @@ def moving_pixels(
 
     Args:
         depth, distance, occupancy, sigma, tolerance: As for ``weigh_readings``.
-        seen_free: (h, w) bool, pixels in space that single frames observed as free; of size 0 for none.
+        added: (h, w) float32, further log odds moving : static; of size 0 for none.
         offset, slope: Float64 and float32, as in ``Mixture.coefficients``.
         noise: NoiseParameters, all float32.
         rules: RegionRules.
@@ -172,7 +172,7 @@ def moving_pixels(
         probability: (h, w) float32 out, static probability of the mean field.
     """
     h, w = depth.shape
-    limit, seen = np.float32(rules.limit), seen_free.size > 0
+    limit = np.float32(rules.limit)
     odds = np.zeros((h, w), np.float32)
     for v in range(h):
         for u in range(w):
@@ -180,8 +180,10 @@ def moving_pixels(
                 s = sigma[v, u]
                 least = noise_limit(s, noise.floor, noise.sigmas)
                 odds[v, u] = surface_log_odds(distance[v, u], s, least, offset, slope, limit)
-            if occupancy[v, u] == FREE or (seen and seen_free[v, u]):
+            if occupancy[v, u] == FREE:
                 odds[v, u] = -limit
+            if added.size > 0:
+                odds[v, u] = min(max(odds[v, u] - added[v, u], -limit), limit)
     smoothed = mean_field(odds, depth, tolerance, rules.coupling, rules.sweeps)
     for v in range(h):
         for u in range(w):
