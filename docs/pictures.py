@@ -95,7 +95,7 @@ def labels() -> Figure:
     for index in range(len(sequence)):
         result = slam.process(sequence[index])
         share = float(sequence.mask(index).mean())
-        if result.labels is not None and result.labels.mixture is not None and share > coverage:
+        if result._labels is not None and result._labels.mixture is not None and share > coverage:
             best, coverage = (index, result), share
     assert best is not None
     index, result = best
@@ -103,7 +103,7 @@ def labels() -> Figure:
 
 
 def _draw_labels(color: NDArray[np.uint8], true_mask: NDArray[np.bool_], result: FrameResult) -> Figure:
-    found = result.labels
+    found = result._labels
     assert found is not None
     assert found.mixture is not None
     figure = Figure(figsize=(10.5, 6.4), layout="constrained")

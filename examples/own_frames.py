@@ -12,4 +12,4 @@ for number in range(5):
     shade = 128 + 60 * np.sin(u / 7) * np.sin(v / 9)
     rgb = np.repeat(shade[..., None], 3, axis=2).astype(np.uint8)
     result = slam.process(depth=z.astype(np.float32), rgb=rgb, timestamp=number / 30)
-    print(result.timestamp, result.state, "fused" if result.fused else "redundant")
+    print(result.timestamp, result.status, "fused" if result.fused else "redundant")

@@ -1,6 +1,5 @@
 """Fake of ``dudmap.core.slam.Slam`` with scripted results, for tests of the pipeline and the command line."""
 
-from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -9,7 +8,8 @@ import numpy as np
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.core.verdict import ACCEPTED, Verdict
+from dudmap.core.result import FrameResult, Status
+from dudmap.core.verdict import Outcome, Verdict
 from recordings import HEIGHT, WIDTH
 
 TRIANGLE = Mesh(
@@ -20,32 +20,19 @@ TRIANGLE = Mesh(
 )
 
 
-@dataclass
-class FakeResult:
-    timestamp: float
-    state: str = "tracked"
-    lost_reason: str = ""
-    T_world_camera: np.ndarray | None = None
-    fused: bool = True
-    skipped_similar: bool = False
-    relocalized: bool = False
-    corrected: bool = False
-    blind: bool = False
-    colorless: bool = False
-    submap: int = 0
-    uncertain: str = ""
-    calibrated: bool = False
-    rejected: str = ""
-    repeats: str = ""
-    verdict: Verdict = ACCEPTED
-    unobservable: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))
-    dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
-    dynamic_share: float = 0.0
-    residuals: np.ndarray = field(default_factory=lambda: np.full((HEIGHT // 2, WIDTH // 2), 0.01, np.float32))
-    labels: None = None
-    tracking: None = None
-    movers: tuple = ()
-    timings: dict = field(default_factory=lambda: {"track": 2.0})
+def fake_result(timestamp, T_world_camera=None, reason="", name="", mask=None, share=0.0):
+    """A frame tracked at a pose (4, 4) or lost, with a failed check."""
+    return FrameResult(
+        timestamp,
+        Status.LOST if T_world_camera is None else Status.TRACKED,
+        T_world_camera,
+        None,
+        Verdict((Outcome(name, 1.0, 0.0, reason),) if reason else ()),
+        dynamic_mask=np.zeros((HEIGHT, WIDTH), bool) if mask is None else mask,
+        dynamic_share=share,
+        residuals=np.full((HEIGHT // 2, WIDTH // 2), 0.01, np.float32),
+        timings={"track": 2.0},
+    )
 
 
 class FakeVolume:
@@ -117,13 +104,11 @@ class FakeSlam:
         if isinstance(event, BaseException):
             raise event
         if event == "lost":
-            return FakeResult(frame.timestamp, "lost", "too few inliers", fused=False)
+            return fake_result(frame.timestamp, reason="too few inliers", name="overlap")
         T = np.eye(4)
         T[0, 3] = 0.01 * index
         self.poses.append((frame.timestamp, T))
         mask = np.zeros((HEIGHT, WIDTH), bool)
         mask[:24, :32] = True
-        return FakeResult(
-            frame.timestamp, T_world_camera=T, fused=event != "similar", skipped_similar=event == "similar",
-            dynamic_mask=mask, dynamic_share=0.25,
-        )  # fmt: skip
+        similar = ("the map has the content of the frame", "redundant") if event == "similar" else ("", "")
+        return fake_result(frame.timestamp, T, *similar, mask, 0.25)

@@ -8,7 +8,7 @@ from dudmap.app.pipeline.frame_source import FrameRead
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
-from fake_slam import FakeResult
+from fake_slam import fake_result
 from run_folders import CAMERA
 from wavy_wall import CAMERA as WALL_CAMERA
 from wavy_wall import CONSTANT, wall
@@ -31,4 +31,4 @@ class GrowingMap:
 
     def step(self, k):
         self.volume.integrate(wall(1.5, k), np.eye(4))
-        return FakeResult(float(k), T_world_camera=np.eye(4), dynamic_mask=np.zeros(SIZE, bool))
+        return fake_result(float(k), np.eye(4), mask=np.zeros(SIZE, bool))

@@ -28,15 +28,15 @@ def test_a_system_says_once_that_it_is_lost(caplog):
     for number in range(5):
         frame = wall(1.5, seed=number)
         depth = np.zeros_like(frame.depth) if number > 2 else frame.depth
-        state = slam.process(Frame(number / 30, depth, frame.color)).state
+        state = slam.process(Frame(number / 30, depth, frame.color)).status
     assert state == "lost"
     assert [record.levelname for record in caplog.records if record.name.startswith("dudmap")] == ["WARNING"]
     assert caplog.messages[-1].startswith("0.100 s: lost, ")
 
 
-def result(time, state="tracked", **others):
-    nothing = {"rejected": "", "lost_reason": "", "submap": 0, "relocalized": False, "corrected": False}
-    return SimpleNamespace(timestamp=time, state=state, **(nothing | {"tracking": "of the map"} | others))
+def result(time, status="tracked", *, reason="", events=(), submap=0):
+    verdict = SimpleNamespace(reason=reason)
+    return SimpleNamespace(timestamp=time, status=status, verdict=verdict, events=events, submap=submap)
 
 
 @pytest.mark.parametrize(
@@ -44,13 +44,13 @@ def result(time, state="tracked", **others):
     [
         ({}, "tracked", []),
         ({}, "lost", ["2.000 s: tracked again"]),
-        ({"relocalized": True}, "lost", ["2.000 s: tracked again at a known place of map 1"]),
-        ({"submap": 1, "tracking": None}, "lost", ["2.000 s: map 2 begins"]),
-        ({"corrected": True}, "tracked", ["2.000 s: a loop is closed"]),
-        ({"corrected": True, "tracking": None}, "tracked", ["2.000 s: the young map is begun again"]),
-        ({"state": "lost", "lost_reason": "why"}, "tracked", ["2.000 s: lost, why"]),
-        ({"state": "lost", "lost_reason": "why"}, "lost", []),
-        ({"state": "lost", "rejected": "time", "lost_reason": "old"}, "lost", ["2.000 s: frame ignored, old"]),
+        ({"events": ["relocalized"]}, "lost", ["2.000 s: tracked again at a known place of map 1"]),
+        ({"submap": 1, "events": ["started"]}, "lost", ["2.000 s: map 2 begins"]),
+        ({"events": ["corrected"]}, "tracked", ["2.000 s: a loop is closed"]),
+        ({"events": ["started", "corrected"]}, "tracked", ["2.000 s: the young map is begun again"]),
+        ({"status": "lost", "reason": "why"}, "tracked", ["2.000 s: lost, why"]),
+        ({"status": "lost", "reason": "why"}, "lost", []),
+        ({"status": "rejected", "reason": "old"}, "lost", ["2.000 s: frame ignored, old"]),
     ],
 )
 def test_what_changes_is_said(frame, was, said, caplog):

@@ -66,7 +66,7 @@ def outcome(slam, results):
     """Results of a system: poses, masks and mesh."""
     mesh = slam.volume.extract_mesh()
     return [
-        *(result.state for result in results),
+        *(result.status for result in results),
         *(result.T_world_camera for result in results),
         *(result.dynamic_mask for result in results),
         *(mover.points for result in results for mover in result.movers),

@@ -74,7 +74,6 @@ INSIDE = {
     "RegistrationHistory",
     "Segmentation",
     "Mixture",
-    "Verdict",
     "Observation",
     "Level",
     "Scalar",
@@ -118,7 +117,7 @@ def test_arrays_give_the_same_result_as_frames():
         found = other.process(depth=frame.depth, **arrays)
         millimetres = scaled.process(depth=np.rint(1000 * frame.depth).astype(np.uint16), **arrays)
         for result in (found, millimetres):
-            assert result.state == expected.state
+            assert result.status == expected.status
             if expected.T_world_camera is not None:
                 np.testing.assert_array_equal(result.T_world_camera, expected.T_world_camera)
 

@@ -66,7 +66,7 @@ def test_a_scaled_scene_is_tracked_as_a_room(size: float):
     for factor in (1.0, size):
         slam, frames, truth = frames_of(factor, movers=("person",))
         found = [slam.process(frame) for frame in frames]
-        assert [result.state for result in found] == ["tracked"] * len(frames)
+        assert [result.status for result in found] == ["tracked"] * len(frames)
         poses = np.array([result.T_world_camera for result in found])
         positions = poses[:, :3, 3] / factor
         error = np.linalg.norm(positions - truth / factor, axis=1)

@@ -34,10 +34,10 @@ def test_a_repeated_frame_has_the_pose_of_the_one_it_repeats(recording):
     for frame in frames[:8]:
         results.append(slam.process(frame))
         results.append(slam.process(replace(frame, timestamp=frame.timestamp + 1 / 30)))
-    assert [result.state for result in results] == ["tracked", "repeated"] * 8
-    assert not any(result.fused or result.skipped_similar for result in results[1::2])
+    assert [result.status for result in results] == ["tracked", "repeated"] * 8
+    assert not any(result.fused or "redundant" in result.verdict for result in results[1::2])
     for first, again in zip(results[::2], results[1::2], strict=True):
-        assert again.repeats == "frame"
+        assert "frame_repeats" in again.verdict
         assert np.array_equal(first.T_world_camera, again.T_world_camera)
         assert np.array_equal(first.dynamic_mask, again.dynamic_mask)
     assert len(slam.trajectory) == 16
@@ -51,8 +51,11 @@ def test_where_depth_alone_repeats_the_pose_is_interpolated(recording):
     late = [replace(frames[k], depth=frames[k - k % 2].depth) for k in range(len(frames))]
     slam = Slam(CAMERA, CONFIG)
     results = [slam.process(frame) for frame in late]
-    assert [result.repeats for result in results] == ["", "depth"] * 8
-    assert all(result.state == ("repeated" if result.repeats else "tracked") for result in results)
+    assert ["depth_repeats" in result.verdict for result in results] == [False, True] * 8
+    assert [result.status for result in results] == ["tracked", "repeated"] * 8
+    assert all(
+        np.trace(b.covariance) > np.trace(a.covariance) for a, b in zip(results[::2], results[1::2], strict=True)
+    )
     errors = off(slam.trajectory, [frame.timestamp for frame in frames], truth)
     step = np.median(np.linalg.norm(np.diff(truth[::2, :3, 3], axis=0), axis=1))
     assert errors[2:-1].max() < 0.15 * np.linalg.norm(truth[-1, :3, 3] - truth[0, :3, 3]), errors
@@ -64,15 +67,15 @@ def test_a_sensor_that_hangs_is_not_believed_for_long(recording, what):
     frames, _ = recording
     slam = Slam(CAMERA, CONFIG)
     for frame in frames[:4]:
-        assert slam.process(frame).state == "tracked"
+        assert slam.process(frame).status == "tracked"
     old = {name: getattr(frames[3], name) for name in what}
     frozen = [slam.process(replace(frame, **old)) for frame in frames[4:12]]
-    states = [result.state for result in frozen]
+    states = [result.status for result in frozen]
     assert states == sorted(states, reverse=True)  # repeated first, lost then
     assert set(states) == {"repeated", "lost"}
-    assert "the sensor hangs" in frozen[-1].lost_reason
-    assert slam.process(replace(frames[11], timestamp=frames[11].timestamp + 0.03, **old)).state == "lost"
-    assert slam.process(frames[12]).state == "tracked"
+    assert "the sensor hangs" in frozen[-1].reasons[0]
+    assert slam.process(replace(frames[11], timestamp=frames[11].timestamp + 0.03, **old)).status == "lost"
+    assert slam.process(frames[12]).status == "tracked"
 
 
 def test_a_frame_that_arrives_twice_with_one_stamp_has_one_pose(recording):
@@ -80,8 +83,8 @@ def test_a_frame_that_arrives_twice_with_one_stamp_has_one_pose(recording):
     slam = Slam(CAMERA, CONFIG)
     results = [slam.process(frame) for frame in (frames[0], frames[1], frames[1])]
     results.append(slam.process(replace(frames[1], timestamp=frames[1].timestamp + 1 / 30)))
-    assert [result.rejected for result in results] == ["", "", "duplicate", ""]
-    assert [result.state for result in results] == ["tracked", "tracked", "lost", "repeated"]
+    assert ["duplicate" in result.verdict for result in results] == [False, False, True, False]
+    assert [result.status for result in results] == ["tracked", "tracked", "rejected", "repeated"]
     assert len(slam.trajectory) == 3
 
 
@@ -92,7 +95,7 @@ def test_a_frame_that_repeats_a_lost_one_is_lost(recording):
     dark = replace(frames[1], depth=np.where(frames[1].depth > 0, np.float32(0.25), 0).astype(np.float32))
     first = slam.process(dark)
     again = slam.process(replace(dark, timestamp=dark.timestamp + 1 / 30))
-    assert first.state == again.state == "lost"
-    assert again.lost_reason == first.lost_reason
-    assert again.repeats == "frame"
+    assert first.status == again.status == "lost"
+    assert again.reasons[0] == first.reasons[0]
+    assert "frame_repeats" in again.verdict
     assert len(slam.trajectory) == 1

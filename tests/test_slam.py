@@ -62,7 +62,7 @@ def test_the_stages_make_up_the_time_of_a_frame(followed):
 
 def test_a_static_room_is_followed(recording, followed):
     (sequence, frames), (slam, results, _) = recording, followed
-    assert {result.state for result in results} == {"tracked"}
+    assert {result.status for result in results} == {"tracked"}
     assert share(sequence, results) < LIMIT
     assert np.mean([result.dynamic_share for result in results]) < 0.05
     assert np.array_equal(slam.trajectory.timestamps, [frame.timestamp for frame in frames])
@@ -76,7 +76,7 @@ def test_a_map_is_exposed_as_usual_though_the_camera_begins_in_the_dark(recordin
     (sequence, frames), (_, usual, _) = recording, followed
     slam, dark = Slam(sequence.camera), replace(frames[0], color=(0.12 * frames[0].color).astype(np.uint8))
     results = [slam.process(frame) for frame in (dark, *frames[1:4])]
-    gains = [result.tracking.exposure[0] for result in results[1:]]
+    gains = [result._tracking.exposure[0] for result in results[1:]]
     assert 0.5 < min(gains) <= max(gains) < 2  # a map of the dark frame would have 0.12
     for result, other in zip(results[1:], usual[1:], strict=False):
         assert np.linalg.norm((result.T_world_camera - other.T_world_camera)[:3, 3]) < 0.005
@@ -98,7 +98,7 @@ def test_every_part_can_be_switched(recording, assignments):
     sequence, frames = recording
     slam = Slam(sequence.camera, Config().override(assignments))
     results = [slam.process(frame) for frame in frames[:14]]
-    assert all(result.state == "tracked" for result in results)
+    assert all(result.status == "tracked" for result in results)
     assert share(sequence, results) < LIMIT
 
 
@@ -110,11 +110,11 @@ def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recordin
     before = slam.volume.num_blocks
     blank = Frame(frames[10].timestamp, np.zeros_like(frames[10].depth), frames[10].color)
     result = slam.process(blank)
-    assert (result.state, result.fused, result.T_world_camera) == ("lost", False, None)
-    assert result.lost_reason
+    assert (result.status, result.fused, result.T_world_camera) == ("lost", False, None)
+    assert result.verdict.reason
     assert slam.volume.num_blocks == before
     again = slam.process(frames[11])
-    assert again.state == "tracked"
+    assert again.status == "tracked"
     assert len(slam.trajectory) == 11
 
 
@@ -139,7 +139,7 @@ def test_a_camera_that_is_blinded_goes_on_by_distances_and_fuses_nothing(recordi
     before = slam.volume.num_blocks
     for frame in frames[14:18]:
         results.append(slam.process(replace(frame, color=np.full_like(frame.color, grey))))
-    assert all(result.state == "tracked" for result in results), [result.lost_reason for result in results]
+    assert all(result.status == "tracked" for result in results), [result.verdict.reason for result in results]
     assert [(result.blind, result.fused) for result in results[14:]] == [(True, False)] * 4
     assert slam.volume.num_blocks == before
     assert not slam.predictor.image_motion.active  # the last image with something to see was taken from elsewhere
@@ -155,7 +155,7 @@ def test_a_turn_that_no_prediction_expects_is_followed():
     predict = slam.motion.predict
     slam.motion.predict = lambda timestamp: predict(timestamp) @ se3.exp(np.array([0, 0, 0, 0, np.radians(6.0), 0]))
     results.append(slam.process(sequence[13]))
-    assert results[-1].state == "tracked", results[-1].lost_reason
+    assert results[-1].status == "tracked", results[-1].verdict.reason
     assert share(sequence, results) < LIMIT
 
 
@@ -167,7 +167,7 @@ def test_another_room_is_never_taken_for_this_one(recording):
     other = synthetic.sequence("corridor", movers=(), frames=3, camera=SMALL, seed=7, noise="none")
     shifted = Frame(frames[10].timestamp, other[0].depth, other[0].color)
     result = slam.process(shifted)
-    assert result.state == "lost"
+    assert result.status == "lost"
     assert not result.fused
 
 
@@ -175,7 +175,7 @@ def test_nothing_to_start_from_is_lost():
     slam = Slam(SMALL)
     empty = Frame(0.0, np.zeros(SMALL.shape, np.float32), np.zeros((*SMALL.shape, 3), np.uint8))
     result = slam.process(empty)
-    assert result.state == "lost"
+    assert result.status == "lost"
     assert slam.volume.is_empty
     assert len(slam.trajectory) == 0
 
@@ -184,11 +184,11 @@ def test_a_redundant_view_gets_a_pose_but_is_not_fused():
     sequence = synthetic.sequence("room", movers=(), camera_path="still", frames=24, camera=SMALL)
     slam = Slam(SMALL)
     results = [slam.process(sequence[index]) for index in range(24)]
-    redundant = [result.skipped_similar for result in results]
+    redundant = ["redundant" in result.verdict for result in results]
     assert not any(redundant[: 2 * slam.config.volume.free_after])
     assert sum(redundant) >= 4
     assert [result.fused for result in results] == [not skipped for skipped in redundant]
-    assert {result.state for result in results} == {"tracked"}
+    assert {result.status for result in results} == {"tracked"}
     assert len(slam.trajectory) == 24
 
 

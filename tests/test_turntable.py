@@ -50,7 +50,7 @@ def turning(static) -> list[FrameResult]:
 @pytest.mark.parametrize(("static", "turned"), [(FAR_AWAY, RATE * (COUNT - 1) / 30), (AROUND, 0.0)])
 def test_the_camera_moves_relative_to_what_else_is_in_view(static, turned):
     results = turning(static)
-    assert [result.state for result in results] == ["tracked"] * COUNT
+    assert [result.status for result in results] == ["tracked"] * COUNT
     first, last = results[0].T_world_camera, results[-1].T_world_camera
     assert first is not None
     assert last is not None

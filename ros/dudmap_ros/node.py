@@ -140,11 +140,11 @@ class DudmapNode(LifecycleNode):
         stamp = result.timestamp
         self.outputs["mask"].publish(ros.image(TYPES, stamp, mask, "mono8", frame))
         if result.T_world_camera is None:
-            self.get_logger().warning(f"lost: {result.lost_reason}", throttle_duration_sec=1.0)
+            self.get_logger().warning(f"lost: {result.verdict.reason}", throttle_duration_sec=1.0)
             return
         T, velocity = result.T_world_camera, self.session.slam.motion.velocity
         self.broadcaster.sendTransform(ros.transform(TYPES, stamp, T, map_frame, frame))
-        self.outputs["odometry"].publish(ros.odometry(TYPES, stamp, T, velocity, map_frame, frame))
+        self.outputs["odometry"].publish(ros.odometry(TYPES, stamp, T, result.covariance, velocity, map_frame, frame))
         movers = [{"id": mover.id, "box": mover.box} for mover in result.movers]
         self.outputs["movers"].publish(ros.mover_markers(TYPES, stamp, movers, map_frame))
         changes = self.session.watch.reported if self.session.watch is not None else []

@@ -26,7 +26,6 @@ _HOMES = {
     "FrameView": "core.tracking.frame_view",
     "GivenPoses": "app.pipeline.given_poses",
     "InternalError": "errors",
-    "Labels": "core.dynamics.masks",
     "LiveCamera": "io.cameras",
     "LoopsConfig": "config",
     "MapError": "errors",
@@ -36,6 +35,7 @@ _HOMES = {
     "MissingExtraError": "errors",
     "Mover": "core.objects.object_tracker",
     "MoversConfig": "config",
+    "Outcome": "core.verdict",
     "PreprocessConfig": "config",
     "RaycastResult": "core.backends.parameters",
     "Recording": "io.sequences",
@@ -49,13 +49,14 @@ _HOMES = {
     "SimilarityConfig": "config",
     "Slam": "core.slam",
     "StateError": "errors",
+    "Status": "core.result",
     "Storing": "app.pipeline.storing",
     "SubmapsConfig": "config",
     "ThesisConfig": "thesis_config",
     "TrackerConfig": "config",
-    "TrackingResult": "core.tracking.tracker",
     "Trajectory": "core.geometry.trajectory",
     "TsdfVolume": "core.map.volume",
+    "Verdict": "core.verdict",
     "VolumeConfig": "config",
     "export_run": "io.exporting.exporters",
     "open_sequence": "io.sequences",
@@ -86,7 +87,6 @@ __all__ = [
     "FrameView",
     "GivenPoses",
     "InternalError",
-    "Labels",
     "LiveCamera",
     "LoopsConfig",
     "MapError",
@@ -96,6 +96,7 @@ __all__ = [
     "MissingExtraError",
     "Mover",
     "MoversConfig",
+    "Outcome",
     "PreprocessConfig",
     "RaycastResult",
     "Recording",
@@ -109,13 +110,14 @@ __all__ = [
     "SimilarityConfig",
     "Slam",
     "StateError",
+    "Status",
     "Storing",
     "SubmapsConfig",
     "ThesisConfig",
     "TrackerConfig",
-    "TrackingResult",
     "Trajectory",
     "TsdfVolume",
+    "Verdict",
     "VolumeConfig",
     "__version__",
     "export_run",
@@ -149,7 +151,6 @@ if TYPE_CHECKING:
     )
     from dudmap.core.backends.parameters import MapSample, RaycastResult
     from dudmap.core.dynamics.cue import Cue
-    from dudmap.core.dynamics.masks import Labels
     from dudmap.core.frames.frame import Frame, FrameArrays
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.geometry.camera import Camera
@@ -160,10 +161,10 @@ if TYPE_CHECKING:
     from dudmap.core.objects.object_map import RigidObject
     from dudmap.core.objects.object_tracker import Mover
     from dudmap.core.places.saved_map import SavedMap
-    from dudmap.core.result import FrameResult
+    from dudmap.core.result import FrameResult, Status
     from dudmap.core.slam import Slam
     from dudmap.core.tracking.frame_view import FrameView
-    from dudmap.core.tracking.tracker import TrackingResult
+    from dudmap.core.verdict import Outcome, Verdict
     from dudmap.errors import (
         CameraError,
         ConfigError,

@@ -151,9 +151,9 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator):
         if index == FIRST - 1:
             T = results[8].T_world_camera
             before = color_error(slam, exact[8], T)
-    assert sum(result.calibrated for result in results) == 1
+    assert sum("calibrated" in result.events for result in results) == 1
     assert slam.calibration.tree() == estimator.result.tree()
-    assert all(result.state == "tracked" for result in results)
+    assert all(result.status == "tracked" for result in results)
     assert color_error(slam, exact[8], T) < 0.7 * before
 
 
@@ -161,7 +161,7 @@ def test_only_frames_since_it_is_known_that_stamps_are_late_have_poses_at_other_
     estimator.may.set()
     estimator.result = replace(Calibration.registered(SMALL), depth_late=0.02, estimated=("delay",))
     slam, frames = Slam(SMALL), recording()
-    calibrated = [slam.process(frames[index]).calibrated for index in range(FRAMES)]
+    calibrated = ["calibrated" in slam.process(frames[index]).events for index in range(FRAMES)]
     assert any(calibrated[FIRST:])
     images, stamps = slam.image_poses.Ts_world_camera, slam.trajectory.Ts_world_camera
     assert (images != stamps).any(axis=(1, 2)).tolist() == [n > calibrated.index(True) for n in range(FRAMES)]
@@ -172,5 +172,5 @@ def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estim
     faulty = recording(**UNREGISTERED)
     for config, known in ((Config(), truth_of(faulty)), (Config().override(["sensor.self_calibration=false"]), None)):
         slam = Slam(SMALL, config, calibration=known)
-        assert not any(slam.process(faulty[index]).calibrated for index in range(FIRST))
+        assert not any("calibrated" in slam.process(faulty[index]).events for index in range(FIRST))
     assert estimator.keyframes == []

@@ -158,14 +158,14 @@ def test_people_who_fill_the_view_do_not_take_a_camera_at_rest_along():
     slam = Slam(people.camera)
     results = [slam.process(people[index]) for index in range(56)]
     assert np.mean([people.mask(index).mean() for index in range(40, 56)]) > 0.7
-    assert all(result.state == "tracked" for result in results)
+    assert all(result.status == "tracked" for result in results)
     assert max(np.linalg.norm(result.T_world_camera[:3, 3]) for result in results) < 0.025
 
 
 def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     slam = Slam(crowd.camera)
     results = [slam.process(crowd[index]) for index in range(3)]
-    labels, tracked = results[2].labels, results[2].tracking
+    labels, tracked = results[2]._labels, results[2]._tracking
     view = slam.prepare(crowd[2])
     rows = np.arange(labels.dynamic.shape[0])[:, None] >= 0.2 * labels.dynamic.shape[0]
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
@@ -256,7 +256,7 @@ def test_a_second_pass_knows_what_the_first_frames_could_not():
     once = [first.process(frame) for frame in frames]
     second = Slam(people.camera, first_pass=first)
     twice = [second.process(frame) for frame in frames]
-    assert {result.state for result in twice} == {"tracked"}
+    assert {result.status for result in twice} == {"tracked"}
     assert overlap(twice[:10]) > overlap(once[:10])
     assert overlap(twice) > 0.85  # the target for people
 
@@ -334,7 +334,7 @@ def test_a_young_map_that_followed_a_crowd_begins_anew_and_its_poses_are_correct
     sequence = synthetic.sequence("room", coverage=0.7, speed=0.3, start_dynamic=True, frames=24, camera=CAMERA)
     slam, truth = Slam(CAMERA), sequence.ground_truth
     results = [slam.process(sequence[index]) for index in range(24)]
-    restarted = [result.corrected for result in results].index(True)
+    restarted = ["corrected" in result.events for result in results].index(True)
     followed = results[restarted - 1].T_world_camera
     wanted = (se3.inverse(truth.Ts_world_camera[0]) @ truth.Ts_world_camera[restarted - 1])[:3, 3]
     assert np.linalg.norm(followed[:3, 3] - wanted) > 0.05
@@ -348,4 +348,4 @@ def test_a_young_map_that_followed_a_crowd_begins_anew_and_its_poses_are_correct
 def test_a_start_without_a_crowd_is_not_corrected():
     sequence = synthetic.sequence("room", movers=("person",), start_dynamic=True, frames=15, camera=CAMERA)
     slam = Slam(CAMERA)
-    assert not any(slam.process(sequence[index]).corrected for index in range(15))
+    assert not any("corrected" in slam.process(sequence[index]).events for index in range(15))

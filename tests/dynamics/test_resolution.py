@@ -46,15 +46,15 @@ def run(width: int, height: int, label_width: int) -> Run:
     )
     slam = Slam(camera, Config().override([f"dynamics.width={label_width}"]))
     results = [slam.process(sequence[index]) for index in range(FRAMES)]
-    assert all(result.state == "tracked" for result in results)
+    assert all(result.status == "tracked" for result in results)
     assert off_course(sequence.ground_truth.Ts_world_camera, [result.T_world_camera for result in results]) < LIMIT
     view = slice((width - height * 4 // 3) // 2, (width + height * 4 // 3) // 2)
     masks = [
         cv2.resize(result.dynamic_mask[:, view].astype(np.uint8), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST) > 0
         for result in results
     ]
-    assert results[-1].labels is not None
-    label_pixel = HEIGHT / results[-1].labels.dynamic.shape[0]
+    assert results[-1]._labels is not None
+    label_pixel = HEIGHT / results[-1]._labels.dynamic.shape[0]
     return Run(np.array(masks), np.array([result.T_world_camera for result in results]), label_pixel)
 
 

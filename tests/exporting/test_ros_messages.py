@@ -33,8 +33,9 @@ def test_transform_odometry_and_path():
     assert (tf.header.frame_id, tf.child_frame_id) == ("map", "camera")
     assert ros.seconds_of(tf) == 12.25
     np.testing.assert_allclose(matrix(tf.transform.translation, tf.transform.rotation), T, atol=1e-12)
-    found = there_and_back(ros.odometry(TYPES, 1.5, T, np.arange(6.0), "map", "camera"))
+    found = there_and_back(ros.odometry(TYPES, 1.5, T, np.arange(36.0).reshape(6, 6), np.arange(6.0), "map", "camera"))
     np.testing.assert_allclose(matrix(found.pose.pose.position, found.pose.pose.orientation), T, atol=1e-12)
+    np.testing.assert_array_equal(found.pose.covariance, np.arange(36))
     assert (found.twist.twist.linear.y, found.twist.twist.angular.z) == (1, 5)
     track = there_and_back(ros.path(TYPES, 2.0, [0.5, 1.5], np.stack([np.eye(4), T]), "map"))
     assert [ros.seconds_of(pose) for pose in track.poses] == [0.5, 1.5]

@@ -77,7 +77,7 @@ class Breaks(RunObserver):
         self.device, self.number, self.seen = device, number, []
 
     def frame(self, index, read, result, ms):
-        self.seen.append((index, result.state))
+        self.seen.append((index, result.status))
         if index == self.number:
             self.device.breaks()
 

@@ -52,7 +52,7 @@ def test_a_system_is_continued_on_either_device(saved, frames, device):
     kind = KIND[device]
     assert type(slam.volume.backend) is kind
     for frame in frames[SAVED_AFTER:]:
-        assert slam.process(frame).state == "tracked"
+        assert slam.process(frame).status == "tracked"
     poses, others = (one.trajectory.Ts_world_camera for one in (whole, slam))
     assert np.array_equal(poses[:SAVED_AFTER], others[:SAVED_AFTER])
     if device != written_on:

@@ -39,7 +39,7 @@ def test_no_frame_is_lost_between_the_rests_of_an_arm(tmp_path, turn_deg, step, 
     )
     slam, truth = Slam(CAMERA, timed=timed), room.ground_truth.Ts_world_camera
     results = [slam.process(room[number]) for number in range(count)]
-    assert [(n, result.lost_reason) for n, result in enumerate(results) if result.state == "lost"] == []
+    assert [(n, result.verdict.reason) for n, result in enumerate(results) if result.status == "lost"] == []
     for result, T in zip(results, truth, strict=True):
         D = se3.inverse(se3.inverse(truth[0]) @ T) @ result.T_world_camera
         assert np.linalg.norm(D[:3, 3]) < 0.03

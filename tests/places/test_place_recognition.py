@@ -182,8 +182,8 @@ def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found():
     sequence = turned_away(sequence, 15, 40, 150.0)
     slam = Slam(sequence.camera)
     rows = errors(slam, sequence, 45)
-    assert [result.state for result, _ in rows] == ["tracked"] * 15 + ["lost"] * 25 + ["tracked"] * 5
-    assert [i for i, (result, _) in enumerate(rows) if result.relocalized] == [40]
+    assert [result.status for result, _ in rows] == ["tracked"] * 15 + ["lost"] * 25 + ["tracked"] * 5
+    assert [i for i, (result, _) in enumerate(rows) if "relocalized" in result.events] == [40]
     assert not any(result.fused for result, _ in rows[15:40])
     assert max(error for _, error in rows if error is not None) < 0.017  # of 117 mm
 
@@ -206,7 +206,7 @@ def test_a_map_of_six_frames_is_enough_to_be_found_in():
     sequence = dudmap.lab.synthetic.sequence(movers=(), frames=40, seed=1, camera=SMALL, camera_path="dolly")
     sequence = turned_away(sequence, 6, 12, 25.0)
     rows = errors(Slam(sequence.camera), sequence, 14)
-    assert all(result.state == "tracked" for result, _ in rows)
+    assert all(result.status == "tracked" for result, _ in rows)
     assert max(error for _, error in rows) < 0.015  # of 127 mm
 
 
@@ -217,11 +217,11 @@ def test_the_situations(situation):
     rows = errors(Slam(sequence.camera), sequence, 120)
     spans = sequence.parameters["covered_s"] + sequence.parameters["elsewhere_s"]
     back = int(np.searchsorted(sequence.timestamps, max(stop for _, stop in spans) + 0.15))
-    lost = [i for i, (result, _) in enumerate(rows) if result.state == "lost"]
+    lost = [i for i, (result, _) in enumerate(rows) if result.status == "lost"]
     assert lost
     if situation == "kidnapped":
         assert lost[-1] < back + 5
-        assert any(result.relocalized for result, _ in rows)
+        assert any("relocalized" in result.events for result, _ in rows)
     else:  # it is where it was: it goes on as soon as it sees, recognised or not
         assert lost[-1] < back
     assert max(error for _, error in rows if error is not None) < 0.02

@@ -109,7 +109,7 @@ def first_run(tmp_path_factory):
     recording = sequence("room", (), frames=60, seed=3, camera=CAMERA, camera_path="pan")
     slam = Slam(CAMERA, COARSE)
     for index in range(0, 60, 2):
-        assert slam.process(recording[index]).state == "tracked"
+        assert slam.process(recording[index]).status == "tracked"
     folder = tmp_path_factory.mktemp("run")
     saved(folder, slam.saved_map)
     return folder, recording.ground_truth.Ts_world_camera[0]
@@ -124,7 +124,7 @@ def errors(results, recording, T_room_world, indices):
     """Errors (m, deg) of the tracked frames' poses in the world of the first run."""
     out = []
     for index, result in zip(indices, results, strict=True):
-        if result.state == "tracked":
+        if result.status == "tracked":
             truth = se3.inverse(T_room_world) @ recording.ground_truth.Ts_world_camera[index]
             error = se3.inverse(truth) @ result.T_world_camera
             out.append((np.linalg.norm(error[:3, 3]), np.degrees(se3.rotation_angle(error))))
@@ -138,9 +138,9 @@ def test_localizing_finds_the_way_and_changes_nothing(first_run):
     words, count = loaded.volume.blocks.geometry.copy(), len(loaded.keyframes)
     slam, recording = Slam(CAMERA, COARSE, saved_map=loaded, localize=True), next_recording()
     results = [slam.process(recording[index]) for index in range(25, 40)]
-    assert results[0].state == "tracked"
-    assert results[0].relocalized
-    assert not any(result.fused or result.skipped_similar for result in results)
+    assert results[0].status == "tracked"
+    assert "relocalized" in results[0].events
+    assert not any(result.fused or "redundant" in result.verdict for result in results)
     found = errors(results, recording, T_room_world, range(25, 40))
     assert len(found) == 15
     assert found[:, 0].max() < 0.02
@@ -171,11 +171,11 @@ def test_frames_of_another_place_are_lost_until_a_submap_starts(first_run):
     slam = Slam(CAMERA, COARSE.override(["submaps.patience=0.4"]), saved_map=SavedMap.load(folder))
     recording = sequence("desk", (), frames=22, seed=1, camera=CAMERA)
     results = [slam.process(recording[index]) for index in range(22)]
-    assert {result.lost_reason for result in results if result.state == "lost"} == {
+    assert {result.verdict.reason for result in results if result.status == "lost"} == {
         "the camera has not been recognised in the saved map yet"
     }
-    assert all(result.submap == 1 for result in results if result.state == "tracked")
-    assert results[-1].state == "tracked"  # in a submap of its own, begun after submaps.patience
+    assert all(result.submap == 1 for result in results if result.status == "tracked")
+    assert results[-1].status == "tracked"  # in a submap of its own, begun after submaps.patience
     assert len(slam.maps[0][0]) == 0  # the saved map stays the main one, in whose world no pose is known
 
 
@@ -185,7 +185,7 @@ def test_a_submap_is_joined_with_the_saved_map_when_that_is_recognised(first_run
     slam = Slam(CAMERA, COARSE, saved_map=SavedMap.load(folder))
     recording = sequence("room", (), frames=240, seed=4, camera=CAMERA, camera_path="round")
     results = [slam.process(recording[index]) for index in range(110, 235)]
-    assert {0, 1} <= {result.submap for result in results if result.state == "tracked"}
+    assert {0, 1} <= {result.submap for result in results if result.status == "tracked"}
     assert list(slam.atlas.volumes) == [0]
     poses = slam.trajectory
     truth = recording.ground_truth

@@ -66,7 +66,7 @@ def test_masked_pixels_are_neither_tracked_nor_fused():
         spoiled[mask] = np.where(spoiled[mask] > 0, 0.5 + 0.05 * i, 0)  # a board that comes nearer
         result = slam.process(Frame(frame.timestamp, spoiled, frame.color), mask)
         truth = free.process(frame)
-        assert result.state == "tracked"
+        assert result.status == "tracked"
         assert result.dynamic_mask[mask].all()
         assert result.dynamic_share > 0.2
         assert np.linalg.norm(result.T_world_camera[:3, 3] - truth.T_world_camera[:3, 3]) < 0.01

@@ -23,8 +23,8 @@ def tracked():
     sequence: Any = synthetic.sequence("desk", movers=(), frames=13, noise="kinect", seed=5, camera=CAMERA)
     slam = Slam(sequence.camera, Config().override(["dynamics.start_seconds=0"]))
     result = [slam.process(sequence[n]) for n in range(13)][-1]
-    assert result.tracking is not None
-    return slam, slam.prepare(sequence[12]), result.tracking
+    assert result._tracking is not None
+    return slam, slam.prepare(sequence[12]), result._tracking
 
 
 def labelled(tracked, moving=None):

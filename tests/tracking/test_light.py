@@ -58,7 +58,7 @@ def test_no_frame_is_lost_where_the_light_changes_and_the_map_keeps_its_colours(
     room, undisturbed, without_colors, gain
 ):
     results, error, slam = run(room, gain)
-    assert [result.lost_reason for result in results if result.state == "lost"] == []
+    assert [result.verdict.reason for result in results if result.status == "lost"] == []
     told = gain == 0.1  # else hardly any grey levels are left, or many pixels are saturated
     assert error < (2 * undisturbed[1] if told else without_colors)
     assert [result.blind for result in results[DARK_FROM:DARK_TO]] == [gain < 0.1] * (DARK_TO - DARK_FROM)

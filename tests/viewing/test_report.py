@@ -23,7 +23,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError
 from dudmap.io.sequences import open_sequence
-from fake_slam import FakeResult
+from fake_slam import fake_result
 from recordings import write_recording
 from run_folders import FRAMES, stamp, wall, write_run
 
@@ -305,7 +305,7 @@ def test_kept_frames_are_evenly_spaced(tmp_path, count, known):
     read = type("Read", (), {"frame": type("F", (), {"rgb": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})})
     for index in range(count):
         mask = np.zeros((2, 2), bool)
-        observer.frame(index, read, FakeResult(float(index), dynamic_mask=mask), 1.0)
+        observer.frame(index, read, fake_result(float(index), mask=mask), 1.0)
     kept = sorted(float(re.sub(r"\.color\.jpg$", "", p.name)) for p in (tmp_path / "thumbnails").glob("*.color.jpg"))
     if number is None:
         assert min(count, NUMBER) <= len(kept) <= 2 * NUMBER

@@ -16,7 +16,7 @@ from dudmap.app.viewing.window import Window
 from dudmap.cli import app
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
-from fake_slam import FakeResult
+from fake_slam import fake_result
 from growing_map import GrowingMap, read
 from recordings import write_recording
 from run_folders import write_run
@@ -141,7 +141,7 @@ def test_the_colours_of_the_images():
 
 def test_images_are_reduced_to_a_width():
     frame = Frame(0.0, np.ones((480, 640), np.float32), np.zeros((480, 640, 3), np.uint8))
-    images = FrameImages.of(frame, FakeResult(0.0, dynamic_mask=np.zeros((480, 640), bool)))
+    images = FrameImages.of(frame, fake_result(0.0, mask=np.zeros((480, 640), bool)))
     assert images.color.shape == (240, 320, 3)
     assert images.mask.shape == images.depth.shape == (240, 320)
 

@@ -66,7 +66,12 @@ class MostDynamicFrame(RunObserver):
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Keep the frame if its dynamic share is the largest so far."""
         frame, mask = read.frame, read.true_mask
-        if isinstance(frame, FrameError) or isinstance(mask, FrameError) or mask is None or result.state == "lost":
+        if (
+            isinstance(frame, FrameError)
+            or isinstance(mask, FrameError)
+            or mask is None
+            or result.T_world_camera is None
+        ):
             return
         if mask.mean() > self._coverage:
             self._coverage, self._kept = float(mask.mean()), (frame, mask, result)

@@ -11,17 +11,18 @@ log = logging.getLogger(__name__)
 
 def log_changes(before: "FrameResult | None", result: "FrameResult") -> None:
     """Log how a frame differs from the frame ``before`` it: lost, found again, a new map, a closed loop."""
-    time, was_lost = result.timestamp, before is not None and before.state == "lost"
-    if result.rejected:
-        log.warning("%.3f s: frame ignored, %s", time, result.lost_reason)
-    elif result.state == "lost":
+    time, was_lost = result.timestamp, before is not None and before.status == "lost"
+    if result.status == "rejected":
+        log.warning("%.3f s: frame ignored, %s", time, result.verdict.reason)
+    elif result.status == "lost":
         if not was_lost:
-            log.warning("%.3f s: lost, %s", time, result.lost_reason)
+            log.warning("%.3f s: lost, %s", time, result.verdict.reason)
     elif before is not None and result.submap > before.submap:
         log.info("%.3f s: map %d begins", time, result.submap + 1)
-    elif result.relocalized:
+    elif "relocalized" in result.events:
         log.info("%.3f s: tracked again at a known place of map %d", time, result.submap + 1)
     elif was_lost:
         log.info("%.3f s: tracked again", time)
-    if result.corrected:
-        log.info("%.3f s: %s", time, "the young map is begun again" if result.tracking is None else "a loop is closed")
+    if "corrected" in result.events:
+        again = "started" in result.events
+        log.info("%.3f s: %s", time, "the young map is begun again" if again else "a loop is closed")

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import cached_property, partial
 from typing import Any, Literal
 
@@ -13,7 +14,6 @@ from dudmap.config import Config
 from dudmap.core.calibration.self_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import Labels
-from dudmap.core.frames.stream_check import Repeats
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
@@ -28,96 +28,126 @@ from dudmap.core.places.saved_map import PriorMap, SavedMap
 from dudmap.core.tracking.motion_model import GivenRole
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
-from dudmap.core.verdict import ACCEPTED, Verdict
+from dudmap.core.verdict import Verdict
+
+
+class Status(StrEnum):
+    """What became of a frame.
+
+    * TRACKED: it has a pose, by registration to the map or as the start of a map.
+    * REPEATED: its images, or its depth image, equal the frame before. It has the same pose; if only the depth repeats,
+      the predicted pose, which the trajectory interpolates once the next frame is tracked.
+    * LOST: its pose cannot be trusted.
+    * REJECTED: it is ignored for a fault of the stream, such as a wrong time stamp.
+    """
+
+    TRACKED = "tracked"
+    REPEATED = "repeated"
+    LOST = "lost"
+    REJECTED = "rejected"
+
+
+Event = Literal["started", "relocalized", "corrected", "calibrated"]
+"""Event of a frame.
+
+* started: A map starts with this frame.
+* relocalized: The pose comes from a recognised place after tracking was lost.
+* corrected: Earlier poses of the submap changed: a loop was closed, or a young map started again.
+* calibrated: A new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
+"""
+
+
+UNCERTAIN = "unobservable", "saturated"
+"""Checks that doubt pose and labels of a tracked frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
     """Result of processing one frame.
 
+    The covariance is the variance of a residual times the inverse of the Hessian of the registration. Residuals are
+    correlated, so that the variance comes from sums over blocks of pixels. Along directions that the view does not
+    observe it is the variance of the predicted motion. It holds the noise of one registration to the map as it is. It
+    contains neither errors of the map, which grow with the path (drift), nor errors of the calibration. The frame that
+    starts a map defines the world, with a covariance of 0.
+
     Attributes:
         timestamp: Time of the depth image, seconds; after a change of the clock, on the clock of the first frames.
-        state: "tracked", "lost", or "repeated" if the images, or the depth image, equal the frame before.
-        lost_reason: Names the check that failed; empty for a tracked frame.
-        rejected: Kind of stream error for which a lost frame was ignored (``frames/stream_check.py``); else empty.
-        T_world_camera: Camera pose (4, 4); None if lost. A repeated frame has the pose of the frame before. If only the
-            depth repeats, the pose is predicted; the trajectory interpolates it once the next frame is tracked.
-        fused: Whether the frame changed the map.
-        skipped_similar: Whether the frame was not fused because it is a redundant view.
+        status: What became of the frame.
+        T_world_camera: Camera pose (4, 4); None unless tracked or repeated.
+        covariance: (6, 6) of the pose's error: displacement of the camera's centre (m), then rotation about it (rad),
+            both in world axes, as in a ROS ``PoseWithCovariance``. None without a pose or with a given one.
+        verdict: Outcomes of the checks that decided on the frame.
         dynamic_mask: (H, W) bool, dynamic pixels of the recorded image.
         dynamic_share: Share of the depth measurements in the mask.
         residuals: (h, w) float32 signed distances of the measurements to the map, metres, at label resolution; NaN off
             the map.
-        labels: Full result of the labelling; None if it did not run.
-        tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
-        relocalized: Whether the pose comes from a recognised place after tracking was lost.
-        find_movers: Computes the moving objects; None if there are none.
         submap: Number of the submap of the pose, 0 the first.
-        corrected: Whether this frame closed a loop, which changed all earlier poses of the submap.
-        blind: Whether only the distances determine the pose, and the frame is not fused: the image is textureless,
-            missing in a map with colours, or rejected after a change of the light.
-        colorless: Whether the frame has no colour image, so that only the distances determine the pose.
-        calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
-        uncertain: Reason why pose and labels of a tracked frame may be wrong, else empty. Such a frame is not fused.
-        unobservable: (k, 6) twists, camera axes, that the view does not observe and along which the pose follows the
-            prediction (``core/tracking/observability.py``). Such a frame is ``uncertain``.
-        repeats: Part that equals the frame before bit for bit: the whole ``frame``, its ``depth`` or its ``color``. A
-            frame with repeated colour is tracked by its distances alone (``blind``).
-        verdict: Outcomes of the checks that decided on the frame (``tracking/checks.py``); empty without registration.
+        events: Events of the frame.
     """
 
     timestamp: float
-    state: Literal["tracked", "lost", "repeated"]
-    lost_reason: str
+    status: Status
     T_world_camera: NDArray[np.float64] | None
-    fused: bool
-    skipped_similar: bool
+    covariance: NDArray[np.float64] | None
+    verdict: Verdict
     dynamic_mask: NDArray[np.bool_]
     dynamic_share: float
     residuals: NDArray[np.float32]
-    labels: Labels | None
-    tracking: TrackingResult | None
     timings: dict[str, float] = field(default_factory=dict)
-    relocalized: bool = False
-    find_movers: Callable[[], tuple[Mover, ...]] | None = None
     submap: int = 0
-    corrected: bool = False
-    blind: bool = False
-    colorless: bool = False
-    uncertain: str = ""
-    calibrated: bool = False
-    rejected: str = ""
-    repeats: Repeats = ""
-    verdict: Verdict = ACCEPTED
-    unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+    events: tuple[Event, ...] = ()
+    _labels: Labels | None = None
+    _tracking: TrackingResult | None = None
+    _find_movers: Callable[[], tuple[Mover, ...]] | None = None
 
     def __repr__(self) -> str:
-        """The state without the images."""
-        reason = f": {self.lost_reason}" if self.lost_reason else ", fused" if self.fused else ""
-        return f"FrameResult({self.timestamp:.6f} s, {self.state}{reason}, {self.dynamic_share:.1%} dynamic)"
+        """The status without the images."""
+        reason = f": {self.verdict.reason}" if self.verdict.reason else ", fused" if self.fused else ""
+        return f"FrameResult({self.timestamp:.6f} s, {self.status}{reason}, {self.dynamic_share:.1%} dynamic)"
 
-    def without_details(self) -> "FrameResult":
-        """Pose and mask alone, for a frame that repeats this one."""
-        return FrameResult(
-            self.timestamp, self.state, self.lost_reason, self.T_world_camera, fused=False, skipped_similar=False,
-            dynamic_mask=self.dynamic_mask, dynamic_share=self.dynamic_share, residuals=self.residuals, labels=None,
-            tracking=None, timings=self.timings, submap=self.submap, rejected=self.rejected, repeats=self.repeats,
-            unobservable=self.unobservable,
-        )  # fmt: skip
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the frame is lost, rejected or repeated, or is tracked and not fused; the first reason decided."""
+        return tuple(outcome.reason for outcome in self.verdict.failed)
+
+    @property
+    def fused(self) -> bool:
+        """Whether the map takes the static pixels of the frame; a map younger than 0.4 s may hold them back."""
+        return self.status is Status.TRACKED and self.verdict.accepted
+
+    @property
+    def blind(self) -> bool:
+        """Whether only the distances determine the pose, because the image carries no information."""
+        return "blind" in self.verdict or "color_repeats" in self.verdict
+
+    @property
+    def uncertain(self) -> str:
+        """Reason why pose and labels of a tracked frame may be wrong; empty if there is none."""
+        return next((one.reason for one in self.verdict.failed if one.name in UNCERTAIN), "")
+
+    @property
+    def histogram(self) -> NDArray[np.int64] | None:
+        """(BINS,) counts of the residuals in standard deviations of a measurement; None if no pixel was labelled."""
+        return None if self._labels is None else self._labels.histogram
 
     @cached_property
     def movers(self) -> tuple[Mover, ...]:
         """Moving objects, by id; none in a lost frame. They are computed at the first access."""
-        return () if self.find_movers is None else deepcopy(self.find_movers())
+        return () if self._find_movers is None else deepcopy(self._find_movers())
+
+    def without_details(self) -> "FrameResult":
+        """Pose and mask alone, for a frame that repeats this one."""
+        return replace(self, events=(), _labels=None, _tracking=None, _find_movers=None)
 
     def detached(self) -> "FrameResult":
         """Copy with copies of all arrays, which the caller may keep and change."""
-        return replace(deepcopy(replace(self, find_movers=None)), find_movers=self.find_movers)
+        return replace(deepcopy(replace(self, _find_movers=None)), _find_movers=self._find_movers)
 
     def __getstate__(self) -> dict[str, Any]:
         """State for pickling and copying, with the moving objects."""
-        return vars(self) | {"find_movers": partial(tuple, self.movers)}
+        return vars(self) | {"_find_movers": partial(tuple, self.movers)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from dudmap.core.places.loop_verification import LoopQuery
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalization, Relocalizer
 from dudmap.core.places.saved_map import SavedMap
-from dudmap.core.result import FrameResult, SlamArguments, SlamResults
+from dudmap.core.result import Event, FrameResult, SlamArguments, SlamResults, Status
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
@@ -44,7 +44,7 @@ from dudmap.core.tracking.motion_model import GivenRole, MotionModel
 from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
-from dudmap.core.verdict import Verdict
+from dudmap.core.verdict import Outcome, Verdict
 from dudmap.core.young_map import StartFrame, YoungMap
 
 
@@ -178,7 +178,7 @@ class Slam(SlamResults, Stateful):
 
         Args:
             frame: Depth and colour, in order of arrival, prepared or not. A frame with an impossible time stamp or
-                image is lost and changes nothing (``FrameResult.rejected``).
+                image is rejected and changes nothing.
             dynamic_mask: (H, W) bool, known dynamic pixels, excluded from all registrations and from the map.
             T_world_camera: (4, 4) given pose of the depth camera, see ``poses``; metres.
             arrays: ``depth``, ``timestamp`` and ``rgb`` instead of a frame. ``depth`` (H, W) is float32 in metres or
@@ -203,7 +203,7 @@ class Slam(SlamResults, Stateful):
             arrival = self.stream.judge(view.observation)
             arrival = self.motion.verdict if arrival.accepted else arrival
         if not arrival.accepted:
-            return self._reject(view, arrival)
+            return self._result(view, None, np.zeros_like(view.observation.readings), arrival, Status.REJECTED)
         view = self._resumed(view)
         if self.stream.repeats in ("frame", "depth") and self._last is not None:
             return self._repeat(view, self._last)
@@ -228,21 +228,29 @@ class Slam(SlamResults, Stateful):
         if relocalized is not None:
             estimate, verdict = relocalized.estimate, relocalized.verdict
         if not verdict.accepted:
-            return replace(self._lose(view, estimate, verdict.reason), verdict=verdict)
+            return self._lose(view, estimate, verdict)
         view = registered if relocalized is None else self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
+        covariance = estimate.tracking.covariance_with(self.motion.drift(view.timestamp))
         self._accept(view, estimate)
-        uncertain = estimate.doubt(view)
-        fuse = self._adds_information(view, estimate, uncertain)
+        verdict += self._fusion_verdict(view, estimate)
         mask = estimate.dynamic_mask(view)
-        self.mapper.extend(view, estimate, mask, fuse=fuse)
-        T_world_camera, corrected = self._close_loop(view, estimate, mask)
-        corrected |= restarted
+        self.mapper.extend(view, estimate, mask, fuse=verdict.accepted)
+        correction = self._close_loop(view, estimate, mask)
+        T_world_camera = estimate.T_world_camera
+        if correction is not None:
+            T_world_camera, turn = correction @ T_world_camera, np.kron(np.eye(2), correction[:3, :3])
+            covariance = turn @ covariance @ turn.T
+        corrected = restarted or correction is not None
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
+        happened: dict[Event, bool] = {
+            "relocalized": relocalized is not None, "corrected": corrected, "calibrated": calibrated,
+        }  # fmt: skip
         return self._result(
-            view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, find_movers=self.objects.update(view, estimate), uncertain=uncertain,
-            calibrated=calibrated, verdict=verdict,
+            view, estimate, mask, verdict, T_world_camera=T_world_camera,
+            covariance=None if self.motion.is_given else covariance,
+            events=tuple(event for event, has in happened.items() if has),
+            _find_movers=self.objects.update(view, estimate),
         )  # fmt: skip
 
     def _rectified(self, view: FrameView) -> FrameView:
@@ -254,28 +262,33 @@ class Slam(SlamResults, Stateful):
             known = None if view.known_dynamic is None else view.known_dynamic.reshape(-1)[observation.sources]
             return replace(FrameView.of(observation, self.config, self.detector), timer=view.timer, known_dynamic=known)
 
-    def _reject(self, view: FrameView, verdict: Verdict) -> FrameResult:
-        nothing = np.zeros_like(view.observation.readings)
-        return self._result(view, None, nothing, reason=verdict.reason, rejected=verdict.failed[0].name)
-
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the frame before, or its depth.
 
         It has the pose of the repeated frame, or with new colours the predicted pose, which is interpolated once the
         next frame is tracked. Neither is used longer than predictions are valid.
         """
-        repeats, time = self.stream.repeats, view.timestamp
-        result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
-        if last.T_world_camera is not None and self.motion.drift(time) > MAX_DRIFT:
-            what = "the depth image has" if repeats == "depth" else "both images have"
-            reason = f"{what} repeated for {time - self.motion.timestamp:.2f} s: the sensor hangs"
-            result = replace(result, state="lost", lost_reason=reason, T_world_camera=None)
-        elif last.T_world_camera is not None:
-            T_world_camera = self.motion.repeated(time, last.T_world_camera, depth_only=repeats == "depth")
-            result = replace(result, state="repeated", T_world_camera=T_world_camera)
-            self.atlas.add_pose(time, T_world_camera, "depth" if "depth" in (repeats, last.repeats) else "frame")
-        self._last = result
-        return result
+        depth_only, time, drift = self.stream.repeats == "depth", view.timestamp, self.motion.drift(view.timestamp)
+        images = "the depth image" if depth_only else "both images"
+        repeated = Outcome.of(f"{self.stream.repeats}_repeats", 1, 0, f"the frame has {images} of the frame before")
+        reasons, status, T_world_camera, covariance = (), Status.REPEATED, last.T_world_camera, last.covariance
+        if T_world_camera is None:
+            reasons, status = last.verdict.failed[:1], last.status
+        elif drift > MAX_DRIFT:
+            hangs = f"{images} repeat for {time - self.motion.timestamp:.2f} s: the sensor hangs"
+            reasons, status = (Outcome.of("repeated_drift_m", drift, MAX_DRIFT, hangs),), Status.LOST
+            T_world_camera = covariance = None
+        else:
+            T_world_camera = self.motion.repeated(time, T_world_camera, depth_only=depth_only)
+            if covariance is not None and depth_only:
+                covariance = covariance + np.diag(np.repeat((drift, drift / self.atlas.unit), 3) ** 2)
+            depth_only = depth_only or "depth_repeats" in last.verdict
+            self.atlas.add_pose(time, T_world_camera, "depth" if depth_only else "frame")
+        self._last = replace(
+            last, timestamp=time, status=status, T_world_camera=T_world_camera, covariance=covariance,
+            verdict=Verdict((*reasons, repeated)), timings=view.timer.timings,
+        )  # fmt: skip
+        return self._last
 
     def _resumed(self, view: FrameView) -> FrameView:
         """The frame on the clock of the first frames; a long pause invalidates velocity and place."""
@@ -293,7 +306,7 @@ class Slam(SlamResults, Stateful):
         self.young_map.textureless = view.textureless
         verdict = self.young_map.verdict(view, mask)
         if not verdict.accepted:
-            return self._result(view, None, mask, reason=verdict.reason, verdict=verdict)
+            return self._result(view, None, mask, verdict, Status.LOST)
         self.motion.restart(view.timestamp, estimate.T_world_camera)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
@@ -304,7 +317,10 @@ class Slam(SlamResults, Stateful):
             self.predictor.image_motion.start(view.timestamp)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
+        return self._result(
+            view, None, mask, verdict, T_world_camera=estimate.T_world_camera, covariance=np.zeros((6, 6)),
+            events=("started",),
+        )  # fmt: skip
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> Relocalization | None:
         """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
@@ -322,13 +338,13 @@ class Slam(SlamResults, Stateful):
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
         return found
 
-    def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
+    def _lose(self, view: FrameView, estimate: PoseEstimate, verdict: Verdict) -> FrameResult:
         self.relocalizer.lost(view.timestamp, mostly_dynamic=self.predictor.mostly_dynamic)
         self.front_end.lose(view.timestamp)
         self.color_calibration.interrupt()
         if self.relocalizer.start_verdict(view).accepted:
             return self._start_submap(replace(view, blind=False))
-        return self._result(view, estimate, estimate.dynamic_mask(view), reason=reason)
+        return self._result(view, estimate, estimate.dynamic_mask(view), verdict, Status.LOST)
 
     def _start_submap(self, view: FrameView) -> FrameResult:
         self.atlas.start_submap()
@@ -385,30 +401,34 @@ class Slam(SlamResults, Stateful):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _adds_information(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
+    def _fusion_verdict(self, view: FrameView, estimate: PoseEstimate) -> Verdict:
         """Whether to fuse a tracked frame: its pose is certain, and its view is not redundant."""
+        repeats, unused = self.stream.repeats == "color", "map without texture" if self.young_map.textureless else ""
+        certain = Verdict((
+            Outcome.of("color_repeats", repeats, 0, "the colour image equals the one before", overruled_by=unused),
+            Outcome.of("blind", view.blind and not repeats, 0, "the image has no contrast, or the light has changed"),
+            *estimate.doubts(view),
+            Outcome.of("localize", self.localize, 0, "the map is not changed"),
+        ))  # fmt: skip
         with view.timer("similarity"):
-            known = view.blind or uncertain or self.localize
-            return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
+            redundant = certain.accepted and self.redundancy.is_redundant(self.atlas.volume, view, estimate)
+        return certain + Verdict((Outcome.of("redundant", redundant, 0, "the map has the content of the frame"),))
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], bool]:
-        """Pose of the frame after a loop closure, and whether a loop was closed."""
-        T_world_camera = estimate.T_world_camera
+    ) -> NDArray[np.float64] | None:
+        """Correction (4, 4) of the world by a loop closure; None if no loop was closed."""
         if self.atlas.history is None or view.without_image or self.motion.is_given:
-            return T_world_camera, False
+            return None
         with view.timer("loops"):
             levels = view.pyramid.tracked
             query = LoopQuery(view.colored(), levels, estimate.tracking, dynamic_mask, estimate.labels)
             correction = self.loops.close(query, self.monitor)
-        if correction is None:
-            return T_world_camera, False
-        self.young_map.abandon()  # the poses of held-back frames are outdated
-        self.motion.apply_correction(correction)
-        self.redundancy.apply_correction(correction)
-        self.detector.apply_correction(correction)
-        return correction @ T_world_camera, True
+        if correction is not None:
+            self.young_map.abandon()  # the poses of held-back frames are outdated
+            for moved in (self.motion, self.redundancy, self.detector):
+                moved.apply_correction(correction)
+        return correction
 
     def _calibrate(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
@@ -425,29 +445,24 @@ class Slam(SlamResults, Stateful):
         view: FrameView,
         estimate: PoseEstimate | None,
         dynamic_mask: NDArray[np.bool_],
+        verdict: Verdict,
+        status: Status = Status.TRACKED,
         *,
-        reason: str = "",
         T_world_camera: NDArray[np.float64] | None = None,
-        fused: bool = False,
-        uncertain: str = "",
+        covariance: NDArray[np.float64] | None = None,
         **details: Any,  # noqa: ANN401 - further attributes of the result
     ) -> FrameResult:
         """The result of a frame, with the mask in the recorded (distorted) image."""
         labels, tracking = (None, None) if estimate is None else (estimate.labels, estimate.tracking)
         readings, count = view.observation.readings, view.observation.num_readings
         result = FrameResult(
-            timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
-            T_world_camera=T_world_camera, fused=fused, uncertain=uncertain,
-            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
+            view.timestamp, status, T_world_camera, covariance, verdict,
             dynamic_mask=self.preprocess.distorted(recorded_mask(dynamic_mask, view.observation)),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=tracking, timings=view.timer.timings, submap=self.atlas.current, blind=view.blind,
-            colorless=not view.observation.has_color,
-            unobservable=np.empty((0, 6)) if tracking is None else tracking.unobservable, repeats=self.stream.repeats,
-            **details,
+            timings=view.timer.timings, submap=self.atlas.current, _labels=labels, _tracking=tracking, **details,
         )  # fmt: skip
-        if not result.rejected:
+        if status is not Status.REJECTED:
             self._last = result.without_details()
         return result
 

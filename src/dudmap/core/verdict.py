@@ -23,11 +23,14 @@ class Outcome(NamedTuple):
     overruled_by: str = ""
 
     @classmethod
-    def of(cls, name: str, figure: float, limit: float, reason: str, *, at_least: bool = False) -> "Outcome":
+    def of(
+        cls, name: str, figure: float, limit: float, reason: str, *, at_least: bool = False, overruled_by: str = ""
+    ) -> "Outcome":
         """Outcome of a comparison; ``reason`` may contain ``{figure}`` and ``{limit}``. NaN passes."""
         figure, limit = float(figure), float(limit)
         beyond = figure < limit if at_least else figure > limit
-        return cls(name, figure, limit, reason.format(figure=figure, limit=limit) if beyond else "", at_least)
+        reason = reason.format(figure=figure, limit=limit) if beyond else ""
+        return cls(name, figure, limit, reason, at_least, overruled_by if beyond else "")
 
     @property
     def passed(self) -> bool:
@@ -58,6 +61,14 @@ class Verdict:
     def failed(self) -> tuple[Outcome, ...]:
         """The failed checks."""
         return tuple(outcome for outcome in self.outcomes if not outcome.passed)
+
+    def __contains__(self, name: str) -> bool:
+        """Whether the check of this name failed."""
+        return any(outcome.name == name for outcome in self.failed)
+
+    def figure(self, name: str) -> float:
+        """Figure of the check of this name; NaN if it is unknown."""
+        return next((outcome.figure for outcome in self.outcomes if outcome.name == name), np.nan)
 
     @property
     def accepted(self) -> bool:

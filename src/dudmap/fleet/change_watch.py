@@ -114,7 +114,7 @@ class ChangeWatch(RunObserver):
     def look(self, index: int, frame: Frame, result: "FrameResult") -> None:
         """Count the evidence of a tracked frame, and report changes that are now certain."""
         T = result.T_world_camera
-        if T is None or result.submap != 0 or result.state != "tracked":
+        if T is None or result.submap != 0 or result.status != "tracked":
             return
         kind = KINDS[index % 2]
         self._count(kind, frame, T)

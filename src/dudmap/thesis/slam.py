@@ -18,7 +18,8 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.result import FrameResult
+from dudmap.core.result import FrameResult, Status
+from dudmap.core.verdict import ACCEPTED, Outcome, Verdict
 from dudmap.errors import FrameError
 from dudmap.thesis.depth_filter import bilateral, fill_zeros
 from dudmap.thesis.labels import dynamic_labels
@@ -101,7 +102,9 @@ class ThesisSlam:
             return self._fused(image, np.eye(4), dynamic, levels[0])
         T = self._poses[-1][1]
         if similarity > self.config.similarity:
-            return self._result(image, T, dynamic, levels[0], fused=False)
+            known = "the view resembles the last fused one by {figure:.0%}"
+            similar = Verdict((Outcome.of("redundant", similarity, self.config.similarity, known),))
+            return self._result(image, T, dynamic, levels[0], similar=similar)
         T, found = self._timed("track", lambda: self.registration.align(self.volume, levels, T))
         dynamic, _ = self._timed("label", lambda: dynamic_labels(found.psi, _points(levels[0], T), self.config))
         T, found = self._timed("track_again", lambda: self.registration.align(self.volume, levels, T, dynamic))
@@ -144,7 +147,7 @@ class ThesisSlam:
         static = ~full_size(dynamic, level.depth, image.depth)
         frame = Frame(image.timestamp, image.depth, image.rgb)
         self._timed("integrate", lambda: self.volume.integrate(frame, T, static))
-        return self._result(image, T, dynamic, level, psi, fused=True)
+        return self._result(image, T, dynamic, level, psi)
 
     def _result(
         self,
@@ -154,17 +157,16 @@ class ThesisSlam:
         level: Level,
         psi: NDArray[np.float32] | None = None,
         *,
-        fused: bool,
+        similar: Verdict = ACCEPTED,
     ) -> FrameResult:
         """Result of a frame; the mask has the geometry of the recorded image."""
         self._poses.append((image.timestamp, T))
         mask = full_size(dynamic, level.depth, image.depth)
         return FrameResult(
-            timestamp=image.timestamp, state="tracked", lost_reason="", T_world_camera=T, fused=fused,
-            skipped_similar=not fused, dynamic_mask=self.lens.distorted(mask),
+            image.timestamp, Status.TRACKED, T, None, similar, dynamic_mask=self.lens.distorted(mask),
             dynamic_share=np.count_nonzero(mask & image.readings) / max(image.num_readings, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if psi is None else psi,
-            labels=None, tracking=None, timings=self._timings,
+            timings=self._timings,
         )  # fmt: skip
 
     def _timed(self, stage: str, function: Callable[[], Result]) -> Result:

@@ -130,7 +130,7 @@ def calibrate_sequence(
             if result.submap != submap:
                 submap, keyframes = result.submap, max(keyframes, collector.keyframes, key=len)
                 collector.clear()
-            if result.state == "repeated":
+            if result.status == "repeated":
                 continue
             if result.T_world_camera is None or result.blind:
                 collector.interrupt()

@@ -67,7 +67,7 @@ def process_source(
     if record.masked is not None:
         record.masked += given_mask is not None
     delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
-    record.add_readings(read.frame.depth)
+    record.add_readings(read.frame)
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     row = record.rows[-1]
     read = read._replace(prepared=None)  # background jobs hold no pyramids
@@ -81,7 +81,7 @@ def process_source(
                     display.once(f"images for the report cannot be written: {error}; {MAKE_ROOM}")
 
     def keep_images() -> None:
-        if mask_folder is not None and not result.rejected:
+        if mask_folder is not None and result.status != "rejected":
             try:
                 save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
             except OSError as error:
@@ -95,6 +95,6 @@ def process_source(
         keep_images()
         background.do(partial(record.add_movers, row, result))
     notify(in_background=False)
-    if result.calibrated:
+    if "calibrated" in result.events:
         log.info("frame %d: %s", index, outcome(slam.calibration, slam.camera))
     display.frame(index, result, record.dropped)

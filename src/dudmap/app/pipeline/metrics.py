@@ -19,12 +19,12 @@ from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 
 if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
     from dudmap.core.objects.object_tracker import Mover
-    from dudmap.core.verdict import Verdict
     from dudmap.errors import FrameError
 
 STRIDE = 4
-COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain")
+COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "colorless", "uncertain", "degenerate")
 
 
 @dataclass
@@ -43,8 +43,7 @@ class RunRecord:
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
         readings: Numbers of depth measurements in every fourth row and column: all, below and above the depth range.
         depth_limits: Used depths, metres.
-        counts: Numbers of frames by attribute of ``FrameResult``, and of ``degenerate`` frames, in which not all
-            directions of motion are observable.
+        counts: Numbers of frames by kind.
         spent: Seconds, and seconds of processor time, of the run before this process or pass.
     """
 
@@ -59,7 +58,7 @@ class RunRecord:
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     readings: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", "too_near", "too_far"), 0))
     depth_limits: tuple[float, float] = Config().depth_limits
-    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
@@ -90,7 +89,7 @@ class RunRecord:
         In a live run ``delays`` are the number of frames ``dropped`` before this one, and the ``latency`` from its
         arrival to the result, ms.
         """
-        frame = {"timestamp": f"{result.timestamp:.6f}", "state": result.state}
+        frame = {"timestamp": f"{result.timestamp:.6f}", "state": str(result.status)}
         times = {"reading": reading_ms, "total": total_ms} | delays | result.timings
         row: dict[str, Any] = frame | {
             "fused": int(result.fused),
@@ -98,24 +97,29 @@ class RunRecord:
             **{name: round(value, 3) for name, value in times.items()},
         }
         self.rows.append(row)
-        for name in COUNTED:
+        for name in ("fused", "blind", "uncertain"):
             self.counts[name] += bool(getattr(result, name))
-        self.counts["degenerate"] += len(result.unobservable) > 0
-        if result.rejected:
-            self._reject(result.rejected)
-        if result.repeats:
-            self.repeated[result.repeats] = self.repeated.get(result.repeats, 0) + 1
-        if result.verdict.outcomes:
-            self.checks.append(frame | _columns(result.verdict))
-        if result.state == "lost":
-            self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
-        if result.labels is not None:
-            self.residuals = self.residuals + result.labels.histogram
+        for name in ("relocalized", "corrected"):
+            self.counts[name] += name in result.events
+        self.counts["skipped_similar"] += "redundant" in result.verdict
+        self.counts["degenerate"] += result.verdict.figure("unobservable") > 0
+        for part in ("frame", "depth", "color"):
+            if result.verdict.figure(f"{part}_repeats") > 0:
+                self.repeated[part] = self.repeated.get(part, 0) + 1
+        self.checks.append(frame | _columns(result))
+        if result.T_world_camera is None:
+            self.lost.append({"timestamp": result.timestamp, "reason": result.verdict.reason})
+        if result.status == "rejected":
+            self._reject(result.verdict.failed[0].name)
+        if result.histogram is not None:
+            self.residuals = self.residuals + result.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
-    def add_readings(self, depth: NDArray[np.float32]) -> None:
-        """Count the measurements of a frame (H, W), and the measurements outside of the depth range."""
+    def add_readings(self, frame: "Frame") -> None:
+        """Count the measurements of a frame, those outside of the depth range, and frames without colour."""
+        depth = frame.depth
+        self.counts["colorless"] += frame.color is None
         least, largest = self.depth_limits
         some = depth[::STRIDE, ::STRIDE]
         self.readings["all"] += int(np.count_nonzero(some > 0))
@@ -218,9 +222,14 @@ def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
     write_text(path, text.getvalue())
 
 
-def _columns(verdict: "Verdict") -> dict[str, Any]:
-    """Figure and limit of each check by column, the failed checks, and the evidence that overruled others."""
+def _columns(result: FrameResult) -> dict[str, Any]:
+    """Figure and limit of each check by column, the failed checks, the evidence that overruled others, and standard
+    deviations of the pose."""
+    verdict, covariance = result.verdict, result.covariance
     figures = dict[str, float]()
+    if covariance is not None:
+        figures["sigma_t_mm"] = 1000 * np.sqrt(np.trace(covariance[:3, :3]))
+        figures["sigma_r_deg"] = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
     for one in verdict.outcomes:
         figures |= {one.name: one.figure, f"{one.name}_{'min' if one.at_least else 'max'}": one.limit}
     overruled = (f"{one.name}: {one.overruled_by}" for one in verdict.outcomes if one.overruled_by)

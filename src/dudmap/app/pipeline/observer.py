@@ -77,11 +77,11 @@ class EventLog(RunObserver):
             with writing(f"the log {path}"):
                 self._file = path.open("w", encoding="utf-8", buffering=1)
         self._slam: Slam | None = None
-        self._state = "tracked"
+        self._was_lost = False
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """Write the start event of a pass."""
-        self._slam, self.out, self._state = slam, out, "tracked"
+        self._slam, self.out, self._was_lost = slam, out, False
         self.event("start", folder=str(out), frames=count)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
@@ -89,22 +89,21 @@ class EventLog(RunObserver):
         assert self._slam is not None
         place: dict[str, Any] = {"frame": index, "timestamp": result.timestamp}
         figures = {"ms": round(ms, 2), "dynamic_share": round(float(result.dynamic_share), 4), "submap": result.submap}
-        if result.state == "lost":
-            self.event("lost", **place, **figures, reason=result.lost_reason, first=self._state != "lost")
+        if result.T_world_camera is None:
+            self.event("lost", **place, **figures, reason=result.verdict.reason, first=not self._was_lost)
         else:
-            assert result.T_world_camera is not None
             position = [round(float(x), 4) for x in result.T_world_camera[:3, 3]]
-            self.event(result.state, **place, **figures, fused=result.fused, position=position)
-        if result.relocalized:
+            self.event(result.status, **place, **figures, fused=result.fused, position=position)
+        if "relocalized" in result.events:
             self.event("relocalized", **place, submap=result.submap)
-        if result.corrected:
+        if "corrected" in result.events:
             self.event("loop", **place, submap=result.submap)
-        if result.calibrated:
+        if "calibrated" in result.events:
             self.event("calibration", **place, estimated=list(self._slam.calibration.estimated))
         for kind, sentence in (("uncertain", result.uncertain), ("blind", "no contrast" if result.blind else "")):
             if sentence:
                 self.event("warning", **place, kind=kind, reason=sentence)
-        self._state = result.state
+        self._was_lost = result.T_world_camera is None
 
     def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
         """Write an event."""

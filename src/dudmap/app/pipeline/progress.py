@@ -79,16 +79,16 @@ class RunProgress:
         if self._skipped > 1:
             log.info("frame %d: readable again, %d skipped", index, self._skipped)
         self._skipped = 0
-        if result.state == "lost":
+        if result.T_world_camera is None:
             if self._lost == 0:
-                log.info("frame %d: lost, %s", index, result.lost_reason)
+                log.info("frame %d: lost, %s", index, result.verdict.reason)
             self._lost += 1
         elif self._lost:
             log.info("frame %d: tracked again, %d lost", index, self._lost)
             self._lost = 0
         self._times.append(time.perf_counter())
         seconds = self._times[-1] - self._times[0]
-        state = f"[{'red' if result.state == 'lost' else 'green'}]{result.state}[/]"
+        state = f"[{'red' if result.T_world_camera is None else 'green'}]{result.status}[/]"
         if dropped:
             state += f", {dropped} dropped"
         self._bar.update(

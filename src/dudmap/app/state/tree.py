@@ -12,6 +12,7 @@ A node is a number, a text, None, or an object with an ``id`` for references.
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -90,6 +91,8 @@ class TreeWriter:
             return {"array": self._add(value if constant else value.copy(order="K"))}
         if kind is np.random.Generator:
             return {"random": value.bit_generator.state}
+        if issubclass(kind, Enum):
+            return {"member": value.value}
         if issubclass(kind, BaseModel):
             return {"json": value.model_dump_json()}
         if issubclass(kind, Stateful):
@@ -223,6 +226,8 @@ class TreeReader:
             generator = np.random.default_rng(0)
             generator.bit_generator.state = node["random"]
             return generator
+        if issubclass(kind, Enum):
+            return kind(node["member"])
         if issubclass(kind, BaseModel):
             return kind.model_validate_json(node["json"])
         if issubclass(kind, Stateful):

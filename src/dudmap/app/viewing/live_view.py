@@ -82,7 +82,7 @@ class LiveView(RunObserver):
         with self._changed:
             self._update.figures.append(figures)
             self._update.images = images or self._update.images
-            if result.corrected:
+            if "corrected" in result.events:
                 self._update.poses = self._poses()
             self._changed.notify()
         self.costs.append(1000 * (time.perf_counter() - start))

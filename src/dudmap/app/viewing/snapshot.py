@@ -69,9 +69,9 @@ class FrameFigures:
     def of(cls, result: "FrameResult", ms: float) -> "FrameFigures":
         """Metrics of a processed frame."""
         movers = tuple(MoverBox(mover.id, mover.box, mover.speed) for mover in result.movers)
-        residual = np.nan if result.tracking is None else result.tracking.residual
+        lost = "" if result.T_world_camera is not None else result.verdict.reason
         return cls(
-            result.timestamp, result.T_world_camera, result.lost_reason, movers, ms, float(residual),
+            result.timestamp, result.T_world_camera, lost, movers, ms, result.verdict.figure("residual_mm") / 1000,
             result.dynamic_share,
         )  # fmt: skip
 

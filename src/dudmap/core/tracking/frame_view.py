@@ -18,7 +18,7 @@ from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced,
 from dudmap.core.state import CACHE
 from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult
-from dudmap.core.verdict import ACCEPTED
+from dudmap.core.verdict import ACCEPTED, Outcome
 
 
 class StageTimer:
@@ -198,20 +198,16 @@ class PoseEstimate:
         """Whether the view, or the corners of the last image, determine all directions of motion."""
         return self.from_corners or len(self.tracking.unobservable) == 0
 
-    @property
-    def unobserved_motion(self) -> str:
-        """Reason why the pose is uncertain: directions that nothing determines; empty if there are none."""
-        return "" if self.is_observed else unobserved_motion(self.tracking.unobservable)
-
-    def doubt(self, view: FrameView) -> str:
-        """Reason why the pose is uncertain, empty if there is none: unobserved directions, or changed light with a
-        mostly saturated image."""
-        if self.unobserved_motion:
-            return self.unobserved_motion
+    def doubts(self, view: FrameView) -> tuple[Outcome, Outcome]:
+        """Whether the pose is uncertain: unobserved directions, or changed light with a mostly saturated image."""
+        free, corners = self.tracking.unobservable, "corners" if self.from_corners else ""
         level = view.labelled
         dark = saturated(level, self.exposure)
         share = 0.0 if dark is None else np.count_nonzero(dark & (level.depth > 0)) / max(level.num_readings, 1)
-        return f"the light has changed, and {share:.0%} of the image is saturated" if share > 0.5 else ""
+        return (
+            Outcome.of("unobservable", len(free), 0, unobserved_motion(free), overruled_by=corners),
+            Outcome.of("saturated", share, 0.5, "the light has changed, and {figure:.0%} of the image is saturated"),
+        )
 
     def dynamic_mask(self, view: FrameView) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of the frame: labelled or known before."""

@@ -16,6 +16,7 @@ from dudmap.core.backends.parameters import (
     RegistrationParameters,
     TruncationBand,
 )
+from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level, chained, exposed
 from dudmap.core.geometry import se3
 from dudmap.core.map.volume import TsdfVolume
@@ -39,6 +40,11 @@ EXPOSURE_NOISE = 0.01
 """Largest change of gain and offset in total that is noise of the fit and not applied."""
 NEAREST_STEPS = 3
 """Largest number of steps to a nearby minimum."""
+BLOCKS_ACROSS = 20
+"""Blocks across the image whose sums of residuals give their variance: 16 pixels of 320, several times the widths of
+filter and voxels. Errors of rendered sequences then have the covariance within a factor of 4."""
+UNKNOWN = np.full((6, 6), np.nan)
+"""Covariance of a rejected registration."""
 MEDIAN_STRIDE = 4
 """Step between the pixels of a median over the image, across and down."""
 
@@ -62,6 +68,8 @@ class TrackingResult:
         unobservable: (k, 6) twists, camera axes, that the view does not determine and along which the initial pose was
             kept (``core/tracking/observability.py``).
         readings: Number of static measurements on the map, weighted.
+        covariance: (6, 6) of the pose's error, a twist (v, omega) about the camera's centre in world axes, m and rad;
+            0 along unobservable directions. NaN unless accepted.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -75,6 +83,13 @@ class TrackingResult:
     converged: bool = True
     unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
     readings: float = np.inf
+    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def covariance_with(self, drift: float) -> NDArray[np.float64]:
+        """Covariance (6, 6) of the pose with the standard deviation ``drift`` of the prediction, metres and radians,
+        along the unobservable directions."""
+        basis, _ = np.linalg.qr(np.kron(np.eye(2), self.T_world_camera[:3, :3]) @ self.unobservable.T)
+        return self.covariance + drift**2 * basis @ basis.T
 
     @property
     def accepted(self) -> bool:
@@ -114,6 +129,7 @@ class Minimum:
     iterations: int
     converged: bool
     seen: Observability
+    parameters: RegistrationParameters
 
 
 class Tracker:
@@ -213,7 +229,7 @@ class Tracker:
         if system is None or weights is None:  # all levels are skipped: the initial pose is judged
             weights = np.ones(lit.depth.shape, np.float32)
             system = self._descend(volume, lit, T, weights, None, NO_STEP, parameters).equations
-        return Minimum(T, exposure, system, lit, weights, iterations, converged, seen or COMPLETE)
+        return Minimum(T, exposure, system, lit, weights, iterations, converged, seen or COMPLETE, parameters)
 
     def judge(
         self,
@@ -233,7 +249,7 @@ class Tracker:
             curve = fit_exposure(lit.intensity, system.residuals[1], weights)
             lit = exposed(level, curve)
             system = self._descend(volume, lit, T_world_camera, weights, None, NO_STEP, parameters).equations
-        found = Minimum(T_world_camera, curve, system, lit, weights, 1 + fitted, True, COMPLETE)
+        found = Minimum(T_world_camera, curve, system, lit, weights, 1 + fitted, True, COMPLETE, parameters)
         return self._judge(found, T_world_camera)
 
     def nearest(
@@ -361,4 +377,21 @@ class Tracker:
             T_world_camera, found.exposure, ACCEPTED, share, residual, condition, found.iterations,
             color_residual, found.converged, found.seen.unobservable, system.weight,
         )  # fmt: skip
-        return replace(result, verdict=judged(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules)))
+        verdict = judged(REGISTRATION, result.figures, Limits(config, self.sensor, self.rules))
+        return replace(result, verdict=verdict, covariance=self._covariance(found) if verdict.accepted else UNKNOWN)
+
+    def _covariance(self, found: Minimum) -> NDArray[np.float64]:
+        """Covariance (6, 6) of the pose of a minimum along the observable directions: s^2 H^-1.
+
+        The variance s^2 of a weighted residual r is the mean over both terms of (sum of r)^2 over blocks of pixels, per
+        measurement. The sums hold the correlation of neighbouring residuals, which filter, voxels and errors of the map
+        cause.
+        """
+        level, residuals, basis = found.level, found.equations.residuals, found.seen.observable
+        weights = residual_weights(level.depth, residuals, found.weights, found.parameters)[:2]
+        scaled = np.where(weights > 0, np.sqrt(weights) * residuals, np.float32(0))
+        size = max(1, level.camera.width // BLOCKS_ACROSS)
+        rows, columns = level.camera.height // size, level.camera.width // size
+        sums = scaled[:, : rows * size, : columns * size].reshape(2, rows, size, columns, size).sum(axis=(2, 4))
+        variance = float(np.sum(np.square(sums)) / max(np.count_nonzero(weights), 1))
+        return variance * basis @ np.linalg.inv(basis.T @ found.equations.H @ basis) @ basis.T

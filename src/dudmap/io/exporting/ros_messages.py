@@ -100,18 +100,26 @@ def transforms(types: MessageTypes, stamped: Sequence[Any]) -> Any:  # noqa: ANN
 
 
 def odometry(
-    types: MessageTypes, seconds: float, T: NDArray[np.float64], velocity: NDArray[np.float64], parent: str, child: str
+    types: MessageTypes,
+    seconds: float,
+    T: NDArray[np.float64],
+    covariance: NDArray[np.float64] | None,
+    velocity: NDArray[np.float64],
+    parent: str,
+    child: str,
 ) -> Any:  # noqa: ANN401
-    """``nav_msgs/Odometry`` of a pose (4, 4) and a twist (6,) per second in camera axes; covariances 0 = unknown."""
+    """``nav_msgs/Odometry`` of a pose (4, 4) with its covariance (6, 6), world axes, and of a twist (6,) per second in
+    camera axes; covariances of 0 are unknown."""
     twist = types.make(
         "geometry_msgs/msg/Twist", linear=vector(types, velocity[:3]), angular=vector(types, velocity[3:])
     )
     unknown = np.zeros(36)
+    known = unknown if covariance is None else covariance.ravel()
     return types.make(
         "nav_msgs/msg/Odometry",
         header=header(types, seconds, parent),
         child_frame_id=child,
-        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=pose(types, T), covariance=unknown),
+        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=pose(types, T), covariance=known),
         twist=types.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
     )
 
@@ -327,7 +335,7 @@ def _messages(types: MessageTypes, run: RunContent) -> Iterator[tuple[str, float
         velocity = se3.log(se3.inverse(before[1]) @ T) / elapsed if elapsed > 0 else np.zeros(6)
         before = stamp, T
         yield "/tf", stamp, transforms(types, [transform(types, stamp, T, frame, CAMERA_FRAME)])
-        yield "/odometry", stamp, odometry(types, stamp, T, velocity, frame, CAMERA_FRAME)
+        yield "/odometry", stamp, odometry(types, stamp, T, None, velocity, frame, CAMERA_FRAME)
         seen = movers.get(round(stamp, 6), [])
         if seen or had_movers:
             yield "/movers", stamp, mover_markers(types, stamp, seen, frame)

@@ -114,12 +114,13 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
         except FrameError as error:
             rejected[error.kind] = rejected.get(error.kind, 0) + 1
             continue
-        if result.rejected:
-            rejected[result.rejected] = rejected.get(result.rejected, 0) + 1
+        if result.status == "rejected":
+            kind = result.verdict.failed[0].name
+            rejected[kind] = rejected.get(kind, 0) + 1
         elif result.T_world_camera is None:
             lost += 1
         else:
-            flagged[-1] = result.blind or bool(result.uncertain) or result.state == "repeated"
+            flagged[-1] = result.blind or bool(result.uncertain) or result.status == "repeated"
             T_true = truth[delivery.number]
             anchor = anchors.setdefault(result.submap, T_true @ se3.inverse(result.T_world_camera))
             errors[-1] = float(np.linalg.norm((anchor @ result.T_world_camera - T_true)[:3, 3]))
