@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from dudmap.core.calibration import self_calibration
-from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
+from dudmap.core.calibration.estimator import SHUTTER, TESTED, CalibrationEstimator, Estimate
 from dudmap.lab.synthetic.faults import SensorFaults
 
 DELAY = 0.03
@@ -18,7 +18,8 @@ class KnownDelay(CalibrationEstimator):
     """Finds the true delay, which needs more and larger images than a quick test has; it has tests of its own."""
 
     def estimate(self, keyframes):
-        return Estimate(replace(self.given, delay=DELAY, sigma=np.ones(13), estimated=("delay",)), {}, 0.3, 80)
+        found = replace(self.given, delay=DELAY, sigma=np.ones(13), estimated=("delay",))
+        return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), 4.0), 0.3, 80)
 
 
 def find_early(monkeypatch, attempts):
