@@ -130,13 +130,14 @@ class YoungMap(Stateful):
     _num_fused: Remembered[int] = 0
     _mostly: Remembered[bool] = False  # most of the view has moved in one of the first frames
     _shown: Remembered[bool] = False  # the labels of the first frames showed it at once
+    _slow: Remembered[bool] = False  # the first frames are more than two
+    _interval: Remembered[float] = 0.0  # mean time between them, seconds
     _collects: Remembered[bool] = False  # fused frames are kept for the second registration
 
     def __init__(self, *, refines: bool, decides: bool, reference_depth: float) -> None:
         self._refines, self._decides = refines, decides
         self._same_pose = SAME_POSE[0] * reference_depth, SAME_POSE[1]
         self._frames, self._window = [], []
-        self._slow, self._interval = False, 0.0  # whether the first frames are more than two; mean time between them
 
     @staticmethod
     def verdict(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> Verdict:
