@@ -29,7 +29,7 @@ def scene(movers=("person",), frames=27):
 
 
 def assert_same_results(a, b):
-    for field in ("timestamp", "state", "lost_reason", "fused", "corrected", "relocalized", "submap", "uncertain"):
+    for field in ("timestamp", "status", "reasons", "fused", "events", "submap"):
         assert getattr(a, field) == getattr(b, field), field
     for field in ("T_world_camera", "dynamic_mask", "residuals"):
         np.testing.assert_array_equal(getattr(a, field), getattr(b, field), err_msg=field)
