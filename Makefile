@@ -12,7 +12,7 @@ SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
 	--generate-hashes --custom-compile-command "make lock"
 
-# tests of one file share fixtures, so they stay in one process; the longest file takes a sixteenth of the time
+# tests of one file share fixtures, so they stay in one process; no file takes more than a minute
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-all costs ready check docs package processors soak fuzz fuzz-guided audit lock clean

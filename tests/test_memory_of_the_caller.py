@@ -120,8 +120,7 @@ def prepared(slam, frame, mask):
     return slam.process(view)
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("process", [as_frame, as_arrays, prepared])
+@pytest.mark.parametrize(("process", "masked"), [(as_frame, False), (as_arrays, True), (prepared, True)])
 def test_images_may_be_overwritten_after_each_call(frames, expected, process, masked):
     slam, buffers, results = Slam(CAMERA, SMALL), Buffers(), []
     for frame, mask in frames:

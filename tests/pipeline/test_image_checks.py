@@ -94,6 +94,7 @@ def test_frames_that_show_the_same_count_as_one():
     assert image_warnings([frame] * 4) == [warning]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPOILT)
 def test_wrong_input_of_a_synthetic_recording_is_said(name):
     scene = "room" if name == LARGE else "desk"  # too small a scale shows at a desk, too large a one in a room
