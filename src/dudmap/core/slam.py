@@ -125,7 +125,7 @@ class Slam(SlamResults, Stateful):
         self.front_end = FrontEnd(
             config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion, cues
         )
-        self.predictor = PosePredictor(config, self.motion, prior.Ts_world_camera if prior else {})
+        self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
         self.atlas = Atlas.of(config, self.camera, self._volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         refines = prior is None and not live and poses != "given"
@@ -314,7 +314,7 @@ class Slam(SlamResults, Stateful):
         self.mapper.extend(view, estimate, mask, fuse=True)
         self.color_motion.start(view)
         if self.config.dynamics.enabled:
-            self.predictor.image_motion.start(view.timestamp)
+            self.predictor.start(view.timestamp)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
         return self._result(

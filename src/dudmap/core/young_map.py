@@ -32,6 +32,8 @@ SAME_POSE = 0.01, 0.25
 UNDECIDED = 0.4, 0.8
 """Times after which slow motion is visible, seconds: crowds at 0.2 and 0.1 m/s have moved by 10 pixels at 2 m (262 px
 focal)."""
+FASTEST = 1.5
+"""Speed of people who walk, m/s."""
 WINDOW, WINDOW_STEP = 30, 2
 """Number of fused frames after which the poses of a new map are refined, and step between the refined frames."""
 MIN_READINGS = 0.02
@@ -297,11 +299,21 @@ class YoungMap(Stateful):
             if agrees and before.moving is not None:
                 after = replace(after, moving=_union(after.moving, before.moving))
             out.append(after)
-        return out
+        return out if _drags_smoothly(out) else []
 
     def abandon(self) -> None:
         """Forget the frames, because the camera is tracked in another map."""
         self._frames, self._window, self._collects = [], [], False
+
+
+def _drags_smoothly(frames: list[StartFrame]) -> bool:
+    """Whether people can have dragged the camera away from the revised poses: at most at the speed FASTEST.
+
+    A wrong reference moves all frames of its hop at once.
+    """
+    moved = [frame.T_world_camera[:3, 3] - frame.estimate.T_world_camera[:3, 3] for frame in frames]
+    steps = np.linalg.norm(np.diff(moved, axis=0), axis=1) if len(frames) > 1 else np.empty(0)
+    return bool(np.all(steps <= FASTEST * np.diff([frame.view.timestamp for frame in frames])))
 
 
 def _union(a: NDArray[np.bool_] | None, b: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -21,13 +21,12 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
 from dudmap.core.tracking.motion_model import MotionModel
-from dudmap.core.tracking.pose_prediction import PosePrediction
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import MEDIAN_STRIDE, Minimum, Tracker, TrackingResult
 from dudmap.core.verdict import Verdict
 from dudmap.core.young_map import SAME_POSE
 
-CLEARLY_BETTER = 0.95
 NO_CHANCE = 3
 """Significance of an improvement: excess of improved over worsened measurements, in standard deviations of chance."""
 UNCHANGED_SHARE = 0.02

@@ -11,10 +11,14 @@ from dudmap.core.dynamics.dominant_motion import DominantMotion
 from dudmap.core.dynamics.image_motion import ImageMotion, ImagePose
 from dudmap.core.frames.observation import Level, is_majority_dynamic
 from dudmap.core.geometry import se3
-from dudmap.core.map.volume import UNKNOWN, TsdfVolume
+from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
-from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights
 from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.tracker import Tracker
+
+CLEARLY_BETTER = 0.95
+"""A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +56,27 @@ class PosePredictor(Stateful):
     Args:
         config: All parameters.
         motion: Velocity of the camera.
+        tracker: Evaluates the cost of a pose.
         known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
     """
 
     image_motion: Remembered[ImageMotion]
     mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
+    _last_dynamic: Remembered[NDArray[np.bool_] | None] = None  # dynamic pixels of the last tracked frame
+    _single_frame_map: Remembered[bool] = False  # the map consists of one frame, whose dynamic pixels are unknown
 
-    def __init__(self, config: Config, motion: MotionModel, known_poses: Mapping[float, NDArray[np.float64]]) -> None:
+    def __init__(
+        self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
+    ) -> None:
         self.motion = motion
+        self.tracker = tracker
         self.image_motion = ImageMotion(config.dynamics.start_seconds if config.dynamics.enabled else 0.0)
         self._known_poses = known_poses
+
+    def start(self, timestamp: float) -> None:
+        """Begin with the first frame of a map."""
+        self.image_motion.start(timestamp)
+        self._single_frame_map = True
 
     def predict(self, volume: TsdfVolume, view: FrameView) -> PosePrediction:
         """Initial pose for the registration of a frame to a map."""
@@ -81,6 +96,9 @@ class PosePredictor(Stateful):
                 return by_velocity
             if timestamp in self._known_poses or self.motion.is_given:
                 T_image = T_expected
+            elif not self._single_frame_map and self._fits_better(volume, T_expected, T_image, view.pyramid.coarse):
+                return by_velocity  # the common motion of the images is that of the dynamic objects
+            self._single_frame_map = False
             moving, undecided = motion.moving_after, None
             if self.mostly_dynamic and is_majority_dynamic(moving, view.labelled):
                 undecided = ~motion.static_after
@@ -92,12 +110,22 @@ class PosePredictor(Stateful):
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image for the next comparison: a frame with an accepted pose."""
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
+        self._last_dynamic = dynamic
         self.mostly_dynamic = dynamic is not None and is_majority_dynamic(dynamic, view.labelled)
         if self.image_motion.seconds > 0:
             with view.timer("parallax"):
                 self.image_motion.update(view.tracked_at(
                     estimate.T_world_camera, moving=dynamic, blind=view.without_image, gain=estimate.exposure[0]
                 ))  # fmt: skip
+
+    def _fits_better(
+        self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
+    ) -> bool:
+        """Whether a pose explains the image clearly better than another one, without measurements in free space."""
+        weights = initial_weights([level], self._last_dynamic, []) or [np.ones_like(level.depth)]
+        static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
+        cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
+        return cost < CLEARLY_BETTER * other
 
     def _compare(self, view: FrameView) -> DominantMotion | None:
         if self.image_motion.seconds == 0:

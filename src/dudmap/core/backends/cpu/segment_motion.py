@@ -166,7 +166,8 @@ def classify_segments(evidence, before, min_pixels):
     A segment of at least ``min_pixels`` is dynamic
 
     - if at least NEARLY_ALL of its pixels are dynamic, or
-    - if most of it was dynamic in the last frame, and most of it is not near a surface of the map, or
+    - if most of it, and most of the view, was dynamic in the last frame, and most of it is not near a surface of the
+      map, or
     - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and the others have
       moved as well.
 
@@ -182,10 +183,11 @@ def classify_segments(evidence, before, min_pixels):
         before: (count + 1,) share of the pixels that belonged to a dynamic segment in the last frame.
         min_pixels: Smallest number of pixels of a segment that is classified as a whole.
     """
-    count, readings = len(evidence) - 1, 0.0
+    count, readings, moved_before = len(evidence) - 1, 0.0, 0.0
     distances, mismatches, static = np.empty(count), np.empty(count), 0
     for n in range(1, count + 1):
         readings += evidence[n, SIZE]
+        moved_before += before[n] * evidence[n, SIZE]
         if evidence[n, SIZE] >= min_pixels and evidence[n, COMPARED] > 0.5 and evidence[n, DYNAMIC] < 0.5:
             distances[static], mismatches[static] = abs(evidence[n, DISTANCE]), evidence[n, MISMATCH]
             static += 1
@@ -197,7 +199,7 @@ def classify_segments(evidence, before, min_pixels):
         moved = far * far + unlike * unlike >= (0.5 if before[n] > 0.5 else 1.0)
         small = evidence[n, SIZE] <= MAX_SHARE * readings
         nearly_all, some = evidence[n, DYNAMIC] >= NEARLY_ALL, evidence[n, DYNAMIC] >= MIN_DYNAMIC
-        unseen = before[n] > 0.5 and evidence[n, COMPARED] < 0.5  # nothing tells that it has stopped
+        unseen = before[n] > 0.5 and evidence[n, COMPARED] < 0.5 and moved_before > 0.5 * readings
         moving[n] = evidence[n, SIZE] >= min_pixels and (nearly_all or unseen or (small and moved and some))
     return moving
 
