@@ -31,7 +31,7 @@ NO_STATE = {
         "VolumeMirror._copied",
     ),
     "objects that belong to another one's state": (
-        "Mapper._bootstrap", "Mapper._redundancy", "Slam.mapper", "FrontEnd.detector", "FrontEnd.motion",
+        "Mapper._redundancy", "Slam.mapper", "FrontEnd.detector", "FrontEnd.motion",
         "BlockTree.blocks", "Atlas.volume",
     ),
     "settings of maps that are only looked at (``extend_range``)": (
