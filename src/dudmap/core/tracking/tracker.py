@@ -387,11 +387,14 @@ class Tracker:
         measurement. The sums hold the correlation of neighbouring residuals, which filter, voxels and errors of the map
         cause.
         """
+        import cv2
+
         level, residuals, basis = found.level, found.equations.residuals, found.seen.observable
         weights = residual_weights(level.depth, residuals, found.weights, found.parameters)[:2]
-        scaled = np.where(weights > 0, np.sqrt(weights) * residuals, np.float32(0))
         size = max(1, level.camera.width // BLOCKS_ACROSS)
         rows, columns = level.camera.height // size, level.camera.width // size
-        sums = scaled[:, : rows * size, : columns * size].reshape(2, rows, size, columns, size).sum(axis=(2, 4))
+        scaled = (np.sqrt(weights) * residuals)[:, : rows * size, : columns * size].reshape(-1, columns * size)
+        cv2.patchNaNs(scaled, 0.0)
+        sums = size**2 * cv2.resize(scaled, (columns, 2 * rows), interpolation=cv2.INTER_AREA)
         variance = float(np.sum(np.square(sums)) / max(np.count_nonzero(weights), 1))
         return variance * basis @ np.linalg.inv(basis.T @ found.equations.H @ basis) @ basis.T
