@@ -169,7 +169,7 @@ def test_a_result_is_pickled_and_copied_with_its_moving_objects(frames):
         assert found.timings == result.timings
         np.testing.assert_array_equal(found.dynamic_mask, result.dynamic_mask)
         np.testing.assert_array_equal(found.T_world_camera, result.T_world_camera)
-        assert [mover.id for mover in dataclasses.replace(found, fused=True).movers] == [m.id for m in result.movers]
+        assert [mover.id for mover in dataclasses.replace(found, submap=1).movers] == [m.id for m in result.movers]
 
 
 def test_a_stored_system_holds_nothing_of_the_caller(frames, expected, tmp_path):
