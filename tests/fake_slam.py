@@ -1,5 +1,6 @@
 """Fake of ``dudmap.core.slam.Slam`` with scripted results, for tests of the pipeline and the command line."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -9,6 +10,7 @@ from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.result import FrameResult, Status
+from dudmap.core.shed import Shed
 from dudmap.core.verdict import Outcome, Verdict
 from recordings import HEIGHT, WIDTH
 
@@ -56,6 +58,7 @@ class FakeSlam:
     """
 
     script: ClassVar[dict] = {}
+    shed = Shed.NOTHING
 
     saved_map = SimpleNamespace(save_keyframes=lambda path: path.write_bytes(b"keyframes"))
 
@@ -111,4 +114,4 @@ class FakeSlam:
         mask = np.zeros((HEIGHT, WIDTH), bool)
         mask[:24, :32] = True
         similar = ("the map has the content of the frame", "redundant") if event == "similar" else ("", "")
-        return fake_result(frame.timestamp, T, *similar, mask, 0.25)
+        return replace(fake_result(frame.timestamp, T, *similar, mask, 0.25), shed=self.shed)

@@ -25,6 +25,8 @@ from dudmap.core.objects.object_map import RigidObject
 from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.saved_map import PriorMap, SavedMap
+from dudmap.core.shed import Shed
+from dudmap.core.state import CACHE
 from dudmap.core.tracking.motion_model import GivenRole
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
@@ -85,6 +87,7 @@ class FrameResult:
         timings: Milliseconds per stage.
         submap: Number of the submap of the pose, 0 the first.
         events: Events of the frame.
+        shed: Work that was omitted from the frame, see ``Slam.shed``.
     """
 
     timestamp: float
@@ -98,6 +101,7 @@ class FrameResult:
     timings: dict[str, float] = field(default_factory=dict)
     submap: int = 0
     events: tuple[Event, ...] = ()
+    shed: Shed = field(default=Shed.NOTHING, metadata=CACHE)
     _labels: Labels | None = None
     _tracking: TrackingResult | None = None
     _find_movers: Callable[[], tuple[Mover, ...]] | None = None
@@ -139,7 +143,7 @@ class FrameResult:
 
     def without_details(self) -> "FrameResult":
         """Pose and mask alone, for a frame that repeats this one."""
-        return replace(self, events=(), _labels=None, _tracking=None, _find_movers=None)
+        return replace(self, events=(), shed=Shed.NOTHING, _labels=None, _tracking=None, _find_movers=None)
 
     def detached(self) -> "FrameResult":
         """Copy with copies of all arrays, which the caller may keep and change."""

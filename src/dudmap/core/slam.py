@@ -35,6 +35,7 @@ from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalization, Relocalizer
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.result import Event, FrameResult, SlamArguments, SlamResults, Status
+from dudmap.core.shed import Shed
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
@@ -69,6 +70,11 @@ class Slam(SlamResults, Stateful):
         poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
         ignore: (H, W) bool, pixels of the depth or colour image that are never used, fused or dynamic.
         cues: Further evidence of motion, asked for each frame. They are not stored with the state.
+
+    Attributes:
+        shed: Work to omit from the next frames, to save time. Labels and fusion are only omitted within 0.05 s of a
+            labelled frame (every second frame at 30 Hz), and never in a young map, if most of the last view moved, or
+            if the last frame was not tracked. It is not stored with the state.
     """
 
     stream: Remembered[StreamCheck]
@@ -85,6 +91,7 @@ class Slam(SlamResults, Stateful):
     redundancy: Remembered[RedundantViews]
     loops: Remembered[LoopCloser]
     objects: Remembered[MovingObjects]
+    shed: Shed = Shed.NOTHING
     _last: Remembered[FrameResult | None] = None  # result of the last frame, for a frame that repeats it
 
     def __init__(
@@ -211,7 +218,7 @@ class Slam(SlamResults, Stateful):
         if self.reference.is_empty:
             return self._start_map(view)
         blind = view.textureless or self.stream.repeats == "color"  # the colours carry no information
-        view = replace(view, blind=blind and not self.young_map.textureless)
+        view = replace(view, blind=blind and not self.young_map.textureless, shed=self._omitted(view.timestamp))
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
             if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
@@ -250,8 +257,15 @@ class Slam(SlamResults, Stateful):
             view, estimate, mask, verdict, T_world_camera=T_world_camera,
             covariance=None if self.motion.is_given else covariance,
             events=tuple(event for event, has in happened.items() if has),
-            _find_movers=self.objects.update(view, estimate),
+            _find_movers=None if view.shed else self.objects.update(view, estimate),
         )  # fmt: skip
+
+    def _omitted(self, timestamp: float) -> Shed:
+        """Work that is omitted from this frame, see ``shed``."""
+        young = self.young_map.first is not None or self.predictor.image_motion.active
+        followed = self._last is not None and self._last.status is Status.TRACKED and not self.predictor.mostly_dynamic
+        labelled = self.detector.memory.is_recent(timestamp)
+        return self.shed if followed and labelled and not young else min(self.shed, Shed.MOVERS)
 
     def _rectified(self, view: FrameView) -> FrameView:
         """The frame rectified to the time of its middle row; unchanged with a global shutter or a camera at rest."""
@@ -409,6 +423,7 @@ class Slam(SlamResults, Stateful):
             Outcome.of("blind", view.blind and not repeats, 0, "the image has no contrast, or the light has changed"),
             *estimate.doubts(view),
             Outcome.of("localize", self.localize, 0, "the map is not changed"),
+            *((Outcome.of("shed", 1, 0, "no time to fuse the frame"),) if view.shed >= Shed.FUSION else ()),
         ))  # fmt: skip
         with view.timer("similarity"):
             redundant = certain.accepted and self.redundancy.is_redundant(self.atlas.volume, view, estimate)
@@ -460,7 +475,8 @@ class Slam(SlamResults, Stateful):
             dynamic_mask=self.preprocess.distorted(recorded_mask(dynamic_mask, view.observation)),
             dynamic_share=np.count_nonzero(dynamic_mask & readings) / max(count, 1),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            timings=view.timer.timings, submap=self.atlas.current, _labels=labels, _tracking=tracking, **details,
+            timings=view.timer.timings, submap=self.atlas.current, shed=view.shed,
+            _labels=labels, _tracking=tracking, **details,
         )  # fmt: skip
         if status is not Status.REJECTED:
             self._last = result.without_details()

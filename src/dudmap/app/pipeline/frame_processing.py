@@ -11,6 +11,7 @@ from dudmap.app.pipeline.frame_source import SourceFrame
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run_folder import save_mask
+from dudmap.app.pipeline.shedding import SAID, Shedding
 from dudmap.core.calibration.findings import outcome
 from dudmap.errors import FrameError
 
@@ -33,9 +34,10 @@ def process_source(
     background: Background,
     observers: "tuple[RunObserver, ...]" = (),
     poses: "GivenPoses | None" = None,
+    shedding: Shedding | None = None,
 ) -> None:
     """Process one frame, count it, save its mask, and report it; files and moving objects are done in the
-    background."""
+    background. ``shedding`` chooses the work that a live run omits."""
     index, read = source.number, source.read
     if record.dropped is not None:
         record.dropped += source.dropped
@@ -54,6 +56,8 @@ def process_source(
         given_mask = None
     start = time.perf_counter()
     frame = read.prepared or read.frame
+    if shedding is not None:
+        slam.shed = shedding.step
     try:
         given: dict[str, Any] = {} if given_mask is None else {"dynamic_mask": given_mask}
         if poses is not None:
@@ -66,7 +70,9 @@ def process_source(
     end = time.perf_counter()
     if record.masked is not None:
         record.masked += given_mask is not None
-    delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
+    delays = {}
+    if record.dropped is not None:
+        delays = {"dropped": source.dropped, "latency": 1000 * (end - source.arrival), "shed": int(result.shed)}
     record.add_readings(read.frame)
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     row = record.rows[-1]
@@ -86,7 +92,8 @@ def process_source(
                 save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
             except OSError as error:
                 display.once(f"masks cannot be written: {error}; {MAKE_ROOM}")
-        notify(in_background=True)
+        if not result.shed:
+            notify(in_background=True)
 
     if record.dropped is None:
         record.add_movers(row, result)
@@ -97,4 +104,6 @@ def process_source(
     notify(in_background=False)
     if "calibrated" in result.events:
         log.info("frame %d: %s", index, outcome(slam.calibration, slam.camera))
-    display.frame(index, result, record.dropped)
+    if shedding is not None:
+        shedding.add(index, source.arrival, time.perf_counter() - start)
+    display.frame(index, result, record.dropped, "" if shedding is None else SAID[shedding.step])

@@ -15,6 +15,7 @@ from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.atomic_file import atomic_file, write_text
 from dudmap.config import Config
 from dudmap.core.result import FrameResult
+from dudmap.core.shed import Shed
 from dudmap.core.state import CACHE
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 
@@ -86,8 +87,8 @@ class RunRecord:
     ) -> None:
         """Add one processed frame with its times (ms) and its true dynamic mask (H, W), if known.
 
-        In a live run ``delays`` are the number of frames ``dropped`` before this one, and the ``latency`` from its
-        arrival to the result, ms.
+        In a live run ``delays`` are the number of frames ``dropped`` before this one, the ``latency`` from its arrival
+        to the result, ms, and the omitted work (``shed``).
         """
         frame = {"timestamp": f"{result.timestamp:.6f}", "state": str(result.status)}
         times = {"reading": reading_ms, "total": total_ms} | delays | result.timings
@@ -202,9 +203,10 @@ class RunRecord:
         if self.mask_ious:
             out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
         if self.dropped is not None:
-            latencies = self._column("latency")
+            latencies, shed = self._column("latency"), self._column("shed")
             out |= {
                 "dropped": self.dropped,
+                "shed": {step.name.lower(): int(np.count_nonzero(shed >= step)) for step in Shed if step},
                 "latency_ms_median": _number(np.median(latencies)),
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }

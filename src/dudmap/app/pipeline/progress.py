@@ -74,8 +74,9 @@ class RunProgress:
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
-    def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
-        """Show a processed frame and the number of frames that a live run has dropped so far."""
+    def frame(self, index: int, result: "FrameResult", dropped: int | None = None, shed: str = "") -> None:
+        """Show a processed frame, the number of frames that a live run has dropped so far, and the work that it
+        omits."""
         if self._skipped > 1:
             log.info("frame %d: readable again, %d skipped", index, self._skipped)
         self._skipped = 0
@@ -91,6 +92,8 @@ class RunProgress:
         state = f"[{'red' if result.T_world_camera is None else 'green'}]{result.status}[/]"
         if dropped:
             state += f", {dropped} dropped"
+        if shed:
+            state += f", {shed}"
         self._bar.update(
             self._task,
             completed=index + 1,
@@ -156,4 +159,6 @@ def outcome(metrics: dict[str, Any], out: Path) -> str:
 
 def _reasons(metrics: dict[str, Any]) -> str:
     said = [f"{metrics[key]} {why}" for key, why in NOT_FUSED.items() if metrics[key]]
+    if omitted := metrics.get("shed", {}).get("fusion"):
+        said.append(f"{omitted} for lack of time")
     return f" ({', '.join(said)})" if said else ""

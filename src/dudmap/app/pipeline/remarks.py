@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.core.shed import Shed
 
 if TYPE_CHECKING:
     from dudmap.core.slam import Slam
@@ -22,6 +23,12 @@ def remarks(slam: "Slam", record: RunRecord) -> Iterator[str]:
     if dropped := record.dropped:
         total = dropped + len(record.rows) + len(record.unreadable)
         yield f"live: {dropped} of {total} frames were dropped"
+    if omitted := [row["shed"] for row in record.rows if row.get("shed")]:
+        labels, fusion = (sum(shed >= step for shed in omitted) for step in (Shed.LABELS, Shed.FUSION))
+        yield (
+            f"live: for lack of time, {len(omitted)} frames have no moving objects, {labels} have the labels of the "
+            f"frame before, {fusion} are not fused"
+        )
 
 
 def _unmerged_submaps(slam: "Slam") -> str:

@@ -17,6 +17,7 @@ from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.remarks import remarks
 from dudmap.app.pipeline.run_folder import IGNORED, RunReport, locked, prepare_run_folder, save_mask, write_run_folder
+from dudmap.app.pipeline.shedding import Shedding
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, StoredRun, Storing
 from dudmap.app.state.database import StateReader
 from dudmap.app.state.tree import TreeReader
@@ -304,12 +305,13 @@ class Job:
                     observer.start(state.slam, self.out, options.max_frames)
             mask_folder = self.out if options.save_masks and number == options.passes - 1 else None
             live = isinstance(self.sequence, LiveCamera)
+            shedding = Shedding() if live and options.config.system != "thesis" else None
             with Background(postponed=live) as background, closing(self._frames(state, background)) as frames:
                 for frame in frames:
                     with interruption.postponed():
                         process_source(
                             frame, state.slam, state.record, self.display, mask_folder, background, self.observers,
-                            self.poses,
+                            self.poses, shedding,
                         )  # fmt: skip
                         state.next = frame.number + 1
                         if store is not None:

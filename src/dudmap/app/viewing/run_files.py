@@ -19,7 +19,7 @@ from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 FOLDER = "thumbnails"
-NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency")
+NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency", "shed")
 MAX_TRIANGLES = 5_000_000
 """Most triangles of a mesh in a page or window; a larger mesh is simplified."""
 LARGEST_THUMBNAIL = 2**22

@@ -22,9 +22,9 @@ from dudmap.core.backends.cpu.evidence import (
 from dudmap.core.backends.cpu.segment_motion import STARTED_SHARE, moving_segments, stand_still
 from dudmap.core.backends.parameters import single
 from dudmap.core.backends.threads import submit
-from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture
+from dudmap.core.dynamics.masks import RULES, SEAM, Labels, Mixture, opened_mask
 from dudmap.core.dynamics.segments import Segmentation, pixel_scale, scaled_length, segment
-from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory
+from dudmap.core.dynamics.temporal_memory import BackgroundModel, TemporalMemory, dynamic_segments
 from dudmap.core.frames.observation import Level, Pyramid, saturated, unsaturated
 from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
@@ -157,9 +157,7 @@ class DynamicDetector(Stateful):
         """
         depth = level.depth
         noise = noise_parameters(self.sensor, level, volume.voxel_size)
-        sample = volume.sample(depth, level.intensity, level.camera, T_world_camera)
-        if (dark := saturated(level, exposure, sample.difference)) is not None:
-            sample.difference[dark] = np.nan
+        sample = _sample(volume, level, T_world_camera, exposure)
         sigma, tolerance, probability = (np.empty(depth.shape, np.float32) for _ in range(3))
         histogram = np.zeros(BINS, np.int64)
         unknown, (prior, static, moves) = weigh_readings(
@@ -183,6 +181,33 @@ class DynamicDetector(Stateful):
         probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = self.background.hidden(timestamp, unsaturated(level, exposure), T_world_camera)
         return Labels(probability, dynamic, mixture, histogram, sample, segments, hidden)
+
+    def carried(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        segmentation: Callable[[], Segmentation],
+        exposure: tuple[float, float],
+    ) -> Labels:
+        """Labels of a registered frame from the last one, for the arguments of ``detect``.
+
+        Dynamic are the points of the dynamic segments of the last frame, connected points in known free space, and the
+        segments of both.
+        """
+        import cv2
+
+        segments, carried = segmentation(), self.memory.last_dynamic(level, T_world_camera)
+        sample = _sample(volume, level, T_world_camera, exposure)
+        free = opened_mask(sample.occupancy == FREE, level)
+        count, numbers = cv2.connectedComponents((carried | free).view(np.uint8), connectivity=4)
+        components = np.asarray(numbers, np.int32)
+        moving = np.bincount(components[carried], minlength=count) > 0
+        moving[0] = False
+        dynamic = moving[components]
+        dynamic |= dynamic_segments(segments, dynamic)
+        probability = np.where(dynamic, np.float32(0), np.float32(1))
+        return Labels(probability, dynamic, None, np.zeros(BINS, np.int64), sample, segments)
 
     def update(
         self,
@@ -261,6 +286,16 @@ class DynamicDetector(Stateful):
         still = (np.arange(segments.count + 1) > 0) & (known > MAPPED_SHARE * asked)
         stand_still(segments, mapped, distance, difference, still)
         return moving & still[segments.labels]
+
+
+def _sample(
+    volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64], exposure: tuple[float, float]
+) -> MapSample:
+    """The map at the points of an image; saturated pixels have no intensity difference."""
+    sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
+    if (dark := saturated(level, exposure, sample.difference)) is not None:
+        sample.difference[dark] = np.nan
+    return sample
 
 
 def noise_parameters(sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:

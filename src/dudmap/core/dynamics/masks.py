@@ -84,8 +84,8 @@ class Labels:
     Attributes:
         static_probability: (h, w) float32 in [0, 1]; the weights of the second registration.
         dynamic: (h, w) bool.
-        mixture: The fitted densities.
-        histogram: (BINS,) counts of the normalised residuals.
+        mixture: The fitted densities; None if the labels are carried over from the last frame.
+        histogram: (BINS,) counts of the normalised residuals; 0 if the labels are carried over.
         sample: Distance, intensity difference and occupancy of the map at the points of the frame.
         segmentation: Surface segments of the frame.
         hidden: (h, w) bool, pixels without depth in front of known background; None if not examined.
@@ -93,7 +93,7 @@ class Labels:
 
     static_probability: NDArray[np.float32]
     dynamic: NDArray[np.bool_]
-    mixture: Mixture
+    mixture: Mixture | None
     histogram: NDArray[np.int64]
     sample: MapSample
     segmentation: Segmentation | None = None

@@ -32,6 +32,9 @@ in a room."""
 DYNAMIC_SHARE = 0.2
 """Smallest share of dynamic pixels of a segment that is remembered as dynamic."""
 
+CARRIED_TIME = 0.05
+"""Longest time over which labels are carried, seconds: a fast walker, 2 m/s, moves by MAX_DISPLACEMENT of a room."""
+
 
 @dataclass(eq=False)
 class RememberedFrame:
@@ -104,9 +107,7 @@ class TemporalMemory(Stateful):
         """
         marks = np.zeros(dynamic.shape, dtype=np.uint8)
         if segmentation is not None:
-            dynamic_segments = segmentation.share(dynamic) >= DYNAMIC_SHARE
-            dynamic_segments[0] = False
-            marks = dynamic_segments[segmentation.labels].view(np.uint8)
+            marks = dynamic_segments(segmentation, dynamic).view(np.uint8)
         settle_time, start_seconds = self.config.settle_time, self.config.start_seconds
         self._last = frame = RememberedFrame(timestamp, level, T_world_camera, marks)
         settle_frames, recent_frames = self._settle_frames, self._recent_frames
@@ -133,6 +134,10 @@ class TemporalMemory(Stateful):
         self._settle_frames.clear()
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
+
+    def is_recent(self, timestamp: float) -> bool:
+        """Whether the labels of the last frame can be carried to a frame at a time in seconds."""
+        return self._last is not None and timestamp - self._last.timestamp <= CARRIED_TIME
 
     def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Pixels (h, w) of an image at a pose (4, 4) whose points belonged to a dynamic segment in the last frame."""
@@ -209,6 +214,13 @@ class TemporalMemory(Stateful):
             if not still.any():  # moving objects have mostly left their place since the oldest frame
                 break
         return dynamic & still[segments.labels]
+
+
+def dynamic_segments(segmentation: Segmentation, dynamic: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (h, w) of the segments with a share of at least DYNAMIC_SHARE in a mask (h, w) bool."""
+    chosen = segmentation.share(dynamic) >= DYNAMIC_SHARE
+    chosen[0] = False
+    return chosen[segmentation.labels]
 
 
 def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> Reprojection:

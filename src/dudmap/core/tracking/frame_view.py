@@ -15,6 +15,7 @@ from dudmap.core.dynamics.image_motion import TrackedImage
 from dudmap.core.dynamics.masks import Labels, full_mask
 from dudmap.core.dynamics.segments import Segmentation
 from dudmap.core.frames.observation import Level, Observation, Pyramid, reduced, saturated
+from dudmap.core.shed import Shed
 from dudmap.core.state import CACHE
 from dudmap.core.tracking.observability import unobserved_motion
 from dudmap.core.tracking.tracker import TrackingResult
@@ -79,6 +80,7 @@ class FrameView:
         blind: The image is textureless although the first image of the map was not, or the light has changed too much.
             Only the distances determine the pose, and the frame is not fused.
         color_velocity: (6,) twist of the camera per second with which the colours were registered.
+        shed: Work that is omitted from the frame.
         colors: Returns the observation with registered colours; None if its colours are registered.
     """
 
@@ -88,6 +90,7 @@ class FrameView:
     timer: StageTimer = field(default_factory=StageTimer, metadata=CACHE)
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False
+    shed: Shed = field(default=Shed.NOTHING, metadata=CACHE)
     color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
     colors: Callable[[], Observation] | None = None
 

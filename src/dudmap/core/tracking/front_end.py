@@ -17,6 +17,7 @@ from dudmap.core.dynamics.masks import Labels
 from dudmap.core.frames.observation import is_majority_dynamic, reduced
 from dudmap.core.geometry.se3 import agree
 from dudmap.core.map.volume import SURFACE, TsdfVolume
+from dudmap.core.shed import Shed
 from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.color_motion import ColorMotion, gain_discount, motion_discount
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate, initial_weights, static_weights
@@ -223,7 +224,7 @@ class FrontEnd(Stateful):
         if not view.blind:
             (gain, offset), mean = tracking.exposure, float(view.pyramid.coarse.intensity.mean())
             self._brightness = gain * mean + offset
-        if labels is None or view.blind:
+        if labels is None or view.blind or labels.mixture is None:  # carried labels are not carried again
             return
         with view.timer("label"):
             self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
@@ -282,18 +283,23 @@ class FrontEnd(Stateful):
         that fits at an indistinguishable pose is static.
         """
         with view.timer("label"):
-            T_world_camera = self._by_distances(volume, view, prediction, tracking)
-            added = [cue.log_odds(volume, view, T_world_camera) for cue in self.cues]
-            labels = self.detector.detect(
-                volume,
-                view.labelled,
-                T_world_camera,
-                view.timestamp,
-                view.segmentation,
-                prediction.moving,
-                tracking.exposure,
-                np.asarray(sum(added), np.float32) if added else NONE,
-            )
+            if view.shed >= Shed.LABELS and prediction.moving is None:
+                labels = self.detector.carried(
+                    volume, view.labelled, tracking.T_world_camera, view.segmentation, tracking.exposure
+                )
+            else:
+                T_world_camera = self._by_distances(volume, view, prediction, tracking)
+                added = [cue.log_odds(volume, view, T_world_camera) for cue in self.cues]
+                labels = self.detector.detect(
+                    volume,
+                    view.labelled,
+                    T_world_camera,
+                    view.timestamp,
+                    view.segmentation,
+                    prediction.moving,
+                    tracking.exposure,
+                    np.asarray(sum(added), np.float32) if added else NONE,
+                )
             if view.without_image:
                 labels = replace(labels, hidden=None)
             if view.known_dynamic is None:

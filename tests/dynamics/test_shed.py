@@ -1,0 +1,64 @@
+"""Omitted work: its effect on labels, map, poses and moving objects, against exact truth."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.shed import Shed
+from dudmap.core.slam import Slam
+from dudmap.evaluation.segmentation import mask_iou
+from dudmap.lab import synthetic
+from off_course import LIMIT, off_course
+
+CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+YOUNG, OMITTED, FRAMES = 32, 55, 57
+"""Frames of the young map, at 30 Hz; frames until nothing is omitted; all frames."""
+
+
+@pytest.fixture(scope="module")
+def shed():
+    """A room that a mover enters once the map is complete: each frame with its result and the IoU of its mask."""
+    sequence = synthetic.sequence("room", frames=FRAMES, camera=CAMERA, noise="none")
+    slam, results, ious = Slam(CAMERA), [], []
+    for number in range(FRAMES):
+        slam.shed = Shed.NOTHING if number >= OMITTED else Shed.FUSION
+        results.append(slam.process(sequence[number]))
+        truth = sequence.mask(number)
+        large = truth.mean() > 0.02  # of a smaller mover, the rim is most
+        ious.append(mask_iou(results[-1].dynamic_mask, truth) if large else np.nan)
+    return sequence, results, np.array(ious)
+
+
+def test_the_young_map_is_labelled_and_fused_in_full(shed):
+    _, results, _ = shed
+    assert {result.shed for result in results[1 : YOUNG - 2]} == {Shed.MOVERS}
+    assert all(result.fused for result in results[: YOUNG - 2])
+
+
+def test_every_second_frame_is_not_fused_and_no_redundant_view(shed):
+    _, results, _ = shed
+    found = [(result.shed, result.fused, result.reasons) for result in results[YOUNG:OMITTED]]
+    pair = {(Shed.MOVERS, True, ()), (Shed.FUSION, False, ("no time to fuse the frame",))}
+    assert all(set(two) == pair for two in pairwise(found))
+
+
+def test_carried_labels_cover_the_mover(shed):
+    _, results, ious = shed
+    carried = np.array([result.shed >= Shed.LABELS for result in results]) & ~np.isnan(ious)
+    assert carried.sum() >= 5
+    assert ious[carried].min() > 0.6, "a mover that enters has 0.7 of its final area in the last frame"
+    assert ious[carried].mean() > 0.75
+    assert np.nanmean(ious[~carried]) > 0.8
+
+
+def test_the_pose_does_not_suffer(shed):
+    sequence, results, _ = shed
+    assert off_course(sequence.ground_truth.Ts_world_camera, [r.T_world_camera for r in results]) < LIMIT
+
+
+def test_moving_objects_return(shed):
+    _, results, _ = shed
+    assert not any(result.movers for result in results[1:OMITTED])
+    assert all(result.movers for result in results[OMITTED:])
