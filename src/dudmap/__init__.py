@@ -50,6 +50,7 @@ _HOMES = {
     "Slam": "core.slam",
     "StateError": "errors",
     "Status": "core.result",
+    "Shed": "core.shed",
     "Storing": "app.pipeline.storing",
     "SubmapsConfig": "config",
     "ThesisConfig": "thesis_config",
@@ -107,6 +108,7 @@ __all__ = [
     "SavedMap",
     "SensorConfig",
     "Sequence",
+    "Shed",
     "SimilarityConfig",
     "Slam",
     "StateError",
@@ -162,6 +164,7 @@ if TYPE_CHECKING:
     from dudmap.core.objects.object_tracker import Mover
     from dudmap.core.places.saved_map import SavedMap
     from dudmap.core.result import FrameResult, Status
+    from dudmap.core.shed import Shed
     from dudmap.core.slam import Slam
     from dudmap.core.tracking.frame_view import FrameView
     from dudmap.core.verdict import Outcome, Verdict
