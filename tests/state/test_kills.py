@@ -1,6 +1,7 @@
 """A run that is killed at any moment, or whose disk is full, and continued gives what an undisturbed run gives."""
 
 import json
+import logging
 import shutil
 import sys
 import time
@@ -11,12 +12,19 @@ import pytest
 from killing import begin, in_child, killed, lost_and_found, proceed, results
 
 from delayed_color import DELAY, find_early
-from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.run_folder import LOCK
 from dudmap.app.state.database import StateDatabase
 from dudmap.errors import DudmapError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
+
+
+def listener():
+    """List of all sentences that the program logs from now on."""
+    said, handler = [], logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())
+    logging.getLogger("dudmap").addHandler(handler)
+    return said
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +34,9 @@ def whole(tmp_path_factory):
     cv2.setNumThreads(1)  # threads do not survive the fork
     find_early(patch, (4, 20, 40))
     sequence, out = lost_and_found(), tmp_path_factory.mktemp("whole")
-    statements, said, execute = [], [], StateDatabase._execute
+    statements, said, execute = [], listener(), StateDatabase._execute
     with pytest.MonkeyPatch.context() as during:
         during.setattr(StateDatabase, "_execute", lambda *given: statements.append(given[1]) or execute(*given))
-        during.setattr(RunProgress, "note", lambda self, sentence: said.append(sentence))
         begin(sequence, out)
     assert not [sentence for sentence in said if "cannot be stored" in sentence]
     found = results(out)
@@ -86,10 +93,7 @@ def on_a_full_disk(sequence, out, report):
     """A run whose files cannot grow beyond ``LIMIT``; what it says is written to ``report``."""
     import resource  # POSIX only
 
-    from dudmap.app.pipeline.progress import RunProgress
-
-    said = []
-    RunProgress.note = lambda self, sentence: said.append(sentence)
+    said = listener()
     resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, resource.RLIM_INFINITY))
     error = ""
     try:
