@@ -176,10 +176,10 @@ def test_the_first_demo_waits_for_the_first_of_two_processes_and_ends_both(tmp_p
     monkeypatch.setattr(warmup.subprocess, "Popen", Process)
     monkeypatch.setattr(warmup, "num_threads", lambda: 2)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    with warmup.compiled_for_demo(quiet=True):
+    with warmup.compiled_for_demo():
         assert calls == [("wait", True)]
     assert calls[1:] == [("terminate", False), ("wait", False), ("terminate", True), ("wait", True)]
     calls.clear()
     (kernel_cache.folder() / "kernel.nbi").touch()
-    with warmup.compiled_for_demo(quiet=True):
+    with warmup.compiled_for_demo():
         assert calls == []

@@ -311,7 +311,7 @@ def watched(before, frames, poses, camera, out):
     watch = ChangeWatch(before, (SimpleNamespace(event=lambda name, **row: told.append((name, row))),), MIN_SIZE)
     watch.start(SimpleNamespace(camera=camera), out, len(frames))
     for index, (frame, T) in enumerate(zip(frames, poses, strict=True)):
-        result = SimpleNamespace(T_world_camera=T, submap=0, state="tracked")
+        result = SimpleNamespace(T_world_camera=T, submap=0, status="tracked")
         watch.frame(index, SimpleNamespace(frame=frame), result, 0.0)
     watch.finish(out)
     rows = [json.loads(line) for line in (out / WATCH_FILE).read_text().splitlines()]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap import Config, Slam
-from dudmap.core import mapper
+from dudmap.core import young_map
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.lab import synthetic
@@ -23,7 +23,7 @@ def room():
 
 def run(room, monkeypatch, window, spoil=lambda slam, index: None, *, live=False):
     """A run of 25 frames whose poses are estimated again after so many, and the poses as they were returned."""
-    monkeypatch.setattr(mapper, "WINDOW", window)
+    monkeypatch.setattr(young_map, "WINDOW", window)
     slam, returned = Slam(room.camera, Config(), live=live), []
     for index in range(25):
         spoil(slam, index)
@@ -55,11 +55,11 @@ def test_the_poses_of_a_young_map_become_better_and_the_map_follows(room, monkey
 
 
 def test_it_never_happens_to_a_map_that_began_anew(room, monkeypatch):
-    slam, returned = run(room, monkeypatch, WINDOW, lambda slam, n: slam.bootstrap.abandon() if n == 10 else None)
+    slam, returned = run(room, monkeypatch, WINDOW, lambda slam, n: slam.young_map.abandon() if n == 10 else None)
     assert np.array_equal(slam.trajectory.Ts_world_camera, returned)
 
 
 def test_a_live_camera_does_not_wait_for_it(room, monkeypatch):
     slam, returned = run(room, monkeypatch, WINDOW, live=True)
     assert np.array_equal(slam.trajectory.Ts_world_camera, returned)
-    assert slam.bootstrap.complete_window() == []  # nor are frames kept for it
+    assert slam.young_map.complete_window() == []  # nor are frames kept for it

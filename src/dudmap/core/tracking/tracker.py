@@ -393,7 +393,9 @@ class Tracker:
         weights = residual_weights(level.depth, residuals, found.weights, found.parameters)[:2]
         size = max(1, level.camera.width // BLOCKS_ACROSS)
         rows, columns = level.camera.height // size, level.camera.width // size
-        scaled = (np.sqrt(weights) * residuals)[:, : rows * size, : columns * size].reshape(-1, columns * size)
+        scaled = (np.sqrt(weights) * np.stack([residuals[0], residuals[1]]))[
+            :, : rows * size, : columns * size
+        ].reshape(-1, columns * size)
         cv2.patchNaNs(scaled, 0.0)
         sums = size**2 * cv2.resize(scaled, (columns, 2 * rows), interpolation=cv2.INTER_AREA)
         variance = float(np.sum(np.square(sums)) / max(np.count_nonzero(weights), 1))
