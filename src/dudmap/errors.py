@@ -49,6 +49,10 @@ class FrameError(DatasetError):
         self.kind = kind
 
 
+class NoImagesError(DatasetError):
+    """The images or masks of a run cannot be found; the sentence names the option that keeps them."""
+
+
 class MissingExtraError(ConfigError):
     """A library of an extra is not installed; the sentence names the extra."""
 

@@ -196,6 +196,34 @@ def gate(
 
 
 @app.command()
+def texture(
+    run: o.RunArgument,
+    size: Annotated[int, Option("--texture-size", help="Width of the texture.", metavar="PIXELS")] = 4096,
+    max_triangles: Annotated[int | None, Option(min=4, help="Most triangles of the mesh.", metavar="N")] = None,
+    sheet: Annotated[
+        Path | None, Option(help="Picture (.png): recorded image, texture, vertex colours.", metavar="FILE")
+    ] = None,
+    sequence: Annotated[
+        Path | None, Option(help="The recording of the run; default: its own.", metavar="SEQUENCE")
+    ] = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Compare images that a texture was not made from with renderings of the texture and of vertex colours."""
+    from dataclasses import asdict
+
+    from dudmap.io.exporting.run_content import ExportOptions, RunContent
+    from dudmap.lab.benchmark.texture import measure_texture
+
+    options = ExportOptions(texture=size, max_triangles=max_triangles, sequence=sequence)
+    found = measure_texture(RunContent.load(run), options, sheet)
+    text = (
+        f"PSNR over {found.views} held-out views: texture {found.texture_db:.2f} dB, vertex colours "
+        f"{found.vertices_db:.2f} dB; {found.seen:.0%} of the texels were seen"
+    )
+    answer(asdict(found), text, as_json=as_json)
+
+
+@app.command()
 @o.grouped
 def consistency(
     reading: o.ReadingOptions,

@@ -33,8 +33,10 @@ def demo(
     """Render a short recording with a walking person and run on it.
 
     The depth has the noise of a Kinect; poses and masks are known exactly. The run folder also receives demo.png:
-    colour, depth, mask, residuals and the map without the person, rendered from the same pose.
+    colour, depth, mask, residuals and the map without the person, rendered from the same pose; images/ holds frames for
+    a texture (dudmap export --texture).
     """
+    from dudmap.app.pipeline.image_keeper import ImageKeeper
     from dudmap.app.pipeline.run import run
     from dudmap.lab.synthetic import sequence
     from dudmap.lab.warmup import compiled_for_demo
@@ -46,7 +48,8 @@ def demo(
     keeper = MostDynamicFrame()
     with observers(watching) as watchers, compiled_for_demo():
         done = run(
-            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watchers, keeper),
+            recording, config, out, save_masks=True, progress=not quiet, ahead=0,
+            observers=(*watchers, keeper, ImageKeeper(recording)),
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 

@@ -1,12 +1,15 @@
 """``dudmap export``: results of a run in the format of another program."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from typer import Option
 
+from dudmap.app.terminal import say
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
+from dudmap.errors import NoImagesError
 from dudmap.io.exporting.exporters import EXPORTERS
 from dudmap.io.exporting.run_content import SPECK, ExportOptions
 
@@ -25,6 +28,13 @@ def export(
     ] = SPECK,
     fill_holes: Annotated[
         float | None, Option(min=0, help="Close holes with a shorter border.", metavar="METRES")
+    ] = None,
+    texture: Annotated[
+        bool,
+        Option("--texture", help="Texture of .glb, .obj (with .mtl and .jpg) and .usdz from the images of the run."),
+    ] = False,
+    texture_size: Annotated[
+        int | None, Option(help="Width of the texture, 64 to 8192; default: 4096. Implies --texture.", metavar="PIXELS")
     ] = None,
     up: o.UpOption = None,
     z_up: Annotated[bool, Option("--z-up", help="Turn surface or trajectory: z up from the floor.")] = False,
@@ -57,6 +67,15 @@ def export(
         sequence=sequence,
         camera=camera,
         every=every,
+        texture=texture_size if texture_size is not None else 4096 if texture else None,
     )
-    path = export_run(run, out, options)
-    answer({"export": path, "bytes": path.stat().st_size}, f"written to {path}", as_json=as_json, quiet=quiet)
+    try:
+        path = export_run(run, out, options)
+    except NoImagesError as error:
+        if options.texture is None:
+            raise
+        say(f"warning: {error}; the mesh is written with vertex colours", err=True)
+        options = replace(options, texture=None, sequence=None, camera=None, every=1)
+        path = export_run(run, out, options)
+    tree = {"export": path, "bytes": path.stat().st_size, "texture": options.texture}
+    answer(tree, f"written to {path}", as_json=as_json, quiet=quiet)

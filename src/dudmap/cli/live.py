@@ -30,6 +30,7 @@ def live(
     record: Annotated[Path | None, Option(help="MCAP file for all frames that arrive.", metavar="FILE.mcap")] = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<camera>.")] = None,
     save_masks: o.SaveMasksOption = False,
+    save_images: o.SaveImagesOption = False,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     calibration: Annotated[
@@ -41,6 +42,7 @@ def live(
 
     Frames wait for at most 0.1 s; later ones are dropped and counted, but recorded with --record.
     """
+    from dudmap.app.pipeline.image_keeper import ImageKeeper
     from dudmap.app.pipeline.run import PREVIEW, run
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.cameras import open_camera
@@ -52,10 +54,11 @@ def live(
     source = open_camera(camera)
     config = for_range(config, parameters, mapped, source.preview(PREVIEW))
     with observers(watching) as watchers, compiled_during_run(live=True):
+        watchers += (ImageKeeper(source),) if save_images else ()
         done = run(
             source, config, out or free_folder(Path("runs") / source.name),
-            max_frames=max_frames, save_masks=save_masks, ignore=ignore, record=record, calibration=given,
-            progress=not quiet, saved_map=saved_map, localize=mapped.localize,
+            max_frames=max_frames, save_masks=save_masks or save_images, ignore=ignore, record=record,
+            calibration=given, progress=not quiet, saved_map=saved_map, localize=mapped.localize,
             max_memory=o.memory_size(mapped.max_memory), observers=watchers,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)

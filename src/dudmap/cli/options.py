@@ -116,6 +116,10 @@ IgnoreOption = Annotated[
     Option(help="Image, white at pixels to ignore, such as a robot's arm in view.", metavar="MASK.png"),
 ]
 SaveMasksOption = Annotated[bool, Option("--save-masks/--no-save-masks", help="Write the dynamic mask of every frame.")]
+SaveImagesOption = Annotated[
+    bool,
+    Option("--save-images", help="Keep colour and depth wherever the camera has moved, for textures (images/)."),
+]
 HostOption = Annotated[
     str, Option(help="Address the page is served at; 0.0.0.0 lets other machines see it.", metavar="HOST")
 ]

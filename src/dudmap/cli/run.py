@@ -57,6 +57,7 @@ def run(
     max_frames: o.MaxFramesOption = None,
     out: Annotated[Path | None, Option(help="Run folder; default: runs/<recording>.")] = None,
     save_masks: o.SaveMasksOption = True,
+    save_images: o.SaveImagesOption = False,
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
     watch: Annotated[
@@ -94,6 +95,7 @@ def run(
     moving object.
     """
     from dudmap.app.pipeline.given_poses import checked_options, given_poses
+    from dudmap.app.pipeline.image_keeper import FOLDER, ImageKeeper
     from dudmap.app.pipeline.inspection import inspect, sample
     from dudmap.app.pipeline.resume import resume as resume_run
     from dudmap.app.pipeline.run import run as run_sequence
@@ -106,6 +108,7 @@ def run(
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume continues a run with its own options; leave out the recording and --out")
         with observers(replace(watching, report=False)) as watchers:
+            watchers += (ImageKeeper(None),) if (resume / FOLDER).is_dir() else ()
             done = resume_run(resume, device=mapped.device, progress=not quiet, observers=watchers)
             print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
         return
@@ -133,6 +136,7 @@ def run(
     if watch and mapped.saved is None:
         raise typer.BadParameter("--watch compares with the map of an earlier visit; name it with --map RUN")
     with observers(watching) as watchers, compiled_during_run(live=live):
+        watchers += (ImageKeeper(recording),) if save_images else ()
         if watch and mapped.saved is not None:
             from dudmap.core.places.saved_map import SavedMap
             from dudmap.fleet.change_watch import ChangeWatch

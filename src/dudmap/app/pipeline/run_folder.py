@@ -60,6 +60,7 @@ WRITTEN = {
         *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
     )),
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
+    "images": r"-?\d+\.\d{6}\.(jpg|png)|(associations|intrinsics)\.txt",
 }  # fmt: skip
 """Regular expressions of all file names of a run, by sub-folder."""
 

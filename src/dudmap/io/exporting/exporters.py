@@ -34,15 +34,16 @@ class Exporter:
 
 _UPRIGHT = ("up", "z_up")
 _MESH = (*MESH_OPTIONS, *_UPRIGHT)
+_TEXTURE = ("texture", "sequence", "camera", "every")
 _POINTS = ("crop", "drop_pieces_below", *_UPRIGHT)
 _GRID = ("crop", "drop_pieces_below", "up", "resolution")
 _VIEWS = ("crop", "drop_pieces_below", "sequence", "camera", "every")
 EXPORTERS: dict[str, Exporter] = {
     ".ply": Exporter("mesh", "mesh_files:write", _MESH),
-    ".obj": Exporter("mesh", "mesh_files:write", _MESH),
+    ".obj": Exporter("mesh", "mesh_files:write_obj", (*_MESH, *_TEXTURE)),
     ".stl": Exporter("mesh without colours", "mesh_files:write", _MESH),
-    ".glb": Exporter("mesh for browsers and Blender, y up", "mesh_files:write_glb", (*MESH_OPTIONS, "up")),
-    ".usdz": Exporter("mesh for USD programs, y up", "mesh_files:write_usdz", (*MESH_OPTIONS, "up")),
+    ".glb": Exporter("mesh for browsers and Blender, y up", "mesh_files:write_glb", (*MESH_OPTIONS, "up", *_TEXTURE)),
+    ".usdz": Exporter("mesh for USD programs, y up", "mesh_files:write_usdz", (*MESH_OPTIONS, "up", *_TEXTURE)),
     ".points.ply": Exporter("point cloud", "mesh_files:write_ply", _POINTS),
     ".pcd": Exporter("point cloud of PCL", "mesh_files:write_pcd", _POINTS),
     ".laz": Exporter("point cloud, compressed LAS 1.4", "mesh_files:write_laz", _POINTS),

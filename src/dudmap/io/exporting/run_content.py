@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import ConfigError, DatasetError, MapError
+from dudmap.errors import ConfigError, DatasetError, MapError, NoImagesError
 from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
 from dudmap.version import __version__
 
@@ -135,7 +135,7 @@ class RunContent:
         folder = self.folder / "masks"
         masks = dict(stamped_masks(folder)) if folder.is_dir() else {}
         if not masks:
-            raise DatasetError(f"{self.folder} holds no dynamic masks; repeat the run with --save-masks")
+            raise NoImagesError(f"{self.folder} holds no dynamic masks; repeat the run with --save-masks")
         return masks
 
     def frames_of(self, sequence: "Sequence") -> Iterator[tuple[int, NDArray[np.float64], Path]]:
@@ -201,6 +201,7 @@ class ExportOptions:
         sequence: Recording of the run; None for the recording that the run names.
         camera: Intrinsics of that recording, as for ``--camera``; None for the run's intrinsics.
         every: Every N-th frame of the recording is exported.
+        texture: Width and height of the texture of a mesh, pixels; None for vertex colours.
     """
 
     max_triangles: int | None = None
@@ -214,6 +215,7 @@ class ExportOptions:
     sequence: Path | None = None
     camera: str | None = None
     every: int = 1
+    texture: int | None = None
 
     def check(self, taken: tuple[str, ...], name: str) -> None:
         """Check that only options are set that a format takes.

@@ -14,7 +14,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.geometry.mesh import Mesh
-from dudmap.errors import ConfigError, DatasetError
+from dudmap.errors import ConfigError, DatasetError, NoImagesError
 from dudmap.input_files import damaged
 from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
@@ -50,7 +50,7 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
 
     Poses are camera to world with OpenGL's camera axes; points.ply holds the seed points.
     """
-    sequence = _open(run, options)
+    sequence = images_of(run, options)
     _seeds(run, options).save(path.parent / "points.ply")
     folders = _folders(path.parent, "images", "depth", "masks")
     frames = []
@@ -81,7 +81,7 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
 
     Masks are named ``NAME.png.png``, 0 = dynamic, as for COLMAP's ``ImageReader.mask_path``.
     """
-    sequence, seeds = _open(run, options), _seeds(run, options)
+    sequence, seeds = images_of(run, options), _seeds(run, options)
     images, masks = _folders(path.parent, "images", "masks")
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
     for number, view in enumerate(_views(run, sequence, options.every), start=1):
@@ -115,11 +115,20 @@ def _colmap_camera(camera: Camera) -> str:
     return f"{model} {camera.width} {camera.height} " + " ".join(f"{number:.9g}" for number in numbers)
 
 
-def _open(run: RunContent, options: ExportOptions) -> "Sequence":
+def images_of(run: RunContent, options: ExportOptions) -> "Sequence":
+    """The recording of a run: as given, else the images kept in the run folder, else the one that the run names.
+
+    Raises:
+        NoImagesError: There are no images, or no masks.
+        DatasetError: The given recording cannot be read.
+    """
     given = {"path": options.sequence, "camera": options.camera}
-    opened = run.recording | {name: value for name, value in given.items() if value is not None}
+    kept = run.folder / "images"
+    known = {"path": kept} if (kept / "associations.txt").is_file() else run.recording
+    opened = known | {name: value for name, value in given.items() if value is not None}
+    keep = "name the recording by --sequence, or repeat the run with --save-images"
     if "path" not in opened:
-        raise ConfigError("the images come from the recording, which the run does not name; name it by --sequence")
+        raise NoImagesError(f"{run.folder} holds no images and names no recording; {keep}")
     if options.every < 1:
         raise ConfigError(f"found --every {options.every}; expected 1 or more")
     run.mask_files()
@@ -131,8 +140,8 @@ def _open(run: RunContent, options: ExportOptions) -> "Sequence":
     except DatasetError as error:
         if options.sequence is not None:
             raise
-        raise DatasetError(
-            f"the recording that the run names cannot be read; name it by --sequence: {error}"
+        raise NoImagesError(
+            f"{run.folder} holds no images, and its recording cannot be read ({error}); {keep}"
         ) from error
     run.color_camera(sequence)  # errors occur before anything is written
     return sequence

@@ -1,0 +1,205 @@
+"""Bake a texture: atlas, colours of each texel from the best views, filled gaps."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.texturing import draw_triangles, gather_colors
+from dudmap.core.backends.threads import bands, run_bands
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.errors import ConfigError, DatasetError
+from dudmap.extras import extra
+from dudmap.io.exporting.mesh_editing import edited
+from dudmap.io.exporting.run_content import ExportOptions, RunContent
+from dudmap.io.exporting.view_synthesis import images_of
+from dudmap.io.texturing.views import Taken, View, Views, groups
+
+SIZES = 64, 8192
+"""Smallest and largest texture, pixels; one of 8192 takes 2 GB while it is made."""
+TRIANGLES = 40_000
+"""Most triangles of a textured mesh by default: an atlas of as many takes ten seconds."""
+PADDING = 3
+"""Texels around a chart that continue it, so that interpolation and the first reduced images show no border."""
+BEST = 3
+"""Views that are mixed in a texel."""
+SHARP = 2.0
+"""Exponent of the weights in the mixture."""
+STEEPEST = 0.2
+"""Smallest cosine between viewing ray and normal."""
+ROWS = 64
+"""Rows of the texture that a thread fills at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """A mesh with a texture.
+
+    Attributes:
+        mesh: Vertices on seams of the atlas are repeated.
+        uv: (V, 2) float32 place in the image from (0, 0), its upper left corner, to (1, 1).
+        image: (S, S, 3) uint8.
+        seen: Share of the texels of the surface that a view shows; the others have vertex colours.
+    """
+
+    mesh: Mesh
+    uv: NDArray[np.float32]
+    image: NDArray[np.uint8]
+    seen: float
+
+
+def textured(run: RunContent, options: ExportOptions, chosen: "list[list[Taken]] | None" = None) -> TexturedMesh:
+    """The edited mesh of a run with a texture from its images, by the options' ``texture``, ``sequence``, ``every``.
+
+    ``chosen`` are the frames to use, None for all.
+
+    Raises:
+        ConfigError: The size is out of range.
+        NoImagesError: The run has no images.
+        DatasetError: The run has no masks, its poses do not belong to the recording, or the recording has no colour.
+        MissingExtraError: xatlas or fast-simplification is not installed.
+    """
+    size = options.texture or 0
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise ConfigError(f"found a texture of {size} pixels; expected {SIZES[0]} to {SIZES[1]}, such as 4096")
+    recording = images_of(run, options)
+    fine = edited(run.surface, replace(options, max_triangles=None))
+    mesh, uv = unwrapped(with_mean_colors(edited(fine, _reduced(options)), fine), size)
+    numbers = _texels(mesh, uv, size)
+    A = places(mesh, uv, size)
+    found, colors = np.zeros((size, size, BEST), np.float32), np.zeros((size, size, BEST, 3), np.uint8)
+    views, any_view = Views(run, recording, mesh), False
+    for view in views(groups(run, recording, options.every) if chosen is None else chosen):
+        any_view = True
+        _gather(view, mesh, A, views.camera, numbers, found, colors)
+    if not any_view:
+        raise DatasetError(f"{recording.name} has no colour images; leave out --texture")
+    image, seen = np.zeros((size, size, 3), np.uint8), found[..., 0] > 0
+    for start, stop in bands(size, ROWS):
+        weights = found[start:stop] ** np.float32(SHARP)
+        total = np.maximum(weights.sum(axis=2), np.float32(1e-30))
+        mixed = np.einsum("yxk,yxkc->yxc", weights, colors[start:stop].astype(np.float32)) / total[..., None]
+        image[start:stop] = np.rint(mixed)
+    on_mesh = numbers >= 0
+    rows, columns = np.nonzero(on_mesh & ~seen)
+    image[rows, columns] = _vertex_colors(fine, A, numbers[rows, columns], columns, rows)
+    return TexturedMesh(mesh, uv, _continued(image, on_mesh), float(seen.sum() / max(1, on_mesh.sum())))
+
+
+def _reduced(options: ExportOptions) -> ExportOptions:
+    return ExportOptions(max_triangles=options.max_triangles or TRIANGLES, drop_pieces_below=0.0)
+
+
+def with_mean_colors(mesh: Mesh, fine: Mesh) -> Mesh:
+    """Mesh whose vertices have the mean colour of the nearest vertices of a finer mesh."""
+    from scipy.spatial import KDTree
+
+    _, nearest = KDTree(mesh.vertices).query(fine.vertices, workers=-1)
+    count = np.bincount(nearest, minlength=len(mesh.vertices))
+    sums = [np.bincount(nearest, fine.colors[:, k], len(mesh.vertices)) for k in range(3)]
+    mean = np.rint(np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]).astype(np.uint8)
+    return replace(mesh, colors=np.where(count[:, None] > 0, mean, mesh.colors))
+
+
+def unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, NDArray[np.float32]]:
+    """Mesh cut along the seams of an atlas, and the place (V, 2) of its vertices, 0 to 1."""
+    with extra("texture", "--texture"):
+        import xatlas
+
+    atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
+    atlas.add_mesh(mesh.vertices, mesh.faces.astype(np.uint32))
+    packing.resolution, packing.padding = size, PADDING
+    atlas.generate(xatlas.ChartOptions(), packing)
+    origin, faces, uv = atlas[0]
+    parts = (mesh.vertices[origin], faces.astype(np.int32), mesh.colors[origin], mesh.normals[origin])
+    return Mesh(*parts), uv.astype(np.float32)
+
+
+def _texels(mesh: Mesh, uv: NDArray[np.float32], size: int) -> NDArray[np.int32]:
+    """Triangle (S, S) of each texel, -1 = none."""
+    points = np.column_stack([uv * np.float32(size) - np.float32(0.5), np.ones(len(uv), np.float32)])
+    numbers, distances = np.full((size, size), -1, np.int32), np.full((size, size), np.inf, np.float32)
+    draw_triangles(points, mesh.faces, np.float32(PADDING / 2), numbers, distances)
+    return numbers
+
+
+def places(mesh: Mesh, uv: NDArray[np.float32], size: int) -> NDArray[np.float64]:
+    """(F, 3, 3) maps (column, row, 1) of a texel of a triangle to its point; 0 for triangles without a surface."""
+    corners = np.ones((len(mesh.faces), 3, 3))
+    corners[:, :2] = (uv[mesh.faces].astype(np.float64) * size - 0.5).transpose(0, 2, 1)
+    out, flat = np.zeros_like(corners), np.abs(np.linalg.det(corners)) < 1e-6
+    points = mesh.vertices[mesh.faces].astype(np.float64).transpose(0, 2, 1)
+    out[~flat] = points[~flat] @ np.linalg.inv(corners[~flat])
+    return out
+
+
+def _gather(
+    view: View,
+    mesh: Mesh,
+    A: NDArray[np.float64],
+    camera: Camera,
+    numbers: NDArray[np.int32],
+    found: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+) -> None:
+    """Offer the colours of a view to all texels.
+
+    The weight of a triangle is its number of pixels per area: cosine over squared distance.
+    """
+    T = se3.inverse(view.T_world_camera)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    normal, ray = np.cross(b - a, c - a), (a + b + c) / 3 - view.T_world_camera[:3, 3]
+    z = ray @ view.T_world_camera[:3, 2]
+    cosine = -np.sum(normal * ray, axis=1) / np.maximum(
+        np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1), 1e-12
+    )
+    u, v = camera.project(np.column_stack([ray @ view.T_world_camera[:3, 0], ray @ view.T_world_camera[:3, 1], z])).T
+    reach = camera.width / 4
+    with np.errstate(invalid="ignore"):
+        visible = (cosine > STEEPEST) & (z > 0) & (u > -reach) & (v > -reach)
+        visible &= (u < camera.width + reach) & (v < camera.height + reach)
+    quality = np.where(visible, cosine / np.maximum(z, 0.1) ** 2, 0)
+    slope = np.sqrt(np.maximum(1 - cosine**2, 0)) / np.maximum(cosine, STEEPEST)
+    tolerance = z / camera.fx * (1 + slope)
+    H = camera.K @ (T[:3, :3] @ A + T[:3, 3:] * np.array([0, 0, 1.0]))
+    arrays = (H.astype(np.float32), quality.astype(np.float32), tolerance.astype(np.float32))
+
+    def fill(start: int, stop: int) -> None:
+        gather_colors(start, stop, numbers, *arrays, view.depth, view.weights, view.image, found, colors)
+
+    run_bands(fill, bands(len(numbers), ROWS))
+
+
+def _vertex_colors(
+    fine: Mesh, A: NDArray[np.float64], faces: NDArray[np.int32], columns: NDArray[np.intp], rows: NDArray[np.intp]
+) -> NDArray[np.uint8]:
+    """Colours (n, 3) of the nearest vertices of a mesh at texels (n,)."""
+    from scipy.spatial import KDTree
+
+    out, tree = np.empty((len(faces), 3), np.uint8), KDTree(fine.vertices)
+    for first in range(0, len(faces), 1 << 18):
+        part = slice(first, first + (1 << 18))
+        texels = np.stack([columns[part], rows[part], np.ones_like(rows[part])], axis=1)
+        distance, nearest = tree.query(np.einsum("nij,nj->ni", A[faces[part]], texels), k=3, workers=-1)
+        weights = 1 / np.maximum(distance, 1e-4)
+        mean = np.einsum("nk,nkc->nc", weights, fine.colors[nearest]) / weights.sum(axis=1, keepdims=True)
+        out[part] = np.rint(mean)
+    return out
+
+
+def _continued(image: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Image (S, S, 3) whose unknown texels continue the known ones, for reduced images in viewers and for JPEG."""
+    import cv2
+
+    if min(image.shape[:2]) == 1:
+        return image
+    half = tuple((size + 1) // 2 for size in known.shape[::-1])
+    share = np.asarray(cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA))
+    sums = np.asarray(cv2.resize(image * known[..., None].astype(np.uint8), half, interpolation=cv2.INTER_AREA))
+    mean = np.clip(sums / np.maximum(share, 1e-6)[..., None] + 0.5, 0, 255).astype(np.uint8)
+    coarse = _continued(mean, share > 0)
+    full = np.asarray(cv2.resize(coarse, known.shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
+    full[known] = image[known]
+    return full
