@@ -62,6 +62,7 @@ CASES = [
     ("export", "pye57", ["export", "run", "--out", "a.e57"]),
     ("export", "pxr.Sdf", ["export", "run", "--out", "a.usdz"]),
     ("export", "fast_simplification", ["export", "run", "--out", "a.ply", "--max-triangles", "4"]),
+    ("texture", "xatlas", ["export", "run", "--out", "a.glb", "--texture", "--sequence", "recording"]),
     *(("study", module, ["study", "design.toml"]) for module in STUDY),
     ("study", "optuna", ["study", "tune", "design.toml"]),
     ("study", "pandas", ["study", "thesis", "--published"]),

@@ -33,8 +33,8 @@ def demo(
     """Render a short recording with a walking person and run on it.
 
     The depth has the noise of a Kinect; poses and masks are known exactly. The run folder also receives demo.png:
-    colour, depth, mask, residuals and the map without the person, rendered from the same pose; images/ holds frames for
-    a texture (dudmap export --texture).
+    colour, depth, mask, residuals and the map without the person, rendered from the same pose. Its folder
+    images/ holds frames for a texture (dudmap export --texture).
     """
     from dudmap.app.pipeline.image_keeper import ImageKeeper
     from dudmap.app.pipeline.run import run

@@ -21,6 +21,7 @@ from dudmap.config import Config
 from dudmap.core import kernel_cache
 from dudmap.core.backends.cpu import points, rvl
 from dudmap.core.backends.cpu.evidence import BINS, EDGES
+from dudmap.core.backends.cpu.texturing import draw_triangles, gather_colors
 from dudmap.core.backends.parameters import SensorNoise, TruncationBand
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.calibration.adjustment import Adjustment, Fit, Pair, PairSet
@@ -145,6 +146,14 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         if noise:
             recording.surface(observed=True)
 
+    def texture() -> None:
+        corners, faces = np.eye(3, dtype=np.float32) + np.float32(1), np.arange(3, dtype=np.int32)[None]
+        numbers, depth = np.full((8, 8), -1, np.int32), np.full((8, 8), np.inf, np.float32)
+        draw_triangles(corners, faces, np.float32(0), numbers, depth)
+        H, one, image = np.eye(3, dtype=np.float32)[None], np.ones(1, np.float32), np.zeros((8, 8, 3), np.uint8)
+        found = np.zeros((8, 8, 3), np.uint16), np.zeros((8, 8, 3, 3), np.uint8)
+        gather_colors(0, 8, numbers, H, np.ones(1, np.int32), one, depth, numbers, image, *found)
+
     return [
         ("tracking, labels and map", process),
         ("colour camera", color_camera),
@@ -158,6 +167,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("calibration", calibration),
         ("several voxel sizes", several_voxel_sizes),
         ("synthetic time of flight", lambda: synthetic_frames("l515")),
+        ("texture", texture),
     ]
 
 

@@ -1,6 +1,6 @@
 """Images of a run as sources of a texture: static pixels in the exposure of the map, without lens distortion."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -29,8 +29,8 @@ TRIED = 3
 MOST = 300
 """Most views; one of 640x480 pixels takes a tenth of a second."""
 MARGIN = 12 / 640
-"""Width by which masks grow, as a share of the image width: blur, mixed pixels, and a person of 1.5 m/s at 2 m in the
-20 ms between both images."""
+"""Width by which masks grow, as a share of the image width: blur and mixed pixels, and the way of a walking person (1
+m/s at 1.5 m) in 20 ms between colour and depth."""
 FADE = 24 / 640
 """Distance from masks and depth edges at which pixels get their full weight, as a share of the image width."""
 LEAST = 0.02
@@ -41,8 +41,11 @@ TOLERANCE = 0.03
 EDGE = 0.05
 """Relative difference of neighbouring depths across an edge of an object: the surface is not steeper than 85 degrees at
 a focal length of 525 pixels and less."""
-STRIDE, SMOOTH = 4, 1 / 24
-"""Pixels per sample of the exposure, and standard deviation of its smoothing as a share of the image width."""
+FARTHEST = 16 / 640
+"""Largest shift of an image onto the map, as a share of the width."""
+STRIDE, SMOOTH = 2, 1 / 24
+"""Pixels per sample of registration and exposure; standard deviation of the exposure's smoothing as a share of the
+image width."""
 TWIST_TIME = 1 / 30
 """Time between the poses that give the velocity during an exposure, seconds: a frame."""
 BRIGHTEST = 250
@@ -106,7 +109,8 @@ class Views:
         run: Poses, masks and calibration.
         sequence: The recording of the run.
         mesh: The surface.
-        level: Whether images take the exposure of the map; else they stay as recorded.
+        colors: (n, 3) corners and their shares (n, 3) to colours (n, 3) of the mesh, to which images are registered.
+        level: Whether images take the exposure of the mesh; else they stay as recorded.
 
     Attributes:
         camera: Of all views.
@@ -115,8 +119,11 @@ class Views:
         DatasetError: The run lacks the calibration of a separate colour camera.
     """
 
-    def __init__(self, run: RunContent, sequence: "Recording", mesh: Mesh, *, level: bool = True) -> None:
+    def __init__(
+        self, run: RunContent, sequence: "Recording", mesh: Mesh, colors: "Colors | None" = None, *, level: bool = True
+    ) -> None:
         self._run, self._sequence, self._mesh, self._level = run, sequence, mesh, level
+        self._colors = vertex_colors(mesh) if colors is None else colors
         self._depth_lens = Lens(sequence.camera)
         color = run.color_camera(sequence)  # also checks
         self._color_lens = Lens(color if run.calibration is None else run.calibration.camera)
@@ -156,7 +163,8 @@ class Views:
             raise DatasetError(f"the masks of {self._run.folder} do not have the size of the images")
         T_depth_color = se3.inverse(taken.T_world_camera) @ T_world_color
         pixels = self._pixels(points, stamp, self._color_lens.straight, self._readouts[0], self._bent)
-        image = np.asarray(cv2.remap(frame.rgb, *pixels, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        bent, around = pixels, cv2.BORDER_REPLICATE
+        image = np.asarray(cv2.remap(frame.rgb, *bent, cv2.INTER_CUBIC, borderMode=around), np.uint8)
         if self._other is not None:
             moving = self._other.mask(moving, frame.depth, se3.inverse(T_depth_color))
             measured, expected = self._other.depth(frame.depth, se3.inverse(T_depth_color)), depth
@@ -174,8 +182,11 @@ class Views:
         inner = used & ~_edges(depth)
         distance = np.asarray(cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3))
         weights = np.where(used, np.clip(distance / (FADE * depth.shape[1]), LEAST, 1), 0).astype(np.float32)
-        if self._level:
-            image = levelled(image, self._mesh_colors(T_world_color, triangles, depth), weights)
+        shown = self._mesh_colors(T_world_color, triangles, depth)
+        columns, rows = aligned(image, shown, weights)
+        bent = bent[0] + columns, bent[1] + rows
+        image = np.asarray(cv2.remap(frame.rgb, *bent, cv2.INTER_CUBIC, borderMode=around), np.uint8)
+        image = levelled(image, shown, weights) if self._level else image
         return View(T_world_color, image, depth, weights, triangles)
 
     def _pixels(
@@ -206,13 +217,22 @@ class Views:
         self, T: NDArray[np.float64], triangles: NDArray[np.int32], depth: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Colours (h / STRIDE, w / STRIDE, 3) of the mesh, NaN without one."""
-        rows, columns = np.mgrid[STRIDE // 2 : depth.shape[0] : STRIDE, STRIDE // 2 : depth.shape[1] : STRIDE]
+        height, width = (STRIDE * (size // STRIDE) for size in depth.shape)
+        rows, columns = np.mgrid[STRIDE // 2 : height : STRIDE, STRIDE // 2 : width : STRIDE]
         faces = triangles[rows, columns]
         out = np.full((*faces.shape, 3), np.nan, np.float32)
         seen = faces >= 0
         corners, shares = hit(self._mesh, T, self.camera, rows[seen], columns[seen], faces[seen], depth)
-        out[seen] = np.einsum("nk,nkc->nc", shares, self._mesh.colors[corners])
+        out[seen] = self._colors(corners, shares)
         return out
+
+
+Colors = Callable[[NDArray[np.int32], NDArray[np.float64]], NDArray]
+
+
+def vertex_colors(mesh: Mesh) -> Colors:
+    """Colours (n, 3) between corners (n, 3) with shares (n, 3), by vertex colours."""
+    return lambda corners, shares: np.einsum("nk,nkc->nc", shares, mesh.colors[corners])
 
 
 def drawn(
@@ -262,11 +282,9 @@ def levelled(
     import cv2
 
     size = expected.shape[1::-1]
-    used = (weights > 0) & (image.max(axis=2) < BRIGHTEST)
-    share = np.asarray(cv2.resize(used.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-    share = np.where(np.isfinite(expected[..., 0]), share, 0).astype(np.float32)
-    masked = image * used[..., None].astype(np.float32)
-    seen = np.asarray(cv2.resize(masked, size, interpolation=cv2.INTER_AREA))
+    used = ((weights > 0) & (image.max(axis=2) < BRIGHTEST)).astype(np.float32)
+    share = np.where(np.isfinite(expected[..., 0]), _averaged(used, size), 0).astype(np.float32)
+    seen = _averaged(image * used[..., None], size)
     wanted = np.nan_to_num(expected) * share[..., None]
     seen = np.where(share[..., None] > 0, seen, 0).astype(np.float32)
     overall = (wanted.sum(axis=(0, 1)) + 1) / (seen.sum(axis=(0, 1)) + 1)
@@ -276,6 +294,43 @@ def levelled(
     gain = (wide + support * overall) / (seen_wide + support)
     gain = np.asarray(cv2.resize(gain.astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_LINEAR))
     return np.clip(image * gain + 0.5, 0, 255).astype(np.uint8)
+
+
+def aligned(
+    image: NDArray[np.uint8], expected: NDArray[np.float32], weights: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Shift (h, w) of columns and rows that brings an image (h, w, 3) onto the map's colours; 0 if none is found.
+
+    Poses err by a pixel or two, which would blur a mixture of views and leave steps between them. The affine motion of
+    largest correlation is found (Evangelidis and Psarakis 2008).
+    """
+    import cv2
+
+    size = expected.shape[1::-1]
+    inside = _averaged((weights > LEAST).astype(np.float32), size) > 0.5
+    mask = (inside & np.isfinite(expected[..., 0])).astype(np.uint8)
+    wanted = np.nan_to_num(expected).mean(axis=2).astype(np.float32)
+    given = _averaged(image.mean(axis=2, dtype=np.float32), size)
+    W, stop = np.eye(2, 3, dtype=np.float32), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)
+    none = np.zeros(image.shape[:2], np.float32)
+    try:
+        _, W = cv2.findTransformECC(wanted, given, W, cv2.MOTION_AFFINE, stop, mask, 3)
+    except cv2.error:  # not enough texture
+        return none, none
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    x, y = ((pixels - STRIDE // 2) / STRIDE for pixels in (u, v))  # expected colours are of these pixels
+    x, y = (STRIDE * (row[0] * x + row[1] * y + row[2]) + (STRIDE - 1) / 2 for row in W)
+    columns, rows = x - u, y - v
+    far = max(np.abs(columns).max(), np.abs(rows).max()) > FARTHEST * image.shape[1]
+    return (none, none) if far else (columns.astype(np.float32), rows.astype(np.float32))
+
+
+def _averaged(image: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Means of squares of ``STRIDE`` pixels; ``size`` is their number across and down."""
+    import cv2
+
+    whole = image[: STRIDE * size[1], : STRIDE * size[0]]
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:

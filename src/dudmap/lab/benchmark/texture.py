@@ -14,10 +14,12 @@ from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.exporting.view_synthesis import images_of
 from dudmap.io.texturing.baking import TexturedMesh, textured
-from dudmap.io.texturing.views import Views, drawn, groups, hit
+from dudmap.io.texturing.views import STRIDE, Views, aligned, drawn, groups, hit
 
 HELD_OUT = 8
 """Every so many groups of views is held out."""
+INNER = 0.25
+"""Weight of compared pixels: masks and depth edges are 6 of 640 pixels away."""
 FINER = 2
 """Rendered pixels per pixel of an image, in both directions."""
 BACKGROUND = 32
@@ -43,9 +45,10 @@ class TextureFidelity:
 def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None = None) -> TextureFidelity:
     """Texture a mesh from seven of eight groups of views, and render it at the poses of the others.
 
-    Compared are pixels that are static, have a measured depth that agrees with the mesh, and are covered by both
-    meshes. Each rendering takes the gain per channel that fits best. The vertex colours are of the full mesh, and of
-    all frames. ``sheet`` receives rows of recorded image, vertex colours and texture.
+    Compared are pixels that are static, have a measured depth that agrees with the mesh, are covered by both meshes,
+    and are not next to a mask or a depth edge, where errors of the shape would count. Each image is registered to each
+    rendering, which takes the gain per channel that fits best. The vertex colours are of the full mesh, and of all
+    frames. ``sheet`` receives rows of recorded image, vertex colours and texture.
     """
     recording = images_of(run, options)
     frames = groups(run, recording, options.every)
@@ -57,12 +60,17 @@ def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None 
     count = pixels = 0
     for view in views(held):
         shown = [rendered(mesh, view.T_world_camera, views.camera) for mesh in (made, fine)]
-        used = (view.weights > 0) & np.logical_and(*(covered for _, covered in shown))
+        used = (view.weights > INNER) & np.logical_and(*(covered for _, covered in shown))
         if not used.any():
             continue
         count, pixels, sides = count + 1, pixels + np.count_nonzero(used), [view.image]
         for number, (image, _) in enumerate(shown):
-            given, wanted = image[used].astype(np.float64), view.image[used].astype(np.float64)
+            height, width = (STRIDE * (size // STRIDE) for size in used.shape)
+            sampled = image[STRIDE // 2 : height : STRIDE, STRIDE // 2 : width : STRIDE].astype(np.float32)
+            columns, rows_ = aligned(view.image, sampled, view.weights)
+            v, u = np.mgrid[: used.shape[0], : used.shape[1]].astype(np.float32)
+            moved = cv2.remap(view.image, u + columns, v + rows_, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            given, wanted = image[used].astype(np.float64), np.asarray(moved)[used].astype(np.float64)
             gain = np.sum(given * wanted, axis=0) / np.maximum(np.sum(given**2, axis=0), 1)
             errors[number] += np.mean((np.clip(given * gain, 0, 255) - wanted) ** 2, axis=1).sum()
             sides.insert(1, np.clip(image * gain + 0.5, 0, 255).astype(np.uint8))

@@ -6,6 +6,8 @@ from dudmap.core.backends.threads import kernel
 
 NEAREST = np.float32(0.05)
 """Smallest depth of a drawn corner, metres."""
+OCTAVE, OCTAVES = 256, 20
+"""Steps of a logarithmic weight per factor of 2, and smallest weight, 2^-20, whose step is 1."""
 
 
 @kernel
@@ -58,12 +60,12 @@ def gather_colors(start, stop, numbers, H, quality, tolerance, depth, weights, i
         start, stop: Rows of the texture.
         numbers: (S, S) int32, triangle of each texel, -1 = none.
         H: (F, 3, 3) float32; (column, row, 1) of a texel of a triangle to (u z, v z, z) of the image.
-        quality: (F,) float32, weight of the image for a triangle, 0 = not visible.
+        quality: (F,) int32, logarithm of the weight of the image for a triangle, in ``OCTAVE``; 0 = not visible.
         tolerance: (F,) float32, metres behind ``depth`` at which a texel is hidden.
         depth: (h, w) float32, metres, of the mesh in the image.
-        weights: (h, w) float32, weight of the pixels of the image, 0 = not to be used.
+        weights: (h, w) int32, the same of the pixels of the image; 0 = not to be used.
         image: (h, w, 3) uint8.
-        found: (S, S, K) float32 weights of the best colours, in descending order; changed.
+        found: (S, S, K) uint16, sum of both for the best colours, in descending order; changed.
         colors: (S, S, K, 3) uint8; changed.
     """
     (h, w), K = depth.shape, found.shape[2]
@@ -80,8 +82,8 @@ def gather_colors(start, stop, numbers, H, quality, tolerance, depth, weights, i
             if not (u >= 0 and v >= 0 and u < w - 1 and v < h - 1):
                 continue
             nu, nv = int(u + np.float32(0.5)), int(v + np.float32(0.5))
-            weight = quality[f] * weights[nv, nu]
-            if weight <= found[y, x, K - 1] or z > depth[nv, nu] + tolerance[f]:
+            weight = quality[f] + weights[nv, nu]
+            if weights[nv, nu] <= 0 or weight <= found[y, x, K - 1] or z > depth[nv, nu] + tolerance[f]:
                 continue
             k = K - 1
             while k > 0 and weight > found[y, x, k - 1]:
