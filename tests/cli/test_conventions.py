@@ -68,6 +68,7 @@ CALLS = {
     "live": ["live", "replay:recording", "--out", "c"],
     "report": ["report", "seen"],
     "export": ["export", "run", "--out", "map.glb"],
+    "benchmark texture": ["benchmark", "texture", "run", "--sequence", "recording", "--texture-size", 64],
     "render": ["render", "run", "--orbit", "--max-frames", 2, "--size", "32x24", "--out", "orbit.avi"],
     "clean": ["clean", "recording", "cleaned", "--run", "run"],
     "info": ["info", "recording"],

@@ -195,7 +195,7 @@ def test_kept_images_are_a_recording_and_go_with_the_run(run, tmp_path):
         frame = None
 
     class Result:
-        rejected, T_world_camera = False, None
+        status, T_world_camera = "tracked", None
 
     class Slam:
         camera = recording.camera

@@ -43,7 +43,8 @@ class ImageKeeper(RunObserver):
         """Make the folder, and describe the cameras."""
         from dudmap.app.views.rendering import camera_lines
 
-        self._folder, self._camera, self._last = out / FOLDER, slam.camera, None
+        self._folder, self._last = out / FOLDER, None
+        self._camera = slam.camera if self._source is None else self._source.camera
         if self._source is None:
             return
         make_folder(self._folder)
@@ -62,7 +63,7 @@ class ImageKeeper(RunObserver):
         from dudmap.app.views.rendering import depth_units
 
         frame, T = read.frame, result.T_world_camera
-        if isinstance(frame, FrameError) or frame.color is None or T is None or result.rejected:
+        if isinstance(frame, FrameError) or frame.color is None or T is None or result.status != "tracked":
             return
         if self._last is not None and 0 <= frame.timestamp - self._last[0] < SECONDS:
             if se3.agree(self._last[1], T, APART, APART_DEG):

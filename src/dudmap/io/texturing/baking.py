@@ -216,16 +216,21 @@ def _vertex_colors(
 
 
 def _continued(image: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Image (S, S, 3) whose unknown texels continue the known ones, for reduced images in viewers and for JPEG."""
+    """Image (S, S, 3), changed, whose unknown texels, given as 0, continue the known ones.
+
+    Viewers reduce the image, and JPEG spreads its edges.
+    """
     import cv2
 
     if min(image.shape[:2]) == 1:
         return image
     half = tuple((size + 1) // 2 for size in known.shape[::-1])
-    share = np.asarray(cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA))
-    sums = np.asarray(cv2.resize(image * known[..., None].astype(np.uint8), half, interpolation=cv2.INTER_AREA))
-    mean = np.clip(sums / np.maximum(share, 1e-6)[..., None] + 0.5, 0, 255).astype(np.uint8)
-    coarse = _continued(mean, share > 0)
+    share = np.asarray(cv2.resize(known.view(np.uint8) * np.uint8(255), half, interpolation=cv2.INTER_AREA))
+    sums = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
+    for start, stop in bands(len(sums), ROWS):
+        part = share[start:stop, :, None] / np.float32(255)
+        sums[start:stop] = np.clip(sums[start:stop] / np.maximum(part, np.float32(1e-3)), 0, 255)
+    coarse = _continued(sums, share > 0)
     full = np.asarray(cv2.resize(coarse, known.shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
-    full[known] = image[known]
-    return full
+    np.copyto(image, full, where=~known[..., None])
+    return image

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import write_image
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.errors import DatasetError
 from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.exporting.view_synthesis import images_of
@@ -52,7 +53,7 @@ def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None 
     """
     recording = images_of(run, options)
     frames = groups(run, recording, options.every)
-    held = frames[HELD_OUT // 2 :: HELD_OUT]
+    held = frames[min(HELD_OUT // 2, len(frames) - 1) :: HELD_OUT]
     made = textured(run, options, [group for group in frames if group not in held])
     fine = edited(run.surface, ExportOptions(drop_pieces_below=options.drop_pieces_below, crop=options.crop))
     views = Views(run, recording, fine, level=False)
@@ -77,7 +78,11 @@ def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None 
         rows.append(np.concatenate(sides, axis=1))
     if sheet is not None and rows:
         write_image(sheet, np.concatenate(rows, axis=0))
-    texture_db, vertices_db = 10 * np.log10(255**2 / np.maximum(errors / max(pixels, 1), 1e-9))
+    if not pixels:
+        raise DatasetError(
+            f"none of the {len(held)} held-out views shows the mesh of {run.folder}; expected a longer run"
+        )
+    texture_db, vertices_db = 10 * np.log10(255**2 / np.maximum(errors / pixels, 1e-9))
     return TextureFidelity(count, float(texture_db), float(vertices_db), made.seen)
 
 
