@@ -204,15 +204,14 @@ def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
     assert max(off) < 0.08, f"{max(off):.3f} m"
 
 
-def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
+def test_what_drags_the_pose_is_doubted_at_twice_the_usual_residual():
     good = TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, 0.9, 0.002, 0.01, 3, 0.01)
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
     for _ in range(6):
         monitor.accept(good)
     dragged = replace(good, residual=0.0045).figures
-    assert judged(RELATIVE, dragged, monitor.limits("tracking")).accepted
-    assert "4.5 mm" in judged(RELATIVE, dragged, monitor.limits("mostly dynamic")).reason
-    assert judged(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("mostly dynamic")).accepted
+    assert "4.5 mm" in judged(RELATIVE, dragged, monitor.limits()).reason
+    assert judged(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits()).accepted
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

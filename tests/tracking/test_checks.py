@@ -16,7 +16,7 @@ from dudmap.core.tracking.quality_monitor import MIN_HISTORY, ImageComparison
 from dudmap.lab import synthetic
 
 CONFIG = Config()
-LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, RULES, "recovering", True, True, 2.0, 0.9, 0.02)
+LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, RULES, True, True, 4.0, 0.05, 0.9)
 GOOD = {
     "readings": 5000.0, "overlap": 0.9, "residual_mm": 2.0, "condition": 0.1, "color_residual": 0.02,
     "speed_m_s": 0.3, "turn_deg_s": 20.0, "step": np.nan, "drift_mm": 0.0, "dynamic_share": 0.3,

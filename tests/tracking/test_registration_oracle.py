@@ -223,27 +223,38 @@ def test_constant_velocity_goes_on_and_stops_some_time_after_a_loss():
     assert model.figures(0.2, leap, view)["step"] == pytest.approx(0.2 * CAMERA.fx / CAMERA.width)
 
 
-def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
-    def result(residual: float, share: float) -> TrackingResult:
-        return TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, share, residual, 0.1, 3)
+def test_a_much_worse_registration_is_doubted():
+    def result(residual: float, share: float = 0.9, color: float = 0.02) -> TrackingResult:
+        return TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, share, residual, 0.1, 3, color)
 
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
 
     def doubt(tracking: TrackingResult) -> str:
-        mode = "recovering" if monitor.recovering else "tracking"
-        return judged(RELATIVE, tracking.figures, monitor.limits(mode)).reason
+        return judged(RELATIVE, tracking.figures, monitor.limits()).reason
 
     for _ in range(10):
-        assert doubt(result(0.001, 0.9)) == ""
-        monitor.accept(result(0.001, 0.9))
-    assert doubt(result(0.0035, 0.9)) == ""
-    assert "off the map" in doubt(result(0.006, 0.9))
+        assert doubt(result(0.002)) == ""
+        monitor.accept(result(0.002))
+    assert doubt(result(0.004)) == ""  # exp(6 * 0.12) = 2.05
+    assert "off the map" in doubt(result(0.0042))
+    assert "the image differs" in doubt(result(0.002, color=0.042))
+    assert doubt(result(0.002, 0.3)) == ""
     monitor.lose()
-    assert "off the map" in doubt(result(0.0035, 0.9))
-    assert doubt(result(0.0025, 0.9)) == ""  # within the noise of the sensor
-    assert "fall on the map" in doubt(result(0.001, 0.3))
-    monitor.accept(result(0.001, 0.9))
-    assert doubt(result(0.0035, 0.3)) == ""
+    assert "fall on the map" in doubt(result(0.002, 0.3))
+    monitor.accept(result(0.002))
+    assert doubt(result(0.002, 0.3)) == ""
+
+
+def test_the_limit_follows_the_spread_of_the_residuals():
+    rng = np.random.default_rng(3)
+    monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
+    limits = []
+    for sigma in (0.05, 0.17, 0.6):
+        monitor.reset()
+        for residual in 0.004 * np.exp(sigma * rng.normal(size=30)):
+            monitor.accept(TrackingResult(np.eye(4), (1.0, 0.0), ACCEPTED, 0.9, residual, 0.1, 3, 0.01))
+        limits.append(monitor.limits().residual_mm / 4)
+    assert limits == pytest.approx([np.exp(6 * 0.12), np.exp(6 * 0.17), np.exp(6 * 0.23)], rel=0.25)
 
 
 ANY = RegistrationRules(min_condition=0.0)

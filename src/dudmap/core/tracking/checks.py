@@ -3,8 +3,9 @@
 All metrics are computed for every frame and reported (``FrameResult.verdict``). The first failed check rejects the
 frame.
 
-Relative checks compare a frame with the frames before. They find registrations in a wrong minimum, which fit much worse
-than their predecessors, but often within any fixed limit. Independent evidence for the pose overrules them.
+Relative checks compare a frame with the frames before: the rise of a residual over its median, in units of its spread.
+They find registrations in a wrong minimum, which fit much worse than their predecessors, but often within any fixed
+limit. Independent evidence for the pose overrules them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,19 +38,8 @@ MAX_RESIDUAL = 4.0
 """Largest robust root mean square of the distance residuals, in standard deviations sigma(z) of a measurement."""
 MAX_DYNAMIC_SHARE = 0.9
 """Largest share of dynamic measurements; above it the frame is lost."""
-STRICTNESS = {
-    "tracking": (4.0, 4.0, 0.03),
-    "mostly dynamic": (2.0, 4.0, 0.03),
-    "recovering": (1.6, 2.5, 0.02),
-    "recognized": (2.5, 2.5, 0.02),
-}
-"""Largest distance residual and intensity difference, in multiples of the usual values, and smallest limit of the
-intensity difference (0..1).
-
-* mostly dynamic: a dynamic object registered as static shows in the distances first
-* recovering: the initial pose is poor and wrong minima are common
-* recognized: place recognition found the same pose, so that larger distances are accepted
-"""
+MIN_COLOR_LIMIT = 0.03
+"""Smallest limit of the intensity difference (0..1), for maps whose usual difference is that of the storage steps."""
 USUAL_OVERLAP = 0.6
 """Smallest share of static measurements on the map after a loss, in multiples of the usual share."""
 
@@ -84,21 +74,20 @@ class Limits:
         config: Configured limits.
         sensor: Noise of the sensor.
         rules: Limits of the registration.
-        mode: Key of STRICTNESS.
         mostly_dynamic: Most of the measurements are dynamic.
         blind: The image carries no information.
-        residual_mm, overlap, color: Usual values of the frames before; NaN if unknown.
+        residual_mm, color: Largest residuals that the frames before let expect; NaN if unknown.
+        overlap: Usual value of the frames before, after a loss; NaN if unknown or not lost.
     """
 
     config: TrackerConfig
     sensor: SensorConfig
     rules: RegistrationRules = RULES
-    mode: str = "tracking"
     mostly_dynamic: bool = False
     blind: bool = False
     residual_mm: float = np.nan
-    overlap: float = np.nan
     color: float = np.nan
+    overlap: float = np.nan
 
     @cached_property
     def sigma_mm(self) -> float:
@@ -158,14 +147,14 @@ RELATIVE = (
     # a residual within the sensor noise never rejects a pose, however small it was before
     Check(
         "residual_mm",
-        lambda limits: max(STRICTNESS[limits.mode][0] * limits.residual_mm, limits.sigma_mm),
+        lambda limits: max(limits.residual_mm, limits.sigma_mm),
         "measurements lie {figure:.1f} mm off the map, at most {limit:.1f} mm were to be expected",
         overruled_by="last frame",
         name="usual_residual_mm",
     ),
     Check(
         "overlap",
-        lambda limits: USUAL_OVERLAP * limits.overlap if limits.mode == "recovering" else 0.0,
+        lambda limits: USUAL_OVERLAP * limits.overlap,
         "only {figure:.0%} of the static measurements fall on the map, at least {limit:.0%} were to be expected",
         at_least=True,
         overruled_by="last frame",
@@ -174,7 +163,7 @@ RELATIVE = (
     # two walls of a room have the same shape, but different texture
     Check(
         "color_residual",
-        lambda limits: max(STRICTNESS[limits.mode][1] * limits.color, STRICTNESS[limits.mode][2]),
+        lambda limits: max(limits.color, MIN_COLOR_LIMIT),
         "the image differs by {figure:.1%} from the map, at most {limit:.1%} were to be expected",
         overruled_by="last frame",
     ),
