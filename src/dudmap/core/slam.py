@@ -382,7 +382,7 @@ class Slam(SlamResults, Stateful):
         poses changed."""
         first, replayed = frames[0], [frames[0]]
         corrections = [first.T_world_camera @ se3.inverse(first.estimate.T_world_camera)]
-        for remembered in (self.monitor, self.detector, self.redundancy):
+        for remembered in (self.detector, self.redundancy):
             remembered.reset()
         self.mapper.begin_anew(first, timer)
         self.detector.start(first.view.timestamp, first.view.labelled, first.T_world_camera)
@@ -398,8 +398,10 @@ class Slam(SlamResults, Stateful):
             self.mapper.integrate(view, estimate, estimate.dynamic_mask(view) | frame.undecided_mask)
             replayed.append(frame.registered(estimate))
             corrections.append(estimate.T_world_camera @ se3.inverse(frame.estimate.T_world_camera))
+        self.monitor.reset()  # frames fit a map of few frames better than later ones
         self.young_map.replace_frames(replayed)
         self.atlas.move(np.array([frame.view.timestamp for frame in frames]), np.stack(corrections))
+        self.color_calibration.repaint()
         return len(frames) > 1
 
     def _forget_map(self) -> None:

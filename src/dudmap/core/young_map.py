@@ -212,10 +212,13 @@ class YoungMap(Stateful):
         if len(frames) > 1 and now.timestamp < frames[0].view.timestamp + UNDECIDED[self._decisions]:
             return []
         self._decisions += len(frames) > 1
+        self._slow, self._interval = len(frames) > 1, (now.timestamp - frames[0].view.timestamp) / len(frames)
+        if self._slow and self._interval > UNDECIDED[0] / 2:  # people are elsewhere in the next image
+            self._frames = []
+            return []
         if self._decisions == 1 and (last := frames[-1]).moving is not None:
             self._shown = is_majority_dynamic(last.moving, last.view.labelled)
         self._frames = [] if self._decisions == len(UNDECIDED) else frames[::2]
-        self._slow, self._interval = len(frames) > 1, (now.timestamp - frames[0].view.timestamp) / len(frames)
         rest, anchor, T_anchor, contradicted = frames, now, now.T_world_camera, False
         hops: list[tuple[TrackedImage, list[StartFrame]]] = []
         while rest and (reference := self._reference(anchor, rest)) is not None:

@@ -146,6 +146,11 @@ class ColorCalibration(Stateful):
         """The newest calibration."""
         return self._next or self._color_motion.calibration or self._start
 
+    def repaint(self) -> None:
+        """Repaint a map that was built again while it was repainted."""
+        if self._next is not None:
+            self._atlas.recolor()
+
     def update(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
     ) -> bool:
