@@ -170,7 +170,7 @@ class ColorCalibration(Stateful):
                 log.info("%.3f s: %s", view.timestamp, outcome(found, self._camera))
                 self._next = found
                 self._atlas.recolor()
-            if self._next is None or self._atlas.repainting is not None:
+            if self._next is None or not self._atlas.take_repainted():
                 return False
             self._color_motion.use(self._next, view.timestamp)
             self._atlas.depth_late, self._next = self._next.depth_late, None

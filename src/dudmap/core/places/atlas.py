@@ -143,6 +143,12 @@ class Atlas(Stateful):
                 self._complete_repainting()
         self.switch_to(self.current)
 
+    def take_repainted(self) -> bool:
+        """Take the colours of a repainting that has all frames; returns whether no repainting is left."""
+        if self.repainting is not None and self.repainting.fuse(PER_FRAME):
+            self._complete_repainting()
+        return self.repainting is None
+
     def _complete_repainting(self) -> None:
         repainting, self.repainting = self.repainting, None
         if repainting is not None:
@@ -220,8 +226,8 @@ class Atlas(Stateful):
 
     def continue_rebuilding(self) -> None:
         """Advance the repainting and one rebuilding, of the current submap first, by ``PER_FRAME`` frames each."""
-        if self.repainting is not None and self.repainting.fuse(PER_FRAME):
-            self._complete_repainting()
+        if self.repainting is not None:
+            self.repainting.fuse(PER_FRAME)
         if not self.rebuildings:
             return
         number = self.current if self.current in self.rebuildings else min(self.rebuildings)
