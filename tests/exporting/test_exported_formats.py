@@ -316,7 +316,7 @@ def test_the_recording_is_the_one_that_the_run_names(made, run, tmp_path):
         assert len(tree["frames"]) == len(sequence[::4]) if isinstance(sequence, list) else len(tree["frames"]) == 2
         assert tree["fl_x"] == 90  # opened as the run did
         metrics.write_text(json.dumps({"recording": {"path": str(tmp_path / "moved")}}))
-        with pytest.raises(DatasetError, match=r"that the run names cannot be read; name it by --sequence: .*moved"):
+        with pytest.raises(DatasetError, match=r"recording cannot be read \(.*moved.*by --sequence"):
             exported(run, tmp_path / "transforms.json")
     finally:
         metrics.unlink() if before is None else metrics.write_text(before)
@@ -357,7 +357,7 @@ def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
         exported(run, tmp_path / "map.ply", crop=(90, 90, 90, 91, 91, 91))
     with pytest.raises(ConfigError, match="at least the voxel size"):
         exported(run, tmp_path / "map.npz", resolution=0.001)
-    with pytest.raises(ConfigError, match=r"name it by --sequence"):
+    with pytest.raises(DatasetError, match="name the recording by --sequence, or repeat the run with --save-images"):
         exported(run, tmp_path / "transforms.json")
     for name, module in ((".laz", "laspy"), (".e57", "pye57"), (".usdz", "pxr.Sdf")):
         monkeypatch.setitem(sys.modules, module, None)
