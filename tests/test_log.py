@@ -12,10 +12,12 @@ from dudmap.core.frame_log import log_changes
 from wavy_wall import CAMERA, wall
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def terminal():
-    """Levels and handlers of the log, which are put back."""
+    """Levels and handlers of the log, which are put back; a command in another test may have changed them."""
     logs = [logging.getLogger(name) for name in ("dudmap", "dudmap.core")]
+    for log in logs:
+        log.setLevel(logging.NOTSET)
     before = [(log, log.level, [*log.handlers]) for log in logs]
     yield
     for log, level, handlers in before:
