@@ -304,6 +304,7 @@ def test_a_young_map_with_a_slow_crowd_begins_anew_without_it(coverage, speed, s
         assert masks[sequence.timestamps[index]][people].mean() > 0.85, index
 
 
+@pytest.mark.xfail(strict=True, reason="since the first frames are decided at 0.4 and 0.8 s: 45 mm; 176 mm undecided")
 def test_people_who_enter_with_a_slow_crowd_do_not_take_the_camera_along():
     # they were in no older image, and nearer readings weigh more: the camera followed them by 54 mm in 1.5 s
     camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
@@ -314,10 +315,13 @@ def test_people_who_enter_with_a_slow_crowd_do_not_take_the_camera_along():
     poses = [slam.process(sequence[index]).T_world_camera for index in range(45)]
     truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
     errors = [np.linalg.norm(pose[:3, 3] - T[:3, 3]) for pose, T in zip(poses[-10:], truth[35:45], strict=True)]
-    assert np.mean(errors) < 0.055  # not decided: 110 mm
+    assert np.mean(errors) < 0.035  # was 16 mm
 
 
-@pytest.mark.parametrize(("seed", "frames"), [(1, 26), (4, 26)])
+UNDECIDED = pytest.mark.xfail(strict=True, reason="poses follow the crowd until the first frames are decided at 0.4 s")
+
+
+@pytest.mark.parametrize(("seed", "frames"), [pytest.param(1, 12, marks=UNDECIDED), (1, 26), (4, 26)])
 def test_a_slow_crowd_over_most_of_the_view_does_not_take_the_camera_along(seed, frames):
     sequence = synthetic.sequence(
         "room", coverage=0.7, speed=0.1, start_dynamic=True, frames=frames, camera=CAMERA, seed=seed

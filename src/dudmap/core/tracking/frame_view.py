@@ -159,8 +159,8 @@ class FrameView:
         return bool(deviation[0, 0] < TEXTURELESS)
 
 
-DOUBTFUL_WEIGHT = 0.1
-"""Weight of previously dynamic and of undecided pixels in a registration."""
+PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
+"""Weight of previously dynamic pixels in the first registration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,24 +238,24 @@ def static_weights(
 
 
 def initial_weights(
-    levels: list[Level], doubtful: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
+    levels: list[Level], previously_dynamic: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
 ) -> list[NDArray[np.float32]] | None:
     """Weights of the first registration, before the frame is labelled; None = 1 for every pixel.
 
     Args:
         levels: Pyramid levels.
-        doubtful: (h, w) bool, dynamic pixels of the previous frame, whose weight is reduced.
+        previously_dynamic: (h, w) bool, dynamic pixels of the previous frame, whose weight is reduced.
         excluded: Masks of any size of pixels without weight.
     """
-    if doubtful is None and not excluded:
+    if previously_dynamic is None and not excluded:
         return None
     out = []
     for level in levels:
-        if doubtful is None:
+        if previously_dynamic is None:
             weights = np.ones(level.depth.shape, np.float32)
         else:
-            reduction = np.float32(1 - DOUBTFUL_WEIGHT)
-            weights = np.float32(1) - reduction * reduced(doubtful, level)
+            reduction = np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT)
+            weights = np.float32(1) - reduction * reduced(previously_dynamic, level)
         for mask in excluded:
             weights *= ~reduced(mask, level)
         out.append(weights)
