@@ -226,7 +226,7 @@ def _continued(image: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np
         return image
     half = tuple((size + 1) // 2 for size in known.shape[::-1])
     share = np.asarray(cv2.resize(known.view(np.uint8) * np.uint8(255), half, interpolation=cv2.INTER_AREA))
-    sums = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
+    sums = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
     for start, stop in bands(len(sums), ROWS):
         part = share[start:stop, :, None] / np.float32(255)
         sums[start:stop] = np.clip(sums[start:stop] / np.maximum(part, np.float32(1e-3)), 0, 255)
