@@ -12,8 +12,7 @@ if TYPE_CHECKING:
 
 
 class Cue(Protocol):
-    """Evidence of motion at the pixels of a frame. It is added to the evidence of distances and free space, before
-    pixels share it with their segment."""
+    """Evidence of motion at the pixels of a frame, added to distances and free space before segments share it."""
 
     def log_odds(
         self, volume: TsdfVolume, view: "FrameView", T_world_camera: NDArray[np.float64]
@@ -22,7 +21,7 @@ class Cue(Protocol):
 
         Args:
             volume: The map.
-            view: The frame; ``view.labelled`` has the camera, depth and intensity (h, w) of these pixels.
-            T_world_camera: (4, 4) pose.
+            view: The frame; ``view.labelled`` has camera, depth and intensity (h, w).
+            T_world_camera: (4, 4).
         """
         ...

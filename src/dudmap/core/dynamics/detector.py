@@ -1,4 +1,4 @@
-"""Labelling of dynamic pixels: mixture of residual densities, known free space, segments (thesis section 4.6)."""
+"""Labelling of dynamic pixels by residual densities, known free space and segments (thesis section 4.6)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,44 +30,33 @@ from dudmap.core.map.volume import FREE, SURFACE, MapSample, TsdfVolume
 from dudmap.core.state import Remembered, Stateful
 
 MAX_GAP = 1.5
-"""Largest depth difference of two measurements of one point, in units of the noise threshold of distances."""
+"""Largest depth difference of measurements of one point, in noise thresholds of distances."""
 SMALLEST_MOTION, MOTION_SIGMAS = 0.03, 3.0
-"""Smallest distance to the static map of a dynamic measurement (theta in thesis eq. 4.57): reference depths, and
-standard deviations of the measurement; the larger of the two applies."""
+"""Smallest distance to the map of a dynamic measurement (theta, thesis eq. 4.57): reference depths, standard
+deviations; the larger applies."""
 MAP_ROUGHNESS = 0.4
-"""Standard deviation of the map's surface, voxels."""
+"""Standard deviation of the map surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
-"""Largest depth step to a neighbour of the same surface: standard deviations of a measurement, plus a share of the
-depth per pixel at REFERENCE_WIDTH. The share equals a surface inclined by 69 degrees at a focal length of 131
-pixels."""
+"""Largest depth step within a surface: standard deviations, plus a share of the depth per pixel at REFERENCE_WIDTH (69
+degrees of inclination at a focal length of 131 pixels)."""
 MAX_LOG_ODDS = 6
-"""Log odds static : dynamic of a certain pixel: an error probability of 0.25 %."""
+"""Log odds static : dynamic of a certain pixel: 0.25 % errors."""
 COUPLING = 4
-"""Largest log odds that the eight neighbours together add to a pixel, below certainty so that they cannot overrule a
-certain pixel. The sum of both limits is the range of the mean field's hyperbolic tangent."""
+"""Largest log odds that eight neighbours add, so that they cannot overrule a certain pixel. The sum of both limits is
+the range of the mean field's tanh."""
 SWEEPS = 4
-"""Number of mean-field sweeps over the image."""
+"""Mean-field sweeps."""
 MAPPED_SHARE = 0.3
-"""Smallest share of a segment's moving pixels on the map that lets the map decide about the rest."""
+"""Smallest share of a segment's moving pixels on the map that decides about the rest."""
 MIN_REGION = 0.0008
-"""Smallest moving region, as a share of the image: 15 pixels at 160x120."""
+"""Smallest moving region, share of the image: 15 pixels at 160x120."""
 NONE = np.empty((0, 0), np.float32)
 """No further evidence."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """A frame compared with the map.
-
-    Attributes:
-        timestamp: Seconds.
-        level: The image.
-        T_world_camera: (4, 4).
-        exposure: Gain and offset from the image's intensities to the map's.
-        sample: The map at the points of the image.
-        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        noise: Parameters of the measurement noise.
-    """
+    """A frame compared with the map; ``sigma`` (h, w): standard deviation of a static distance, metres."""
 
     timestamp: float
     level: Level
@@ -79,7 +68,6 @@ class _Comparison:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels in space that is free in the map."""
         return self.sample.occupancy == FREE
 
 
@@ -92,7 +80,7 @@ class DynamicDetector(Stateful):
 
     Attributes:
         memory: Remembered frames.
-        background: The static background behind pixels without depth.
+        background: Static background behind pixels without depth.
     """
 
     memory: Remembered[TemporalMemory]
@@ -106,15 +94,12 @@ class DynamicDetector(Stateful):
         self.background = BackgroundModel(config)
 
     def segment(self, levels: Callable[[], Pyramid], voxel_size: float, *, now: bool) -> Callable[[], Segmentation]:
-        """Surface segments of an image; needs no map.
+        """Function that returns the surface segments of an image.
 
         Args:
             levels: Returns the pyramid of the image.
-            voxel_size: Edge of the map's voxels, metres.
-            now: Start the computation in another thread, if the configuration needs segments.
-
-        Returns:
-            A function that waits for the segmentation, or computes it at the first call.
+            voxel_size: Metres.
+            now: Start the computation in another thread, if dynamics are enabled.
         """
 
         def compute() -> Segmentation:
@@ -124,12 +109,12 @@ class DynamicDetector(Stateful):
         return cache(submit(compute) if now and self.config.enabled else compute)
 
     def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
-        """Begin with the first frame of a map, an image at a pose (4, 4), without known moving pixels."""
+        """Begin with the first frame of a map, at a pose (4, 4)."""
         self.memory.start(timestamp)
         self.memory.update(timestamp, level, T_world_camera, np.zeros(level.depth.shape, dtype=bool), None)
 
     def import_from(self, other: "DynamicDetector", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
-        """Import the remembered frames of a first pass over the same recording; see ``TemporalMemory.import_from``."""
+        """See ``TemporalMemory.import_from``."""
         self.memory.import_from(other.memory, Ts_world_camera)
 
     def detect(
@@ -143,17 +128,17 @@ class DynamicDetector(Stateful):
         exposure: tuple[float, float] = (1.0, 0.0),
         added: NDArray[np.float32] = NONE,
     ) -> Labels:
-        """Labels of a frame that is registered to a map.
+        """Labels of a registered frame.
 
         Args:
             volume: The map.
-            level: The image, at the resolution of the labels.
-            T_world_camera: (4, 4) pose of the registration.
+            level: The image, label resolution.
+            T_world_camera: (4, 4).
             timestamp: Seconds.
-            segmentation: Returns the segments of the image, see ``segment``.
+            segmentation: See ``segment``.
             moving: (h, w) bool, moving pixels by comparison of images; None without comparison.
             exposure: Gain and offset from the image's intensities to the map's.
-            added: (h, w) float32, log odds moving : static of further cues; of size 0 for none.
+            added: (h, w) float32, log odds moving : static of further cues; size 0 for none.
         """
         depth = level.depth
         noise = noise_parameters(self.sensor, level, volume.voxel_size)
@@ -190,10 +175,9 @@ class DynamicDetector(Stateful):
         segmentation: Callable[[], Segmentation],
         exposure: tuple[float, float],
     ) -> Labels:
-        """Labels of a registered frame from the last one, for the arguments of ``detect``.
+        """Labels carried from the last frame, for the arguments of ``detect``.
 
-        Dynamic are the points of the dynamic segments of the last frame, connected points in known free space, and the
-        segments of both.
+        Dynamic are the points of its dynamic segments, connected points in free space, and the segments of both.
         """
         import cv2
 
@@ -217,28 +201,24 @@ class DynamicDetector(Stateful):
         exposure: tuple[float, float],
         labels: Labels,
     ) -> None:
-        """Remember a tracked frame (pose (4, 4), timestamp in seconds) for comparison with later frames.
-
-        ``exposure``: gain and offset from the image's intensities to the map's.
-        """
+        """Remember a tracked frame (pose (4, 4), seconds); ``exposure``: gain and offset to the map's intensities."""
         self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.segmentation)
         self.background.update(timestamp, unsaturated(level, exposure), T_world_camera, labels.dynamic)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
-        """Move the remembered state with a correction (4, 4) of the world."""
+        """Move the state with a correction (4, 4) of the world."""
         self.memory.apply_correction(T_new_old)
         self.background.apply_correction(T_new_old)
 
     def reset(self) -> None:
-        """Forget the remembered frames after a loss of tracking."""
+        """Forget the remembered frames."""
         self.memory.reset()
         self.background.reset()
 
     def _evidence(self, frame: _Comparison, unknown: float, added: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Log odds moving : static (h, w) of space that single frames have seen to be free, and of further cues; size 0
-        for none.
+        """Log odds moving : static of space that single frames have seen to be free, and of further cues.
 
-        ``unknown``: share of the measurements in space unknown to the map.
+        ``unknown``: share of the measurements in unknown space.
         """
         if not (older := self.memory.free_space_frames(frame.timestamp, unknown)):
             return added
@@ -254,7 +234,7 @@ class DynamicDetector(Stateful):
         seeds: NDArray[np.bool_],
         segmentation: Segmentation,
     ) -> tuple[NDArray[np.bool_], Segmentation]:
-        """Dynamic pixels (h, w) decided by segment (``moving_segments``) without settled segments, and the segments."""
+        """Dynamic pixels decided by segment (``moving_segments``) without settled segments, and the segments."""
         level, T_world_camera, sigma = frame.level, frame.T_world_camera, frame.sigma
         before = self.memory.last_dynamic(level, T_world_camera)
         least, (gain, offset) = self._least_sigma, frame.exposure
@@ -270,12 +250,9 @@ class DynamicDetector(Stateful):
     def _stands_on_map(
         self, frame: _Comparison, moving: NDArray[np.bool_], segmentation: Segmentation
     ) -> NDArray[np.bool_]:
-        """Moving pixels (h, w) whose segment is static in the map (``stand_still``).
-
-        Corners are mismatched on silhouettes, in blur and on repetitive patterns. The moving part of a segment that
-        lies on the map decides for the whole segment, because the rest has come into view. A part below MAPPED_SHARE
-        decides nothing.
-        """
+        """Moving pixels whose segment is static in the map (``stand_still``), because corners are mismatched on
+        silhouettes, in blur and on repetitive patterns. The part on the map decides for the segment if at least
+        MAPPED_SHARE."""
         sample, (gain, offset) = frame.sample, frame.exposure
         distance = np.where(sample.occupancy == SURFACE, sample.distance, np.float32(np.nan))
         difference = sample.difference + (np.float32(1 - gain) * frame.level.intensity - np.float32(offset))
@@ -291,7 +268,7 @@ class DynamicDetector(Stateful):
 def _sample(
     volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64], exposure: tuple[float, float]
 ) -> MapSample:
-    """The map at the points of an image; saturated pixels have no intensity difference."""
+    """The map at the pixels; saturated pixels have no intensity difference."""
     sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
     if (dark := saturated(level, exposure, sample.difference)) is not None:
         sample.difference[dark] = np.nan
@@ -299,7 +276,7 @@ def _sample(
 
 
 def noise_parameters(sensor: SensorConfig, level: Level, voxel_size: float) -> NoiseParameters:
-    """Parameters of the measurement noise of an image, for a map with this voxel size, metres."""
+    """Measurement noise of an image, for a voxel size in metres."""
     parameters = NoiseParameters(
         sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
         DEPTH_EDGE_SLOPE / pixel_scale(level), SMALLEST_MOTION * sensor.reference_depth, MOTION_SIGMAS,
@@ -308,18 +285,17 @@ def noise_parameters(sensor: SensorConfig, level: Level, voxel_size: float) -> N
 
 
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-    """Standard deviation (h, w) of the distance of a static point, metres: measurement and map combined."""
+    """Standard deviation (h, w) of the distance of a static point, metres: measurement and map."""
     map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
     return np.asarray(static_sigma.py_func(sensor.sigma(depth), map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
-    """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w): standard deviation of the
-    depth."""
+    """Largest depth step (h, w) within a surface, metres; ``sigma`` (h, w): standard deviation of the depth."""
     slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
     return np.asarray(edge_tolerance.py_func(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
 
 
 def noise_threshold(sensor: SensorConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Distance (h, w) to the map below which nothing is called motion (theta in eq. 4.57), metres."""
+    """Distance (h, w) to the map below which nothing is motion (theta in eq. 4.57), metres."""
     return noise_limit.py_func(sigma, np.float32(SMALLEST_MOTION * sensor.reference_depth), np.float32(MOTION_SIGMAS))

@@ -1,8 +1,7 @@
 """Rigid motion of the static world between two images, and the corners that do not follow it.
 
-Corners are tracked between images (Lucas and Kanade 1981). RANSAC (Fischler and Bolles 1981) finds the rigid motion of
-most of the visible surface, the static world. Corners that do not follow it move. Errors are measured in pixels, so
-that a near person weighs no more than a far wall.
+Corners are tracked between images (Lucas and Kanade 1981); RANSAC (Fischler and Bolles 1981) finds the rigid motion of
+most of the visible surface. Errors are measured in pixels, so that a near person weighs no more than a far wall.
 """
 
 from dataclasses import dataclass
@@ -26,23 +25,21 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 
 NOISE_PX = 0.7
-"""Inlier threshold t of the reprojection error, pixels. t^2 = 5.99 sigma^2 includes 95 % of the errors (chi-square, two
-degrees of freedom) of corners with sigma = 0.29 px per coordinate."""
+"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 (95 %, chi-square, two degrees of freedom)
+with sigma = 0.29 px per coordinate."""
 NOISE_LEVELS = 1.0, 0.5, 0.25
-"""Tested noise levels of the corners, as multiples of the sigma of NOISE_PX: in sharp images corners are measured with
-0.07 px per coordinate."""
+"""Tested noise levels, multiples of sigma: corners of sharp images have 0.07 px."""
 LEAST_SIGMA_PX = NOISE_LEVELS[-1] * NOISE_PX / np.sqrt(5.99)
-"""Smallest plausible sigma of the inliers, pixels per coordinate."""
+"""Smallest sigma of the inliers, pixels per coordinate."""
 OUTLIER_GAIN = 2.996
-"""Log-likelihood ratio of an error-free corner to an outlier at the largest noise level, 5.99 / 2. The inlier threshold
-is the error at which both are equally likely."""
+"""Log-likelihood ratio of an error-free corner to an outlier, 5.99 / 2: both are equally likely at the inlier
+threshold."""
 NEAR_PX = 5.0
-"""Scale of the prior on the distance of a motion from the expected one, pixels. It is a rotation by 1.1 degrees at a
-focal length of 262 pixels: the error of a constant-velocity prediction if a rotation of 33 degrees/s begins within 1/30
-s."""
+"""Scale of the prior on the distance from the expected motion, pixels: 1.1 degrees at a focal length of 262 pixels, the
+prediction error if a rotation of 33 degrees/s begins within 1/30 s."""
 HYPOTHESES = 150
-"""Number of hypotheses from uniform samples, and as many from samples weighted by area. At an inlier share of 1/3, no
-sample of three has only inliers with probability (1 - 1/27)^150 = 0.3 %."""
+"""Hypotheses from uniform samples, and from samples weighted by area. At an inlier share of 1/3, all fail with
+probability (1 - 1/27)^150 = 0.3 %."""
 
 
 def rigid_motion(
@@ -54,24 +51,19 @@ def rigid_motion(
 ) -> NDArray[np.float64]:
     """Motion T_after_before (4, 4) with the highest score among hypotheses from samples of three correspondences.
 
-    Three correspondences determine the twist of a small motion linearly (Longuet-Higgins and Prazdny 1980). The score
-    is MSAC's (Torr and Zisserman 2000), weighted by squared depth, which is proportional to the surface per
-    correspondence, times a prior:
+    Three correspondences determine a small twist linearly (Longuet-Higgins and Prazdny 1980). The score is MSAC's (Torr
+    and Zisserman 2000), weighted by squared depth (surface per correspondence), times a prior:
 
         score(T, sigma) = gain sum_n z_n^2 (1 - min(e_n^2 / (2 gain sigma^2), 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
         gain = log(A / (2 pi sigma^2))
 
-    Here e_n is the reprojection error, and d the mean distance in pixels between the points reprojected by this and by
-    the expected motion. The sum is the log-likelihood of normally distributed errors against outliers over an area A.
-    The unknown noise sigma is maximised together with the motion. With a too large fixed sigma, a motion between the
-    static world and slow people would explain both.
+    e_n is the reprojection error, and d the mean distance in pixels between points reprojected by this and by the
+    expected motion. The sum is the log-likelihood of normal errors against outliers over an area A. The noise sigma is
+    maximised with the motion, because a too large one lets a motion between static world and slow people explain both.
 
-    The prior decides between two motions that explain nearly as much surface. A crowd that walks abreast may cover more
-    surface than the static world, and two images alone cannot show which of them moves. The prior ranges from 1 to 1/2
-    only, because the expected motion may be wrong.
-
-    The REFINED best hypotheses of each noise level and the expected motion are refined on their inliers with the exact
-    projection. The best of them is returned.
+    The prior decides between motions of nearly equal surface, such as static world and abreast crowd. It ranges from 1
+    to 1/2 only, because the expected motion may be wrong. The REFINED best hypotheses of each noise level and the
+    expected motion are refined on their inliers with the exact projection.
 
     Args:
         points: (n, 3) metres, first camera's frame.
@@ -93,7 +85,7 @@ def rigid_motion(
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
-    """Distance in pixels of an image, from the distance in an image of FLOW_WIDTH with the same view."""
+    """Pixels of an image, from pixels in an image of FLOW_WIDTH with the same view."""
     return distance * camera.width / FLOW_WIDTH
 
 
@@ -106,45 +98,44 @@ def _params(camera: Camera, near_px: float = NEAR_PX) -> ConsensusParams:
 
 
 def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Pixels (n, 2) of points (n, 3) after a motion T (4, 4); points behind the camera land far outside the image."""
+    """Pixels (n, 2) of points (n, 3) after a motion T (4, 4); points behind the camera land far outside."""
     moved = points @ T[:3, :3].T + T[:3, 3]
     return camera.focal * moved[:, :2] / np.maximum(moved[:, 2:], 1e-6) + camera.centre
 
 
 MOVES_PX = 1.0
-"""Smallest reprojection error of a moving corner, pixels of an image 320 wide: 3.5 sigma of a static corner."""
+"""Smallest error of a moving corner, pixels of an image 320 wide: 3.5 sigma."""
 MOVES_SIGMAS = 5.0
-"""Smallest reprojection error of a moving corner, in standard deviations (per coordinate) of the static corners."""
+"""The same in standard deviations of static corners."""
 MOVES_SHARE = 0.08
-"""Share of a corner's own flow that is added to either limit (motion blur, rolling shutter)."""
+"""Share of a corner's flow added to either limit (motion blur, rolling shutter)."""
 FEWEST = 15
-"""Smallest number of inliers of an accepted motion. A wrong motion has about one by chance: of 1000 corners with flow
-up to 20 pixels, the share (NOISE_PX / 20)^2."""
+"""Fewest inliers of a motion. A wrong one has about one by chance: of 1000 corners with flow up to 20 pixels, the share
+(NOISE_PX / 20)^2."""
 MANY = 4 * FEWEST
-"""Corners that leave no doubt about a motion which most of them follow."""
+"""Corners that leave no doubt about a motion that most follow."""
 FEWEST_MOVING = 3
-"""Smallest number of moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
+"""Fewest moving (static) corners of a moving (static) segment: three determine a rigid motion."""
 AGREED = 0.7
-"""Smallest share of moving corners of a segment that moves, and of the surface that clearly follows one motion."""
+"""Smallest share of moving corners in a moving segment, and of surface that clearly follows one motion."""
 TIGHTER = 0.5
-"""Largest error of the static corners of a motion that replaces the expected one, as a share of the error of the
-corners that rest with the latter. The static world is rigid; a pose that followed people fits them loosely."""
+"""Largest error of a motion's static corners, as a share of the expected motion's, to replace it: a pose that followed
+people fits loosely."""
 SUPPORTED = 0.8
-"""Smallest number of resting corners of a motion that replaces the expected one, as a share of the number that rests
-with the latter; alternative to TIGHTER."""
+"""Alternative to TIGHTER: smallest number of resting corners, as a share of the expected motion's."""
 NOISE_SHARE = 0.02
 """Largest share of moving measurements that is noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledCorners:
-    """Corners of an image, each labelled as static, moving, or unclear.
+    """Corners of an image: static, moving, or unclear.
 
     Attributes:
-        level: The image, at the resolution of the labels.
+        level: The image, label resolution.
         segmentation: Its segments.
-        points: (n, 3) the corners, metres, camera frame.
-        pixels: (n, 2) int, their pixels u, v in ``level``.
+        points: (n, 3) metres, camera frame.
+        pixels: (n, 2) int u, v in ``level``.
         moving, static: (n,) bool.
     """
 
@@ -156,7 +147,7 @@ class LabelledCorners:
     static: NDArray[np.bool_]
 
     def count_by_segment(self, which: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
-        """Number of the selected corners (n,) in each segment (count + 1,); entry 0: in none."""
+        """Selected corners (n,) in each segment (count + 1,); entry 0: in none."""
         return np.bincount(self.segment_of[which], minlength=self.segmentation.count + 1)
 
     @cached_property
@@ -170,10 +161,10 @@ class DominantMotion:
     """Rigid motion of most of the visible surface between two images, and the labelled corners.
 
     Attributes:
-        T_after_before: (4, 4) motion of the static world from the first camera's frame to the second's.
+        T_after_before: (4, 4), from the first camera's frame to the second's.
         covariance: (6, 6) of its twist: m, rad; axes of the second camera.
-        share: Share of the surface that follows it, sampled by corners not known to move.
-        before, after: The corners in the first and in the second image; moving corners do not follow the motion.
+        share: Share of the surface that follows it.
+        before, after: Corners of the first and the second image.
     """
 
     T_after_before: NDArray[np.float64]
@@ -194,12 +185,12 @@ class DominantMotion:
 
     @cached_property
     def static_after(self) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the second image in segments with static corners; segments without corners are undecided."""
+        """Pixels (h, w) of the second image in segments with static corners."""
         return static_segments(self.after)
 
 
 def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether moving pixels (h, w) are a larger share of an image's measurements than noise produces."""
+    """Whether moving pixels (h, w) exceed the share that noise produces."""
     return bool(np.count_nonzero(moving) > NOISE_SHARE * level.num_readings)
 
 
@@ -215,31 +206,28 @@ def dominant_motion(
 ) -> DominantMotion | None:
     """Motion of the static world between two images, and the corners that do not follow it.
 
-    The static world is the largest *surface* that moves rigidly. Each corner counts by its squared depth, because a
-    crowd may fill half of the image, but hardly ever half of the visible square metres. A corner is moving if its
-    reprojection error e exceeds
+    The static world is the largest *surface* that moves rigidly. Corners count by squared depth, because a crowd may
+    fill half of the image, but hardly half of the visible square metres. A corner is moving if its reprojection error e
+    exceeds
 
         max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
-    with the inlier threshold t of the estimate. (The length of a vector of two normally distributed coordinates has the
-    median sqrt(2 ln 2) sigma.) The median is weighted by surface, because most corners may be on slow, near people.
+    with the inlier threshold t. (The length of a vector of two normal coordinates has the median sqrt(2 ln 2) sigma.)
+    The median is weighted by surface.
 
     Exceptions:
 
     * The image matches as well at the corner's static position: the corner is dropped.
-    * The error is within MOVES_SIGMAS standard deviations of the pixel by the covariance of the motion, and the corner
-      was not known to move: the corner is unclear. A few corners on the far side of a room do not determine the floor
-      before the camera.
+    * The error is within MOVES_SIGMAS standard deviations by the covariance of the motion, and the corner was not known
+      to move: the corner is unclear.
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.
-        segmentations: Segments of both, at the resolution of the labels.
-        moving: (h, w) bool at that resolution, known moving pixels of the first image, excluded from the motion
-            estimate.
-        T_expected: (4, 4) predicted motion, from which the corner search starts. None: the identity.
-        consecutive: Whether the images follow each other, so that the expected motion is a prior. A pose that followed
-            a crowd expects the crowd to be static over longer times.
-        doubtful: The expected motion is the result unless another one fits its static corners clearly more tightly.
+        segmentations: Segments of both, label resolution.
+        moving: (h, w) bool, known moving pixels of the first image, excluded from the estimate.
+        T_expected: (4, 4) predicted motion, start of the corner search. None: the identity.
+        consecutive: Whether the expected motion is a prior; over longer times a pose may have followed a crowd.
+        doubtful: The expected motion is the result unless another fits its static corners clearly more tightly.
 
     Returns:
         None if too few corners follow one motion.
@@ -318,7 +306,7 @@ def dominant_motion(
 
 
 def _misfit(error: NDArray[np.float64], limit: NDArray[np.float64]) -> float:
-    """Median of the errors (n,), px, within their limits (n,)."""
+    """Median of the errors within their limits, px."""
     rests = error <= limit
     return float(np.median(error[rests])) if rests.any() else np.inf
 
@@ -330,7 +318,7 @@ def _refined(
     limit: NDArray[np.float64],
     camera: Camera,
 ) -> NDArray[np.float64]:
-    """Motion (4, 4) of the corners that rest with a motion T (4, 4), by reweighted least squares."""
+    """Motion of the corners that rest with T, by reweighted least squares."""
     for _ in range(5):
         residual = targets - reproject(T, points, camera)
         error = lengths(residual)
@@ -347,11 +335,7 @@ def _refined(
 def _covariance(
     T: NDArray[np.float64], inliers: NDArray[np.float64], error: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64]:
-    """Covariance (6, 6) of the twist (m, rad; axes of the second camera) of a motion T (4, 4) fitted to inliers (m, 3).
-
-    It follows from their normal equations and errors (m,) px: sigma^2 (sum J^T J)^-1 with J (2, 6) the derivative of a
-    pixel by the twist.
-    """
+    """sigma^2 (sum J^T J)^-1 of the twist of a motion T, with J (2, 6) the derivative of an inlier's pixel."""
     rows = _pixel_jacobian(T, inliers, camera).reshape(-1, 6)
     sigma = weighted_median(error, inliers[:, 2] ** 2) / np.sqrt(2 * np.log(2))
     sigma = max(sigma, pixels_at_width(LEAST_SIGMA_PX, camera))
@@ -361,14 +345,13 @@ def _covariance(
 def _deviations(
     T: NDArray[np.float64], points: NDArray[np.float64], covariance: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64]:
-    """Standard deviations (n,) px per coordinate of the pixels of points (n, 3) m after a motion T (4, 4) with a
-    covariance (6, 6): sigma_n^2 = tr(J_n Sigma J_n^T) / 2."""
+    """Standard deviations (n,) px per coordinate of moved points: sigma_n^2 = tr(J_n Sigma J_n^T) / 2."""
     J = _pixel_jacobian(T, points, camera)
     return np.sqrt(np.einsum("nij,nij->n", J @ covariance, J) / 2)
 
 
 def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Derivatives (n, 2, 6) of the pixels of points (n, 3) after a motion T (4, 4) by its twist."""
+    """Derivatives (n, 2, 6) of moved points' pixels by the twist of T."""
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     x, y, by_z, none = x / z, y / z, 1 / z, np.zeros_like(z)
     u = np.stack([by_z, none, -x * by_z, -x * y, 1 + x * x, -y], axis=1)
@@ -377,15 +360,14 @@ def _pixel_jacobian(T: NDArray[np.float64], points: NDArray[np.float64], camera:
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Weighted median: smallest of the values (n,), n > 0, that has half of the weight (n,) together with smaller
-    values."""
+    """Smallest of the values (n,) that has half of the weight (n,) together with smaller values; n > 0."""
     order = values.argsort()
     total = weights[order].cumsum()
     return float(values[order[total.searchsorted(total[-1] / 2)]])
 
 
 def propagate_to_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
-    """Pixels (h, w) of the segments that move: at least AGREED of their corners, and FEWEST_MOVING, move."""
+    """Pixels (h, w) of the segments with at least FEWEST_MOVING moving corners, and a share of AGREED."""
     num_moving, num_all = corners.count_by_segment(corners.moving), corners.count_by_segment()
     moves = (num_moving >= FEWEST_MOVING) & (num_moving >= AGREED * num_all)
     moves[0] = False
@@ -393,7 +375,7 @@ def propagate_to_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
 
 
 def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
-    """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of them."""
+    """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED."""
     num_static, num_all = corners.count_by_segment(corners.static), corners.count_by_segment()
     static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
     static[0] = False
@@ -403,7 +385,7 @@ def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
 def _pixels_of_level(
     pixels: "NDArray[np.int64] | NDArray[np.float64]", level: Level, other: Level
 ) -> NDArray[np.int64]:
-    """Nearest pixels (n, 2) int u, v in another level to positions (n, 2) of a level."""
+    """Nearest pixels in another level to positions of a level."""
     scale = other.camera.width / level.camera.width
     return _nearest_pixels((pixels + 0.5) * scale - 0.5, other)
 

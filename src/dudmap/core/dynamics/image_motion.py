@@ -1,8 +1,4 @@
-"""Motion between consecutive images, while the map cannot separate static and moving surface.
-
-A new map knows no free space, and its moving objects are part of it. Each image is compared with the last one
-(``dominant_motion``).
-"""
+"""Motion between consecutive images, for maps without known free space."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,13 +18,13 @@ ImagePose = Callable[[], NDArray[np.float64] | None]
 
 @dataclass(eq=False)
 class TrackedImage:
-    """Image of a frame at its (predicted) pose, for comparison with older and newer images.
+    """Image of a frame at its (predicted) pose, for comparison with other images.
 
     Attributes:
         timestamp, T_world_camera: Seconds; (4, 4).
         pyramid: Its images.
-        segmentation: Its segments, at the resolution of the labels.
-        moving: (h, w) bool, its known moving pixels; None for none.
+        segmentation: Its segments, label resolution.
+        moving: (h, w) bool, known moving pixels; None for none.
         blind: Whether its intensities carry no information.
         gain: Gain of its exposure.
     """
@@ -42,7 +38,7 @@ class TrackedImage:
     gain: float = 1.0
 
     def motion_to(self, other: "TrackedImage", **options: bool) -> DominantMotion | None:
-        """Motion of the static world to another image (``dominant_motion`` with its ``options``); None if unknown."""
+        """``dominant_motion`` to another image; None if unknown."""
         T_expected = se3.inverse(other.T_world_camera) @ self.T_world_camera
         segmentations = self.segmentation, other.segmentation
         return dominant_motion(self.pyramid, other.pyramid, segmentations, self.moving, T_expected, **options)
@@ -52,11 +48,11 @@ class ImageMotion(Stateful):
     """Compares each image with the last one, while the map is young or most of the view moves.
 
     Args:
-        seconds: Duration of the comparison after the first frame of a map. It is extended, up to twice, while moving
-            objects are found. 0 disables the comparison.
+        seconds: Duration after the first frame of a map, extended up to twice while moving objects are found. 0
+            disables the comparison.
 
     Attributes:
-        active: Whether to compare the next frame with the last one.
+        active: Whether to compare the next frame.
         last: The last tracked frame.
     """
 
@@ -79,25 +75,24 @@ class ImageMotion(Stateful):
         return bool(np.isfinite(self._latest_end))
 
     def map_is_young(self, timestamp: float) -> bool:
-        """Whether the map cannot separate static and moving surface yet."""
+        """Whether the map cannot yet separate static and moving surface."""
         return timestamp < self._young_until
 
     def update(self, frame: TrackedImage) -> None:
-        """Set the tracked frame for the next comparison; after a blind frame there is none."""
+        """Set the frame for the next comparison."""
         self.last, self._compared, self.active = frame, None, False
         if not frame.blind:
             mostly = frame.moving is not None and is_majority_dynamic(frame.moving, frame.pyramid.labelled)
             self.active = self.map_is_young(frame.timestamp) or (mostly and self.seconds > 0 and self.started)
 
     def reset(self) -> None:
-        """Drop the last frame, so that nothing is compared before the next ``update``."""
+        """Drop the last frame."""
         self.last, self._compared, self.active = None, None, False
 
     def compare(self, now: TrackedImage, T_expected: NDArray[np.float64] | None = None) -> DominantMotion | None:
         """Motion of the static world since the last frame; None if unknown.
 
-        ``T_expected``: (4, 4) expected motion, or None. The result is cached: a second call with the same timestamp
-        returns the same object.
+        ``T_expected``: (4, 4) or None. The result is cached by timestamp.
         """
         last = self.last
         if last is None or last.blind:

@@ -1,4 +1,4 @@
-"""Labels of a frame: the mixture of its normalised residuals (thesis section 4.6, eq. 4.52-4.56), and its masks."""
+"""Labels of a frame and its masks: the mixture of its normalised residuals (thesis section 4.6, eq. 4.52-4.56)."""
 
 import math
 from dataclasses import dataclass
@@ -14,25 +14,24 @@ from dudmap.core.frames.observation import Level
 from dudmap.core.map.volume import MapSample
 
 START = 0.1, 1.0, 6.0
-"""Initial values of the EM: prior of the dynamic density, and standard deviations, static and dynamic."""
+"""Initial prior of the dynamic density, and standard deviations, static and dynamic."""
 PRIOR_BOUNDS = 0.02, 0.98
-"""Bounds of the prior of the dynamic density; they keep its logarithm finite."""
+"""Bounds of the prior, so that its logarithm is finite."""
 STATIC_BOUNDS = 0.5, 2.0
-"""Bounds of the standard deviation of the static density, which is 1 for an exact sensor model."""
+"""Bounds of the static standard deviation, which is 1 for an exact sensor model."""
 SEPARATION = 3.0
-"""Smallest ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
+"""Smallest ratio of the standard deviations, so that the components cannot swap."""
 
 RULES = MixtureRules(30, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION)
-"""Rules of the fit of a frame."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56), static and dynamic.
+    """Half-normal densities of the normalised residual (eq. 4.52, 4.56), static and dynamic.
 
     Attributes:
-        prior: Prior probabilities of both components.
-        sigma: Their standard deviations.
+        prior: Prior probabilities.
+        sigma: Standard deviations.
     """
 
     prior: tuple[float, float]
@@ -40,7 +39,7 @@ class Mixture:
 
     @property
     def coefficients(self) -> tuple[float, float]:
-        """Offset and slope of the log odds static : dynamic over the squared normalised residual."""
+        """Offset and slope of the log odds static : dynamic over the squared residual."""
         (p_static, p_dynamic), (s, d) = self.prior, self.sigma
         return np.log(p_static / p_dynamic * d / s), 0.5 / d**2 - 0.5 / s**2
 
@@ -50,7 +49,7 @@ class Mixture:
         return mixture_log_odds.py_func(np.square(residual, dtype=np.float32), offset, np.float32(slope))
 
     def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Densities (2, ...) of both components, priors included."""
+        """Densities (2, ...), priors included."""
         r = np.asarray(residual, dtype=np.float64)
         return np.stack(
             [
@@ -82,12 +81,12 @@ class Labels:
     """Static and dynamic pixels of one frame, at label resolution.
 
     Attributes:
-        static_probability: (h, w) float32 in [0, 1]; the weights of the second registration.
+        static_probability: (h, w) float32 in [0, 1]; weights of the second registration.
         dynamic: (h, w) bool.
-        mixture: The fitted densities; None if the labels are carried over from the last frame.
-        histogram: (BINS,) counts of the normalised residuals; 0 if the labels are carried over.
-        sample: Distance, intensity difference and occupancy of the map at the points of the frame.
-        segmentation: Surface segments of the frame.
+        mixture: The fitted densities; None for carried labels.
+        histogram: (BINS,) counts of the normalised residuals; 0 for carried labels.
+        sample: Distance, intensity difference and occupancy of the map at the pixels.
+        segmentation: Surface segments.
         hidden: (h, w) bool, pixels without depth in front of known background; None if not examined.
     """
 
@@ -101,13 +100,13 @@ class Labels:
 
 
 SEAM = 1
-"""Half width of the seams along depth edges whose measurements fit no map, pixels at REFERENCE_WIDTH."""
+"""Half width of seams along depth edges that fit no map, pixels at REFERENCE_WIDTH."""
 CLOSING_RADIUS = 2
-"""Half width of depth holes that belong to the surrounding dynamic region, pixels at REFERENCE_WIDTH."""
+"""Half width of depth holes that belong to the dynamic region around them, pixels at REFERENCE_WIDTH."""
 
 
 def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Mask (h, w) of an image without parts as thin as the seams along depth edges."""
+    """Mask (h, w) without parts as thin as the seams along depth edges."""
     import cv2
 
     side = scaled_side(SEAM, level)
@@ -135,10 +134,7 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 def _hidden_region(
     hidden: NDArray[np.bool_], dynamic: NDArray[np.bool_], depth: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) without depth that are nearer to a hidden pixel than to a static measurement.
-
-    The other pixels of an object without depth have unknown or similar background.
-    """
+    """Pixels without depth nearer to a hidden pixel than to a static measurement."""
     import cv2
 
     empty = depth <= 0
@@ -148,10 +144,10 @@ def _hidden_region(
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (h, w) of a pyramid level at the resolution (H, W) of its depth image; see ``labeling.upsample_labels``.
+    """Mask (h, w) of a pyramid level at full resolution (H, W); see ``labeling.upsample_labels``.
 
     Args:
-        low: (h, w) bool; halvings of a level round odd sizes down.
+        low: (h, w) bool.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
     """

@@ -1,4 +1,4 @@
-"""Surface segments of an image, and scaling of pixel counts, which refer to images 160 pixels wide."""
+"""Surface segments of an image, and scaling of pixel counts."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from dudmap.core.backends.cpu.segmentation import segment_surface
 from dudmap.core.frames.observation import Level
 
 REFERENCE_WIDTH = 160
-"""Label image width to which pixel counts refer: the default of ``dynamics.width``."""
+"""Label image width of pixel counts: the default of ``dynamics.width``."""
 
 
 def pixel_scale(level: Level) -> float:
@@ -20,28 +20,28 @@ def pixel_scale(level: Level) -> float:
 
 
 def scaled_length(pixels: float, level: Level) -> int:
-    """Length in pixels of a label image, from the length at REFERENCE_WIDTH; at least 1."""
+    """Pixels of a label image, from pixels at REFERENCE_WIDTH; at least 1."""
     return max(1, round(pixels * pixel_scale(level)))
 
 
 def scaled_side(radius: float, level: Level) -> int:
-    """Side of a square window in pixels of a label image, from its radius at REFERENCE_WIDTH; odd, at least 3."""
+    """Odd side of a square window in a label image, from its radius at REFERENCE_WIDTH; at least 3."""
     return 2 * scaled_length(radius, level) + 1
 
 
 def scaled_area(pixels: float, level: Level) -> float:
-    """Area in pixels of a label image, from the area at REFERENCE_WIDTH; at least 9 (3x3)."""
+    """Area in a label image, from the area at REFERENCE_WIDTH; at least 9 (3x3)."""
     return max(9.0, pixels * pixel_scale(level) ** 2)
 
 
 EDGE_REACH = 3
-"""Distance from a concave edge to the compared normals on either side, pixels at REFERENCE_WIDTH."""
+"""Distance of compared normals from a concave edge, pixels at REFERENCE_WIDTH."""
 NORMAL_REACH = 2
 """Half width of the window of a normal, pixels at REFERENCE_WIDTH."""
 CONCAVITY = 0.2
-"""Sine of half the smallest angle between the normals across a concave edge: 23 degrees."""
+"""Sine of half the smallest angle between normals across a concave edge: 23 degrees."""
 MIN_PIXELS = 60
-"""Smallest segment that is classified as a whole, pixels at REFERENCE_WIDTH: 0.3 % of a 4:3 image."""
+"""Smallest segment classified as a whole, pixels at REFERENCE_WIDTH: 0.3 % of a 4:3 image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,9 @@ class Segmentation:
     Attributes:
         labels: (h, w) int32 segment numbers from 1, 0 = no measurement.
         count: Number of segments.
-        gradient: (h, w) float32, local mean of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH.
-        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
-        window: Side of the window for local means of intensities, pixels.
+        gradient: (h, w) float32, local mean of the intensity gradient's magnitude, per pixel at REFERENCE_WIDTH.
+        min_pixels: Smallest segment classified as a whole.
+        window: Side of the window for mean intensities, pixels.
     """
 
     labels: NDArray[np.int32]
@@ -63,13 +63,13 @@ class Segmentation:
     window: int = 3
 
     def with_noise(self, sigma: NDArray[np.float32], least: float) -> SegmentImage:
-        """The segments for kernels; sigma (h, w): standard deviation of the distance of a static point, metres;
-        ``least``: its lower bound."""
+        """The segments for kernels. ``sigma``: (h, w) standard deviation of a static distance, metres, at least
+        ``least``."""
         least_sigma: Any = np.float32(least)
         return SegmentImage(self.labels, self.count, self.min_pixels, self.gradient, self.window, sigma, least_sigma)
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Share (count + 1,) of each segment's pixels in a mask (h, w) bool; entry 0 is meaningless."""
+        """Share (count + 1,) of each segment's pixels in a mask (h, w) bool; entry 0 has no meaning."""
         total = np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
         return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(total, 1)
 
@@ -79,7 +79,7 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
 
     Args:
         level: The image.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        tolerance: (h, w) float32, largest depth step within a surface, metres.
     """
     edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
     labels, count = segment_surface(
@@ -89,7 +89,7 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
 
 
 def intensity_gradient(level: Level) -> NDArray[np.float32]:
-    """Local mean (h, w) of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH."""
+    """Local mean (h, w) of the intensity gradient's magnitude, per pixel at REFERENCE_WIDTH."""
     import cv2
 
     scale, window = pixel_scale(level), scaled_side(1, level)

@@ -1,4 +1,4 @@
-"""Temporal state of the dynamic detector: recent frames, and the static background behind pixels without depth."""
+"""Temporal state of the dynamic detector: recent frames, and the background behind pixels without depth."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -17,23 +17,22 @@ from dudmap.core.geometry import se3
 from dudmap.core.state import Remembered, Stateful
 
 SETTLE_FRAMES = 4
-"""Number of frames over ``settle_time`` in which a segment must be still to be released."""
+"""Frames over ``settle_time`` in which a released segment is still."""
 START_FRAMES = 6
-"""Number of frames over ``start_seconds`` whose lines of sight are free space."""
+"""Frames over ``start_seconds`` whose lines of sight are free space."""
 YOUNG_PERIODS = 3.0
-"""Age of the map, in units of ``start_seconds``, until which single frames give free space; later the map does."""
+"""Age of the map, in ``start_seconds``, until which single frames give free space."""
 YOUNG_UNKNOWN_SHARE = 0.1
-"""Share of measurements in space unknown to the map above which single frames give free space at any age."""
+"""Share of measurements in unknown space above which single frames give free space at any age."""
 SEAM = 1
-"""Half width, pixels at REFERENCE_WIDTH, of the false free regions along depth edges at a slightly wrong pose."""
+"""Half width, pixels at REFERENCE_WIDTH, of false free regions along depth edges."""
 MAX_DISPLACEMENT = 0.1
-"""Largest distance of a point from its measurement in the last frame, reference depths: 3 m/s at 30 frames per second
-in a room."""
+"""Largest distance of a point from its last measurement, reference depths: 3 m/s at 30 frames per second in a room."""
 DYNAMIC_SHARE = 0.2
-"""Smallest share of dynamic pixels of a segment that is remembered as dynamic."""
+"""Smallest dynamic share of a segment that is remembered as dynamic."""
 
 CARRIED_TIME = 0.05
-"""Longest time over which labels are carried, seconds: a fast walker, 2 m/s, moves by MAX_DISPLACEMENT of a room."""
+"""Longest time over which labels are carried, seconds: a fast walker, 2 m/s, moves by MAX_DISPLACEMENT."""
 
 
 @dataclass(eq=False)
@@ -76,15 +75,15 @@ class TemporalMemory(Stateful):
         self._start_frames = []
 
     def start(self, timestamp: float) -> None:
-        """Begin with the first frame of a map, at a time in seconds."""
+        """Begin with the first frame of a map."""
         self._young_until = timestamp + YOUNG_PERIODS * self.config.start_seconds
         self._start_frames = []
         self._recent_frames.clear()
 
     def import_from(self, other: "TemporalMemory", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
-        """Import the frames of the first seconds from another pass over the same recording.
+        """Import the frames of the first seconds from another pass over the recording.
 
-        ``Ts_world_camera``: (4, 4) poses by timestamp; frames without a pose are dropped.
+        ``Ts_world_camera``: (4, 4) by timestamp; frames without a pose are dropped.
         """
         self._young_until, self._imported = other._young_until, True
         self._start_frames = [
@@ -101,10 +100,8 @@ class TemporalMemory(Stateful):
         dynamic: NDArray[np.bool_],
         segmentation: Segmentation | None,
     ) -> None:
-        """Remember a tracked frame (timestamp in seconds) with its dynamic pixels (h, w) bool.
-
-        ``segmentation``: segments of the image; None if motion is not decided by segment.
-        """
+        """Remember a tracked frame with its dynamic pixels (h, w) bool; ``segmentation``: None if motion is not decided
+        by segment."""
         marks = np.zeros(dynamic.shape, dtype=np.uint8)
         if segmentation is not None:
             marks = dynamic_segments(segmentation, dynamic).view(np.uint8)
@@ -129,27 +126,27 @@ class TemporalMemory(Stateful):
             frame.T_world_camera = T_new_old @ frame.T_world_camera
 
     def reset(self) -> None:
-        """Forget all frames after a loss of tracking, except imported ones."""
+        """Forget all frames except imported ones."""
         self._last = None
         self._settle_frames.clear()
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
     def is_recent(self, timestamp: float) -> bool:
-        """Whether the labels of the last frame can be carried to a frame at a time in seconds."""
+        """Whether labels of the last frame can be carried to this time."""
         return self._last is not None and timestamp - self._last.timestamp <= CARRIED_TIME
 
     def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) of an image at a pose (4, 4) whose points belonged to a dynamic segment in the last frame."""
+        """Pixels (h, w) of an image at a pose (4, 4) whose points were in a dynamic segment in the last frame."""
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, bool)
         return _seen_marked(_reprojected(level, T_world_camera, [self._last]), 0, self._near)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
-        """Remembered frames whose lines of sight are free space for a frame at a time in seconds.
+        """Remembered frames whose lines of sight are free space at this time.
 
-        Single frames are used while the map is young, or if ``unknown``, the share of measurements in space unknown to
-        the map, is large. Otherwise there are none. A second pass also compares later frames of the first seconds.
+        There are some while the map is young, or if ``unknown``, the share of measurements in unknown space, is large.
+        A second pass also compares later frames.
         """
         if timestamp < self._young_until:
             candidates = self._start_frames if self._imported else self._recent_frames
@@ -166,11 +163,10 @@ class TemporalMemory(Stateful):
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) of an image at a pose (4, 4) in space that single frames have seen to be free.
 
-        A point is in free space if at least one frame has seen farther by more than ``noise`` along its line of sight.
-        The number of such frames must be at least half the number that saw a surface there.
+        At least one frame saw farther by more than ``noise``, and at least half as many as saw a surface there.
 
         Args:
-            noise: (h, w) float32, largest depth difference between two measurements of one point, metres.
+            noise: (h, w) float32, largest depth difference of measurements of one point, metres.
             frames: See ``free_space_frames``.
         """
         import cv2
@@ -192,10 +188,7 @@ class TemporalMemory(Stateful):
         dynamic: NDArray[np.bool_],
         least_sigma: float = 0.0,
     ) -> NDArray[np.bool_]:
-        """Dynamic pixels (h, w) whose segment has been still for ``settle_time``.
-
-        The dynamic part of a segment has settled if it is still (``stand_still``) relative to every frame kept of
-        ``settle_time``.
+        """Dynamic pixels (h, w) whose segment is still (``stand_still``) in all frames kept of ``settle_time``.
 
         Args:
             timestamp: Seconds.
@@ -217,7 +210,7 @@ class TemporalMemory(Stateful):
 
 
 def dynamic_segments(segmentation: Segmentation, dynamic: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) of the segments with a share of at least DYNAMIC_SHARE in a mask (h, w) bool."""
+    """Pixels (h, w) of the segments with a share of at least DYNAMIC_SHARE in a mask."""
     chosen = segmentation.share(dynamic) >= DYNAMIC_SHARE
     chosen[0] = False
     return chosen[segmentation.labels]
@@ -231,33 +224,32 @@ def _reprojected(level: Level, T_world_camera: NDArray[np.float64], frames: Sequ
 
 
 def _seen_marked(found: Reprojection, n: int, near: float) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose points have a marked measurement of frame n within ``near`` metres."""
     return (found.marks[n] > 0) & (np.abs(found.gap[n]) < near)
 
 
 SAME_INTENSITY = 0.15
-"""Largest difference of a pixel's intensity from the background around it."""
+"""Largest intensity difference from the background around."""
 MIN_AGE = 0.3
-"""Smallest time for which background has been seen, seconds."""
+"""Seconds for which background has been seen."""
 VOTING_SIDE = 7
-"""Side of the square in which pixels without depth vote, subsampled pixels."""
+"""Side of the voting square, subsampled pixels."""
 MIN_KNOWN = 0.2
-"""Smallest share of that square with known background."""
+"""Smallest share of the square with known background."""
 STRIDE = 2
-"""Pixels of the label image per subsampled pixel, across and down, at REFERENCE_WIDTH."""
+"""Pixels of the label image per subsampled pixel, at REFERENCE_WIDTH."""
 SQUARE = np.ones((3, 3), np.uint8)
 MIN_AREA = 0.005
-"""Smallest examined region without depth, as a share of the image."""
+"""Smallest examined region without depth, share of the image."""
 
 
 class BackgroundModel(Stateful):
-    """The last static measurement of every pixel, as a world point that is carried from image to image.
+    """The last static measurement of every pixel, as a world point carried from image to image.
 
-    An object without depth, too near or too dark, hides the known background and looks different. A sensor shadow, a
-    screen or a window looks like the background before.
+    An object without depth hides known background and looks different; a sensor shadow, screen or window looks like the
+    background.
 
     Args:
-        config: ``settle_time``: age of unseen background beyond which it is dropped.
+        config: ``settle_time``: age at which unseen background is dropped.
     """
 
     _background: Remembered[PointImage | None] = None
@@ -266,15 +258,14 @@ class BackgroundModel(Stateful):
         self.config = config
 
     def reset(self) -> None:
-        """Drop the background, because it belongs to another world or the pose was lost."""
+        """Drop the background."""
         self._background = None
 
     def hidden(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) without depth in front of known background.
+        """Pixels (h, w) without depth in front of known background. The image has the exposure of the map.
 
-        A pixel without depth votes if the background is known within 3x3 pixels. It votes for hidden if its intensity
-        is outside the background's range there, extended by SAME_INTENSITY. A pixel is hidden by majority within
-        VOTING_SIDE, if at least MIN_KNOWN of the pixels vote. The image must have the exposure of the map.
+        A pixel without depth votes if background is known within 3x3 pixels, and for hidden if its intensity is outside
+        the background's range plus SAME_INTENSITY. The majority within VOTING_SIDE decides if at least MIN_KNOWN vote.
         """
         import cv2
 
@@ -309,8 +300,7 @@ class BackgroundModel(Stateful):
     def update(
         self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], dynamic: NDArray[np.bool_]
     ) -> None:
-        """Replace the background by the measurements of an image, except at ``dynamic`` pixels (h, w). The image must
-        have the exposure of the map."""
+        """Replace the background, except at ``dynamic`` pixels (h, w). The image has the exposure of the map."""
         stride = _stride(level)
         depth, intensity = _subsampled(level, stride)
         self._background = self._seen_from(timestamp, level, stride, T_world_camera)
@@ -333,7 +323,7 @@ class BackgroundModel(Stateful):
 
 
 def _subsampled(level: Level, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth of one pixel per stride across and down, and mean intensity around it."""
+    """Depth of one pixel per stride, and mean intensity around it."""
     import cv2
 
     depth = level.depth[::stride, ::stride]
@@ -341,5 +331,5 @@ def _subsampled(level: Level, stride: int) -> tuple[NDArray[np.float32], NDArray
 
 
 def _stride(level: Level) -> int:
-    """Pixels of the label image per subsampled pixel: subsampled images are about 80 pixels wide."""
+    """Subsampled images are about 80 pixels wide."""
     return scaled_length(STRIDE, level)

@@ -1,11 +1,8 @@
 """All checks of a registered frame: one table of metric, limit and reason.
 
-All metrics are computed for every frame and reported (``FrameResult.verdict``). The first failed check rejects the
-frame.
-
-Relative checks compare a frame with the frames before: the rise of a residual over its median, in units of its spread.
-They find registrations in a wrong minimum, which fit much worse than their predecessors, but often within any fixed
-limit. Independent evidence for the pose overrules them.
+All metrics are reported (``FrameResult.verdict``); the first failed check rejects the frame. Relative checks compare a
+residual with its median in the previous frames, in units of its spread. They find wrong minima that pass fixed limits.
+Independent evidence for the pose overrules them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,29 +16,29 @@ from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.core.verdict import Outcome, Verdict
 
 MIN_READINGS = 100
-"""Smallest number of static measurements on the map: well above the six unknowns of a registration."""
+"""Fewest static measurements on the map: well above the six unknowns."""
 MAX_DRIFT = 0.03
-"""Largest standard deviation of a pose that follows the prediction in unobserved directions, metres."""
+"""Largest standard deviation of a pose predicted in unobserved directions, metres."""
 MIN_VERIFIED_SHARE = 0.09
-"""Smallest share of measurements that are static and on the map, in mostly dynamic views."""
+"""Smallest share of measurements static and on the map, in mostly dynamic views."""
 MAX_STEP = 0.5
-"""Largest motion between two frames without known times: shift of the median measurement as a share of the image width.
-Half of the view is then still common, from which a registration can start."""
+"""Largest motion between frames without times: shift of the median measurement as a share of the image width. Half of
+the view is then still common."""
 MAX_IMAGE_SHIFT = 1.0
-"""Largest misregistration of two images at a correct pose, pixels of the coarsest level. A larger one has not converged
-on any level."""
+"""Largest misregistration of two images at a correct pose, pixels of the coarsest level. A larger one has not
+converged."""
 CONFIRMED_SHARE, CONFIRMED_OF_SEEN = 0.5, 0.8
-"""Smallest shares of measurements whose depth agrees with the last frame, of all and of those visible in it, to confirm
-a pose. They leave no room for a second motion. At a correct pose noise leaves 99.7 %, depth edges a few percent less.
-At wrong minima of kidnapped cameras in synthetic rooms less than 1 % agreed."""
+"""Smallest shares of measurements that agree with the last frame, of all and of the visible ones, to confirm a pose.
+They leave no room for a second motion. Noise leaves 99.7 % at a correct pose, and depth edges a few percent less; less
+than 1 % agreed at wrong minima in synthetic rooms."""
 MAX_RESIDUAL = 4.0
-"""Largest robust root mean square of the distance residuals, in standard deviations sigma(z) of a measurement."""
+"""Largest robust root mean square of the distance residuals, in standard deviations sigma(z)."""
 MAX_DYNAMIC_SHARE = 0.9
-"""Largest share of dynamic measurements; above it the frame is lost."""
+"""Largest share of dynamic measurements of a tracked frame."""
 MIN_COLOR_LIMIT = 0.03
-"""Smallest limit of the intensity difference (0..1), for maps whose usual difference is that of the storage steps."""
+"""Smallest limit of the intensity difference (0..1), above the storage steps of the map."""
 USUAL_OVERLAP = 0.6
-"""Smallest share of static measurements on the map after a loss, in multiples of the usual share."""
+"""Smallest share of static measurements on the map after a loss, in usual shares."""
 
 
 class RegistrationRules(NamedTuple):
@@ -49,11 +46,11 @@ class RegistrationRules(NamedTuple):
 
     Attributes:
         damping: Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1).
-        min_overlap: Smallest share of the static measurements that lie on the map.
-        min_condition: Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J.
-        min_information: Smallest information on a direction of motion with which the registration always moves along
-            it, in multiples of the information from gradient noise alone. Below it, the registration moves only if map
-            and image have the same texture along the direction. An endless tunnel gives 2 from noise. 0 always moves.
+        min_overlap: Smallest share of the static measurements on the map.
+        min_condition: Smallest ratio of the extreme eigenvalues of the scaled J^T J.
+        min_information: Information on a direction, in multiples of gradient noise, above which the registration always
+            moves along it; an endless tunnel gives 2. Below it, map and image must have the same texture along the
+            direction. 0 always moves.
     """
 
     damping: float = 0.02
@@ -76,8 +73,8 @@ class Limits:
         rules: Limits of the registration.
         mostly_dynamic: Most of the measurements are dynamic.
         blind: The image carries no information.
-        residual_mm, color: Largest residuals that the frames before let expect; NaN if unknown.
-        overlap: Usual value of the frames before, after a loss; NaN if unknown or not lost.
+        residual_mm, color: Largest expected residuals; NaN if unknown.
+        overlap: Usual overlap, after a loss; else NaN.
     """
 
     config: TrackerConfig
@@ -100,12 +97,12 @@ class Check:
     """One condition of a registered frame.
 
     Attributes:
-        figure: Name of the tested metric, with its unit.
+        figure: Name of the metric, with its unit.
         limit: Limit of the metric. A NaN metric or limit passes.
         reason: Text with placeholders for ``figure`` and ``limit``.
-        at_least: The limit is a lower bound instead of an upper bound.
-        overruled_by: Evidence that overrules the check: the ``last frame``, seen from the pose, has the same depth and
-            image; or the ``corners`` of the last image support the pose.
+        at_least: The limit is a lower bound.
+        overruled_by: Overruling evidence. ``last frame``: it has the same depth and image at the pose. ``corners``: the
+            corners of the last image support the pose.
         name: Name of the check; empty for the name of the metric.
     """
 
@@ -117,7 +114,7 @@ class Check:
     name: str = ""
 
     def outcome(self, figures: Mapping[str, float], limits: Limits) -> Outcome:
-        """Outcome of the check before it is overruled."""
+        """Outcome before it is overruled."""
         figure, limit = figures[self.figure], self.limit(limits)
         return Outcome.of(self.name or self.figure, figure, limit, self.reason, at_least=self.at_least)
 
@@ -142,7 +139,7 @@ REGISTRATION = (
         at_least=True,
     ),
 )
-"""Checks of a registration by itself."""
+"""Checks of a single registration."""
 RELATIVE = (
     # a residual within the sensor noise never rejects a pose, however small it was before
     Check(
@@ -168,7 +165,7 @@ RELATIVE = (
         overruled_by="last frame",
     ),
 )
-"""Checks against the usual values of the frames before."""
+"""Checks against usual values of previous frames."""
 CHECKS = (
     *REGISTRATION,
     Check("speed_m_s", lambda limits: limits.config.max_speed, "the camera would have jumped at {figure:.1f} m/s"),
@@ -204,7 +201,7 @@ CHECKS = (
         overruled_by="corners",
     ),
 )
-"""All checks of a frame, in order of application."""
+"""All checks, in order."""
 
 
 def judged(
@@ -219,7 +216,7 @@ def judged(
         checks: The checks.
         figures: Metrics by name.
         limits: Quantities that determine the limits.
-        evidence: Functions that decide on overruling, by name; None for no evidence.
+        evidence: Overruling functions by name; None for none.
     """
     outcomes, failed = list[Outcome](), evidence is None
     for check in checks:

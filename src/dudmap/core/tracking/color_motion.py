@@ -1,4 +1,4 @@
-"""Registration of the colour image with the camera motion, and the remaining noise of its intensities."""
+"""Registration of colour to depth under camera motion, and the remaining intensity noise."""
 
 from dataclasses import replace
 from functools import cache, cached_property
@@ -22,9 +22,7 @@ from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 
 
 class RegisteredLevel(Level):
-    """A level that registers its intensities on demand, because few frames need all levels.
-
-    The intensities follow from the other attributes and are not part of the state of a system.
+    """A level that registers its intensities on demand. They follow from the other attributes and are no state.
 
     Attributes:
         observation: The frame.
@@ -53,19 +51,17 @@ class RegisteredLevel(Level):
 class ColorMotion(Stateful):
     """Registers colour to depth with the present calibration, which may change while the camera moves.
 
-    A camera is at x with the velocity v, and the colour image is taken tau later, at y = x + tau v. Registered with the
-    velocity v + d, it pulls the pose to x - tau d. The registration gives colour the share k; dt is the time since the
-    last frame. The found pose then implies the velocity v - k (tau / dt) d. Used directly for the next frame, errors
-    would grow for tau > dt / 2 and k = 1. Therefore the velocity only moves the part a = 1 / (1 + tau / dt) from the
-    assumed to the found velocity. This leaves d (1 - a (1 + k tau / dt)): zero if colour dominates; otherwise colour
-    hardly affects the pose.
+    Stability: the colour image is taken tau after the depth, at y = x + tau v. Registered with the velocity v + d, it
+    pulls the pose to x - tau d. With the share k of colour in the registration and the frame interval dt, the found
+    pose implies the velocity v - k (tau / dt) d, which diverges for tau > dt / 2 and k = 1. The velocity therefore
+    moves by the part a = 1 / (1 + tau / dt) only, which leaves d (1 - a (1 + k tau / dt)).
 
-    The velocity of the first frame of a map is unknown. Its colours and the colours of the second frame are not moved,
-    so that the motion between both is correct. With this motion the first frame is fused again.
+    The velocity of the first frame of a map is unknown. Colours of the first two frames are not moved; with the motion
+    between them, the first frame is fused again.
 
     Args:
         motion: Velocity of the camera.
-        given: Calibration for preparing frames; None for colour that is registered to depth.
+        given: Calibration for preparing frames; None for registered colour.
 
     Attributes:
         calibration: Calibration in use; None for images without correction.
@@ -86,15 +82,15 @@ class ColorMotion(Stateful):
         return assumed if self.calibration is None else self.calibration.time_sigma(assumed)
 
     def start(self, view: FrameView) -> None:
-        """Begin with the first frame of a map, whose velocity is unknown."""
+        """Begin with the first frame of a map."""
         self._is_first = not self.is_prepared(view.observation) or self.rectifies
 
     def first_frame(
         self, first: FrameView | None, timestamp: float, T_world_camera: NDArray[np.float64]
     ) -> FrameView | None:
-        """The first frame of a map, rectified and with registered colours, once the pose (4, 4) of the next is known.
+        """The first frame of a map, rectified and with registered colours, given the pose (4, 4) of the next.
 
-        Returns None if the map is already correct, its first frame is forgotten, or the velocity is outdated.
+        None if the map is already correct, its first frame is forgotten, or the velocity is outdated.
         """
         is_first, self._is_first = self._is_first, False
         if first is None or not is_first or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
@@ -103,17 +99,17 @@ class ColorMotion(Stateful):
         return self._with_colors(replace(first, observation=self.rectified(first.observation, velocity)), velocity)
 
     def predicted(self, view: FrameView) -> FrameView:
-        """The frame with pyramid intensities registered by the last velocity."""
+        """The frame with intensities registered by the last velocity."""
         return self._with_levels(view, self.motion.velocity)
 
     def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
-        """The frame with pyramid intensities registered by the velocity to a first estimate of its pose (4, 4)."""
+        """The frame with intensities registered by the velocity to a first estimate of its pose (4, 4)."""
         if self._is_first:
             return view
         return self._with_levels(view, self._velocity(view, T_world_camera))
 
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
-        """The frame after its pose (4, 4) is known; another thread registers its colours (``FrameView.colored``)."""
+        """The frame at its pose (4, 4); another thread registers its colours (``FrameView.colored``)."""
         velocity = self._velocity(view, T_world_camera)
         if self._is_first:  # the next frames are compared with its intensities
             view = self._with_levels(view, velocity)
@@ -124,8 +120,8 @@ class ColorMotion(Stateful):
     ) -> Frame:
         """A frame with its recorded colour registered to the preprocessed depth.
 
-        ``camera``: of the depth image, without distortion. ``velocity``: (6,) twist per second, camera axes.
-        ``calibration``: of the colour camera; None for registered colour.
+        ``camera``: depth camera without distortion. ``velocity``: (6,) twist per second, camera axes. ``calibration``:
+        of the colour camera; None for registered colour.
         """
         if calibration is None:
             return frame
@@ -133,7 +129,7 @@ class ColorMotion(Stateful):
         return replace(frame, color=register_color(frame.rgb, frame.depth, camera, projection))
 
     def is_prepared(self, observation: Observation) -> bool:
-        """Whether the colours of the frame need no further registration."""
+        """Whether the colours need no further registration."""
         calibration = self.calibration
         if calibration is None or calibration.is_registered(observation.camera) or not observation.has_color:
             return True
@@ -141,21 +137,19 @@ class ColorMotion(Stateful):
 
     @property
     def rectifies(self) -> bool:
-        """Whether the depth images have a rolling shutter to correct."""
+        """Whether depth images have a rolling shutter to correct."""
         return self._depth_readout != 0
 
     def rectified(self, observation: Observation, velocity: NDArray[np.float64] | None = None) -> Observation:
-        """A frame rectified to the time of its middle row; unchanged with a global shutter.
-
-        ``velocity``: (6,) twist of the camera per second; None for the last velocity.
-        """
+        """A frame rectified to the time of its middle row. ``velocity``: (6,) twist per second; None for the last
+        one."""
         velocity = self.motion.velocity if velocity is None else velocity
         if not (self.rectifies and velocity.any()):
             return observation
         return rectified(observation, self._depth_readout, velocity, with_color=self.is_prepared(observation))
 
     def use(self, calibration: Calibration, timestamp: float) -> None:
-        """Use a calibration for all frames after this time stamp."""
+        """Use a calibration after this time stamp."""
         if calibration.depth_readout != self._depth_readout:
             self._rectified_from = timestamp
         self.calibration = calibration
@@ -185,7 +179,7 @@ class ColorMotion(Stateful):
         return replace(view, colors=submit(colored))
 
     def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist per second (6,) after registration of a frame with the velocity of the motion model."""
+        """Twist per second after registration of a frame."""
         if self.calibration is None:
             return view.color_velocity
         assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
@@ -211,31 +205,30 @@ class ColorMotion(Stateful):
 
 
 RESOLUTION = 0.5
-"""Displacement, in voxels or pixels, that intensities cannot resolve: half a sampling distance."""
+"""Displacement that intensities cannot resolve: half a voxel or pixel."""
 STRIDE = 8
-"""Step between the pixels of the median, across and down."""
+"""Step between sampled pixels, across and down."""
 
 
 def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: float, voxel_size: float) -> float:
     """Factor in (0, 1] for the weight of the intensity residual while the camera moves.
 
-    Colour and depth of one pixel are captured at different times, because of rolling shutter, exposure and
-    unsynchronised cameras. ``s`` is the standard deviation of this time difference, and ``u`` the speed of the image,
-    pixels per second. The colour is then displaced by ``s u`` pixels, and its residual has the variance
+    Rolling shutter, exposure and unsynchronised cameras separate colour and depth of a pixel by a time of standard
+    deviation ``s``. At an image speed ``u`` (px/s) the residual has the variance
 
         sigma^2 + |grad I|^2 (s u)^2 = sigma^2 (1 + (s u / r)^2),   r = sigma / |grad I|.
 
-    Here r is the displacement that intensities resolve: half a pixel of the level, or half a voxel, because the map has
-    no finer detail. The weight is divided by the bracket with the median of u / r over the image. The motion field of a
-    twist (v, omega) is, per unit of the image at depth 1 (Longuet-Higgins and Prazdny 1980),
+    The resolved displacement r is half a pixel, or half a voxel. The weight is divided by the bracket with the median
+    of u / r over the image. The motion field of a twist (v, omega) is, per unit of the image at depth 1
+    (Longuet-Higgins and Prazdny 1980),
 
         (-v_x + x v_z) / z - omega_y + y omega_z + x (y omega_x - x omega_y),
         (-v_y + y v_z) / z + omega_x - x omega_z + y (y omega_x - x omega_y).
 
     Args:
         level: Finest level of the registration.
-        velocity: (6,) twist per second of the camera, camera axes.
-        time_sigma: Standard deviation of the time between the colour and the depth of a pixel, seconds.
+        velocity: (6,) twist per second, camera axes.
+        time_sigma: ``s``, seconds.
         voxel_size: Metres.
     """
     camera, part = level.camera, np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
@@ -253,10 +246,10 @@ def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: flo
 
 
 def gain_discount(gain: float, sigma: float, color_weight: float) -> float:
-    """Factor in (0, 1] for the weight of the intensity residual of an image that is darker than the map.
+    """Factor in (0, 1] for the weight of the intensity residual of an image darker than the map.
 
-    A weight w of intensities against distances with standard deviation ``sigma`` corresponds to the variance sigma^2 /
-    w. A gain g spreads the grey levels to steps of g, whose rounding adds (g^2 - 1) / 12.
+    A weight w against distances with standard deviation ``sigma`` corresponds to the variance sigma^2 / w. The rounding
+    of grey levels spread by a gain g adds (g^2 - 1) / 12.
     """
     rounding = max(gain * gain - 1, 0.0) / (12 * 255**2)
     return 1 / (1 + rounding * color_weight / sigma**2)

@@ -1,4 +1,4 @@
-"""A frame in processing: its independent parts, its pose and labels after registration, and the time of each stage."""
+"""A frame in processing: images, pose, labels, and the time of each stage."""
 
 import time
 from collections.abc import Callable
@@ -23,9 +23,7 @@ from dudmap.core.verdict import ACCEPTED, Outcome
 
 
 class StageTimer:
-    """Milliseconds per processing stage of a frame; repeated stages are added.
-
-    A nested stage does not count for the outer one, so that no time is counted twice.
+    """Milliseconds per processing stage, summed. A nested stage does not count for the outer one.
 
     Args:
         timings: Earlier milliseconds per stage.
@@ -39,11 +37,11 @@ class StageTimer:
 
     @property
     def stage(self) -> str:
-        """The running stage; empty if there is none."""
+        """The running stage; empty for none."""
         return "" if self._running is None else self._running[0]
 
     def __call__(self, stage: str) -> "StageTimer":
-        """Context manager that measures a block of code; a block left by an exception is not counted."""
+        """Context manager that measures a block; a block left by an exception does not count."""
         self._stage = stage
         return self
 
@@ -62,26 +60,26 @@ class StageTimer:
 
 
 TEXTURELESS = 0.01
-"""Standard deviation of the intensities (0..1) below which an image carries no information: black or saturated."""
+"""Standard deviation of intensities (0..1) below which an image carries no information: black or saturated."""
 EXPOSED, USUAL_INTENSITY = (0.2, 0.75), 0.4
-"""Range of mean intensities of normally exposed images, and target mean of other first images of a map."""
+"""Mean intensities of normally exposed images, and target mean of other first images."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """A preprocessed frame with everything that needs no other frame.
+    """A preprocessed frame, independent of other frames.
 
     Attributes:
         observation: Preprocessed images.
-        levels: Returns the image pyramid of the observation.
-        segmentation: Returns the surface segments of ``pyramid.labelled``; waits for the thread that computes them.
-        timer: Collects the processing time of each stage.
+        levels: Returns the image pyramid.
+        segmentation: Returns the surface segments of ``pyramid.labelled``; waits for their thread.
+        timer: Collects the time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
-        blind: The image is textureless although the first image of the map was not, or the light has changed too much.
-            Only the distances determine the pose, and the frame is not fused.
-        color_velocity: (6,) twist of the camera per second with which the colours were registered.
-        shed: Work that is omitted from the frame.
-        colors: Returns the observation with registered colours; None if its colours are registered.
+        blind: The image is textureless unlike the first image of the map, or the light has changed too much. Only the
+            distances determine the pose; the frame is not fused.
+        color_velocity: (6,) twist of the camera per second that registered the colours.
+        shed: Omitted work.
+        colors: Returns the observation with registered colours; None if they are registered.
     """
 
     observation: Observation
@@ -98,7 +96,7 @@ class FrameView:
     def of(
         cls, observation: Observation, config: Config, detector: DynamicDetector, *, now: bool = True
     ) -> "FrameView":
-        """A preprocessed frame with its pyramid and segments, computed ``now`` or on demand."""
+        """A preprocessed frame; pyramid and segments are computed ``now`` or on demand."""
         _ = observation.num_readings  # cached for the result
         levels = cache(lambda: Pyramid.of(observation, observation.camera, config))
         if now:
@@ -112,11 +110,11 @@ class FrameView:
 
     @property
     def without_image(self) -> bool:
-        """Whether only the distances determine the pose: the image carries no information, or there is none."""
+        """Whether only the distances determine the pose."""
         return self.blind or not self.observation.has_color
 
     def colored(self) -> Observation:
-        """The observation with registered colours; waits for the thread that registers them."""
+        """The observation with registered colours; waits for their thread."""
         if self.colors is None:
             return self.observation
         with self.timer("color"):
@@ -124,7 +122,7 @@ class FrameView:
 
     @property
     def pyramid(self) -> Pyramid:
-        """Image pyramid of the observation."""
+        """Image pyramid."""
         return self.levels()
 
     @property
@@ -133,20 +131,20 @@ class FrameView:
         return self.pyramid.labelled
 
     def tracked_at(self, T_world_camera: NDArray[np.float64], **attributes: Any) -> TrackedImage:  # noqa: ANN401
-        """Image of the frame at a pose (4, 4), for comparison with other images."""
+        """Image of the frame at a pose (4, 4), for comparison."""
         return TrackedImage(self.timestamp, T_world_camera, self.pyramid, self.segmentation(), **attributes)
 
     @property
     def brightness(self) -> float:
-        """Mean intensity of the pixels with depth, or of all pixels if there are none; an object before a dark
-        background is thus not dark."""
+        """Mean intensity of the pixels with depth, so that a dark background does not count; of all pixels if there are
+        none."""
         coarse = self.pyramid.coarse
         return float((coarse.intensity[coarse.depth > 0] if coarse.depth.any() else coarse.intensity).mean())
 
     @property
     def first_gain(self) -> float:
-        """Gain of the first frame of a map. Cameras often start before their exposure has settled, and a map, whose
-        exposure later frames adopt, stores colours in steps of 1 / 255."""
+        """Gain of the first frame of a map. Cameras often start before their exposure has settled, and later frames
+        adopt its exposure."""
         mean = self.brightness
         return 1.0 if self.textureless or EXPOSED[0] <= mean <= EXPOSED[1] else USUAL_INTENSITY / mean
 
@@ -165,13 +163,13 @@ PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Result of registering and labelling a frame.
+    """Registered and labelled frame.
 
     Attributes:
-        tracking: Result of the last registration.
+        tracking: Last registration.
         labels: Static probabilities and dynamic pixels; None without labelling or for the first frame of a map.
-        view: The frame with the registered colours; None if they did not change.
-        from_corners: Whether the corners of the last image determine the directions that the view does not observe.
+        view: The frame with registered colours; None if unchanged.
+        from_corners: Whether corners of the last image determine the directions that the view does not observe.
     """
 
     tracking: TrackingResult
@@ -181,8 +179,8 @@ class PoseEstimate:
 
     @classmethod
     def at_origin(cls, gain: float = 1.0, T_world_camera: NDArray[np.float64] | None = None) -> "PoseEstimate":
-        """Estimate of the first frame of a map. Its colours times ``gain`` are the colours of the map. It defines the
-        world frame unless its pose (4, 4) is given."""
+        """Estimate of the first frame of a map. Its colours times ``gain`` are the map's. The pose (4, 4) defaults to
+        the identity."""
         T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera
         return cls(TrackingResult(T_world_camera, (gain, 0.0), ACCEPTED, 1.0, 0.0, 1.0, 0))
 
@@ -198,11 +196,11 @@ class PoseEstimate:
 
     @property
     def is_observed(self) -> bool:
-        """Whether the view, or the corners of the last image, determine all directions of motion."""
+        """Whether view or corners determine all directions of motion."""
         return self.from_corners or len(self.tracking.unobservable) == 0
 
     def doubts(self, view: FrameView) -> tuple[Outcome, Outcome]:
-        """Whether the pose is uncertain: unobserved directions, or changed light with a mostly saturated image."""
+        """Why the pose is uncertain: unobserved directions, or changed light with a mostly saturated image."""
         free, corners = self.tracking.unobservable, "corners" if self.from_corners else ""
         level = view.labelled
         dark = saturated(level, self.exposure)
@@ -213,7 +211,7 @@ class PoseEstimate:
         )
 
     def dynamic_mask(self, view: FrameView) -> NDArray[np.bool_]:
-        """Dynamic pixels (H, W) of the frame: labelled or known before."""
+        """Dynamic pixels (H, W), labelled or known before."""
         with view.timer("label"):
             if self.labels is None:
                 mask = np.zeros(view.observation.depth.shape, dtype=bool)
@@ -225,7 +223,7 @@ class PoseEstimate:
 def static_weights(
     labels: Labels, levels: list[Level], undecided: NDArray[np.bool_] | None = None
 ) -> list[NDArray[np.float32]]:
-    """Weights (h, w) of the second registration at each level: the static probability, less for undecided pixels."""
+    """Weights (h, w) of the second registration at each level; 0 for undecided pixels."""
     import cv2
 
     static = labels.static_probability
@@ -240,7 +238,7 @@ def static_weights(
 def initial_weights(
     levels: list[Level], previously_dynamic: NDArray[np.bool_] | None, excluded: list[NDArray[np.bool_]]
 ) -> list[NDArray[np.float32]] | None:
-    """Weights of the first registration, before the frame is labelled; None = 1 for every pixel.
+    """Weights of the first registration; None = 1 for every pixel.
 
     Args:
         levels: Pyramid levels.

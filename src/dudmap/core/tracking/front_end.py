@@ -1,4 +1,4 @@
-"""Alternating registration and labelling of a frame (thesis algorithm 4)."""
+"""Registration and labelling of a frame in alternation (thesis algorithm 4)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,10 +29,9 @@ from dudmap.core.verdict import Verdict
 from dudmap.core.young_map import SAME_POSE
 
 NO_CHANCE = 3
-"""Significance of an improvement: excess of improved over worsened measurements, in standard deviations of chance."""
+"""Excess of improved over worsened measurements, in standard deviations of chance."""
 UNCHANGED_SHARE = 0.02
-"""Largest share of changed labels on the map, relative to the previous frame, for registration at the finest level
-alone."""
+"""Largest share of changed labels on the map for registration at the finest level alone."""
 
 
 class FrontEnd(Stateful):
@@ -41,14 +40,14 @@ class FrontEnd(Stateful):
     Args:
         config: All parameters.
         tracker: Registers an image pyramid.
-        detector: Labels the pixels of a registered image.
+        detector: Labels a registered image.
         motion: Velocity of the camera.
-        monitor: Provides the residuals of the previous frames.
-        color_motion: Registers the colours of a frame with the camera's motion.
+        monitor: Provides the residuals of previous frames.
+        color_motion: Registers colours with the camera's motion.
         cues: Further evidence of motion.
 
     Attributes:
-        last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
+        last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None for none.
     """
 
     last_dynamic: Remembered[NDArray[np.bool_] | None] = None
@@ -79,11 +78,11 @@ class FrontEnd(Stateful):
     ) -> tuple[FrameView, PoseEstimate, Verdict]:
         """A frame, its pose and labels, and the outcome of the checks.
 
-        A frame that the checks reject is judged once more by other evidence:
+        A rejected frame is judged once more:
 
-        * if pixels are undecided, registered with them;
-        * else if the light has changed, registered by its distances alone, because the change differs between places;
-        * else at the pose by the corners of the last image, if these clearly follow one motion.
+        * with undecided pixels: registered with them;
+        * after a change of light: by its distances alone, because the change differs between places;
+        * else: at the pose by the corners of the last image, if these clearly follow one motion.
         """
         estimate = self.register(volume, view, prediction)
         verdict = self.monitor.judge(last, view, estimate, prediction.image_pose)
@@ -106,19 +105,16 @@ class FrontEnd(Stateful):
         return (other_view, other, judged) if accepted else (view, estimate, verdict)
 
     def _is_relit(self, view: FrameView) -> bool:
-        """Whether the mean intensity of the image shows another light than the map."""
+        """Whether the mean intensity shows another light than the map."""
         mean = float(view.pyramid.coarse.intensity.mean())
         return self._brightness is None or not mean / LARGE_GAIN < self._brightness < LARGE_GAIN * mean
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
         """Pose and labels of a frame, starting at its predicted pose.
 
-        The registration is repeated if it fits unusually badly, or did not settle and moved far from the prediction.
-        The second one starts at the pose of the ego-motion between the last two images and excludes the pixels that do
-        not follow it. The better fit is returned.
-
-        The reason is a near person who starts walking. Registered as static, the person drags the camera, because the
-        floor fits the map at any camera position; only its colours contradict.
+        A registration that fits unusually badly, or did not converge and moved far, is repeated from the ego-motion
+        between the last two images, without the pixels that do not follow it. The better fit is returned. The usual
+        cause is a near person who starts walking and drags the camera: the floor fits the map at any position.
         """
         if self.motion.is_given:
             return self.at_given(volume, view, prediction)
@@ -148,7 +144,7 @@ class FrontEnd(Stateful):
 
     @staticmethod
     def _clear_image_pose(view: FrameView, prediction: PosePrediction) -> NDArray[np.float64] | None:
-        """Pose (4, 4) by the corners of the last image; None unless they clearly follow one motion."""
+        """Pose by the corners of the last image; None unless they clearly follow one motion."""
         T_image, motion = prediction.image_pose(), prediction.image_motion()
         if T_image is None or motion is None or motion.share < AGREED:
             return None
@@ -157,11 +153,8 @@ class FrontEnd(Stateful):
     def register_from(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_init: NDArray[np.float64]
     ) -> PoseEstimate:
-        """Pose and labels of a frame from one initial pose (4, 4).
-
-        The coarse levels give a pose for labelling; the fine levels are registered with the static weights of the
-        labels.
-        """
+        """Pose and labels of a frame from one initial pose (4, 4): coarse levels, labels, then fine levels with static
+        weights."""
         levels = view.pyramid.tracked
         tracker = self.blind_tracker if view.without_image else self.tracker
         excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.undecided) if m is not None]
@@ -198,7 +191,7 @@ class FrontEnd(Stateful):
         return PoseEstimate(tracking, labels, view)
 
     def at_given(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
-        """Labels of a frame with a given pose, which is not registered."""
+        """Labels of a frame with a given pose."""
         coarse, fine = view.pyramid.coarse, view.pyramid.fine
         T_world_camera = prediction.T_world_camera
         excluded = [m for m in (view.known_dynamic, prediction.moving, prediction.undecided) if m is not None]
@@ -216,7 +209,7 @@ class FrontEnd(Stateful):
         return PoseEstimate(tracking, labels)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Accept the pose and labels of a frame, and update velocity and detector."""
+        """Accept the pose and labels of a frame."""
         tracking, labels = estimate.tracking, estimate.labels
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=estimate.is_observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
@@ -230,15 +223,14 @@ class FrontEnd(Stateful):
             self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
     def lose(self, timestamp: float) -> None:
-        """Handle a lost frame; after some time, the state of the previous frames is dropped."""
+        """Handle a lost frame; drop the state of previous frames after some time."""
         self.monitor.lose()
         if self.motion.lost(timestamp):
             self.detector.reset()
             self.last_dynamic = self._brightness = None
 
     def _labels_unchanged(self, labels: Labels) -> bool:
-        """Whether so few labels on the map changed since the previous frame that the coarser level need not be
-        registered again."""
+        """Whether too few labels on the map changed to register the coarser level again."""
         changed = labels.dynamic if self.last_dynamic is None else labels.dynamic != self.last_dynamic
         on_map = labels.sample.occupancy == SURFACE
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
@@ -246,14 +238,13 @@ class FrontEnd(Stateful):
     def _by_distances(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, found: TrackingResult | Minimum
     ) -> NDArray[np.float64]:
-        """Pose (4, 4) near the found one with the smallest distances of the labelled image.
+        """Nearby pose with the smallest distances of the labelled image.
 
         Returns the input pose in these cases:
 
-        * Images are compared: a moving object of the first frame is part of the young map, and the distances would
-          follow it.
-        * Only the distances determine the found pose, too.
-        * The far half of the measurements does not improve: near surfaces dominate this cost and may be moving.
+        * Images are compared: the young map contains moving objects, which the distances would follow.
+        * Only the distances determined the input pose.
+        * The far half of the measurements does not improve: near surfaces dominate the cost and may be moving.
         """
         level, T_world_camera = view.labelled, found.T_world_camera
         if view.without_image or prediction.moving is not None or self.tracker.config.color_weight == 0:
@@ -279,8 +270,8 @@ class FrontEnd(Stateful):
     ) -> Labels:
         """Labels of a registered frame, compared with the map at the pose that fits its distances best.
 
-        Misregistered colours bias the pose, so that a static surface lies off the map and resembles motion. Surface
-        that fits at an indistinguishable pose is static.
+        Misregistered colours bias the pose, so that static surface resembles motion. Surface that fits at an
+        indistinguishable pose is static.
         """
         with view.timer("label"):
             if view.shed >= Shed.LABELS and prediction.moving is None:

@@ -1,4 +1,4 @@
-"""Motion of the camera: constant velocity, or the motion of given poses."""
+"""Camera motion: constant velocity, or the motion of given poses."""
 
 import math
 from typing import Literal
@@ -14,26 +14,23 @@ from dudmap.core.verdict import Outcome, Verdict
 from dudmap.errors import ConfigError
 
 GivenRole = Literal["estimated", "given", "refined"]
-"""Role of poses given with the frames, see ``MotionModel``."""
+"""Role of given poses, see ``MotionModel``."""
 VELOCITY_LIFETIME = 0.15
-"""Time since the last accepted pose during which the velocity is valid, seconds."""
+"""Seconds since the last accepted pose during which the velocity is valid."""
 PAUSE = 1.0
-"""Time without a pose after which the velocity is useless, seconds: a hand accelerates by about 1 m/s^2."""
+"""Seconds without a pose that make the velocity useless: a hand accelerates by about 1 m/s^2."""
 ACCELERATION = 1.0
-"""Standard deviation of the acceleration of a handheld camera, m/s^2, which causes the prediction errors."""
+"""Standard deviation of the acceleration of a handheld camera, m/s^2."""
 
 
 class MotionModel(Stateful):
-    """Predicts the next pose from the last two.
-
-    Given poses (of a robot arm, a phone, odometry) replace constant velocity. They predict the motion since the last
-    accepted pose, after any time.
+    """Predicts the next pose from the last two, or by the motion of given poses (robot arm, phone, odometry).
 
     Args:
         config: Whether velocity is constant.
-        timed: Whether the stamps are the times of the frames; otherwise they only give the order.
-        poses: Role of given poses: the result (``given``), or the start of registration (``refined``); ``estimated`` if
-            there are none.
+        timed: Whether the stamps are times; otherwise they only give the order.
+        poses: Given poses are the result (``given``) or start the registration (``refined``); ``estimated``: there are
+            none.
 
     Attributes:
         T_world_camera: (4, 4), the last accepted pose.
@@ -60,7 +57,7 @@ class MotionModel(Stateful):
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, between the last two poses; 0 if unknown."""
+        """Twist per second (6,), camera axes; 0 if unknown."""
         return self._velocity
 
     def give(self, T_world_camera: NDArray[np.float64] | None) -> None:
@@ -82,12 +79,12 @@ class MotionModel(Stateful):
 
     @property
     def is_given(self) -> bool:
-        """Whether the given pose of the next frame is its result, without estimation."""
+        """Whether the given pose is the result."""
         return self.poses == "given" and self._T_given is not None
 
     @property
     def start(self) -> NDArray[np.float64]:
-        """Pose (4, 4) of the first frame of a map: the given one, else the identity."""
+        """Pose (4, 4) of the first frame of a map: given, else the identity."""
         return np.eye(4) if self._T_given is None else self._T_world_given @ self._T_given
 
     def predict(self, timestamp: float) -> NDArray[np.float64]:
@@ -97,11 +94,11 @@ class MotionModel(Stateful):
         return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
     def repeated(self, timestamp: float, T_last: NDArray[np.float64], *, depth_only: bool) -> NDArray[np.float64]:
-        """Pose (4, 4) of a frame that repeats the images of the last one (pose ``T_last``), or only its depth."""
+        """Pose (4, 4) of a frame that repeats the last images (pose ``T_last``), or only their depth."""
         return self.predict(timestamp) if depth_only or self.is_given else T_last
 
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
-        """Accept the pose of a tracked frame; ``observed``: no direction of its motion was predicted."""
+        """Accept a pose; ``observed``: no direction of its motion was predicted."""
         if observed:
             self._observed = timestamp
         if self._initialized:
@@ -111,53 +108,40 @@ class MotionModel(Stateful):
         self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
 
     def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
+        """Twist per second (6,), camera axes, since the last accepted pose; 0 before the first."""
         if not self._initialized:
             return np.zeros(6)
         return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
 
     def lost(self, timestamp: float) -> bool:
-        """Register a frame without a pose; after the velocity's lifetime, the last pose is the prediction.
-
-        Returns:
-            Whether the velocity's lifetime is over.
-        """
+        """Register a frame without a pose. Returns whether the velocity's lifetime is over."""
         if timestamp - self._timestamp <= VELOCITY_LIFETIME:
             return False
         self._velocity = np.zeros(6)
         return True
 
     def has_paused(self, timestamp: float) -> bool:
-        """Whether no pose has been accepted for longer than PAUSE."""
+        """Whether the last accepted pose is older than PAUSE."""
         return self._initialized and timestamp - self._timestamp > PAUSE
 
     def drift(self, timestamp: float) -> float:
-        """Standard deviation of a partly predicted pose, metres.
-
-        An unknown acceleration with standard deviation a displaces the camera by a t^2 / 2 from its prediction in a
-        time t.
-        """
+        """Standard deviation of a partly predicted pose, metres: a t^2 / 2 with the acceleration a."""
         return ACCELERATION * (timestamp - self._observed) ** 2 / 2
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Continue from the pose of a relocalized frame with unknown velocity."""
+        """Continue from a relocalized pose with unknown velocity."""
         self._initialized, self._velocity = False, np.zeros(6)
         self.update(timestamp, T_world_camera)
 
     def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
-        """Follow a correction of the world frame; the velocity is in camera axes and stays."""
+        """Follow a correction of the world frame."""
         self.T_world_camera = T_new_old @ self.T_world_camera
         self._T_world_given = T_new_old @ self._T_world_given
 
     def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
-        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``.
+        """Motion since the last accepted pose (4, 4): ``speed_m_s`` and ``turn_deg_s``.
 
-        Without frame times it is ``step``: the shift of the median measurement as a share of the image width.
-
-        Args:
-            timestamp: Seconds.
-            T_world_camera: (4, 4) pose at that time.
-            image: The image at that pose, of any size.
+        Without frame times it is ``step``: shift of the median measurement as a share of the image width.
         """
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
         shift, angle = motion[:3, 3].copy(), se3.rotation_angle(motion)

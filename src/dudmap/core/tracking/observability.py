@@ -12,14 +12,14 @@ from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.observation import Level
 
 INTENSITY_SIGMA = 1 / 255
-"""Standard deviation of a voxel's intensity: one grey level, the storage step."""
+"""Standard deviation of a voxel's intensity: the storage step."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
-"""Number of samples across the image for the noise of H, and smallest number of samples on the map."""
+"""Samples across the image for the noise of H, and fewest samples on the map."""
 INTERPOLATED = 2 * (2 / 3) ** 2
-"""Variance of a gradient component of trilinearly interpolated independent values of variance 1, averaged over a cell.
-It is a difference of two means over four edges, whose weights a (1 - a) each square to (2/3)^2 over the cell."""
+"""Gradient variance of trilinearly interpolated independent values of variance 1, averaged over a cell: two means over
+four edges, whose weights a (1 - a) square to (2/3)^2."""
 STEEPEST = 9.5
-"""Tangent of the angle of incidence, 84 degrees, beyond which sensors return no depth."""
+"""Tangent of the angle of incidence (84 degrees) beyond which sensors return no depth."""
 REGULAR = 1e-6
 """Relative increase of the diagonal of the noise."""
 AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
@@ -31,9 +31,8 @@ class Observability:
     """Directions of a twist (v, omega) about the camera's centre that a registration determines.
 
     Attributes:
-        observable: (6, m) basis of the determined directions, world axes.
-        unobservable: (6 - m, 6) the other directions, camera axes; each of unit length if one radian counts as the mean
-            depth.
+        observable: (6, m) basis, world axes.
+        unobservable: (6 - m, 6) other directions, camera axes, of unit length if one radian counts as the mean depth.
     """
 
     observable: NDArray[np.float64]
@@ -41,11 +40,11 @@ class Observability:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every direction is determined."""
+        """Whether all directions are determined."""
         return len(self.unobservable) == 0
 
     def with_shown(self, shown: NDArray[np.bool_], R_world_camera: NDArray[np.float64]) -> "Observability":
-        """Copy in which the directions ``shown`` (k,) of the k unobservable ones are observable."""
+        """Copy in which the unobservable directions ``shown`` (k,) are observable."""
         if shown.all():
             return COMPLETE
         more = np.kron(np.eye(2), R_world_camera) @ self.unobservable[shown].T
@@ -53,16 +52,16 @@ class Observability:
 
 
 COMPLETE = Observability(np.eye(6), np.empty((0, 6)))
-"""Every direction is determined."""
+"""All directions are determined."""
 
 
 @dataclass(frozen=True, eq=False)
 class GradientNoise:
-    """Information in H from noise of the gradients alone.
+    """Information in H from gradient noise alone.
 
     Attributes:
         distances, intensities: (6, 6) of the two terms, world axes.
-        variances: Mean variances of the gradients of the two terms.
+        variances: Mean gradient variances of the two terms.
         depth: Mean depth, metres.
     """
 
@@ -78,11 +77,10 @@ class GradientNoise:
         R_world_camera: NDArray[np.float64],
         least: float,
     ) -> Observability:
-        """Directions in which the information of both terms, in units of their noise, exceeds the noise.
+        """Directions in which the information of both terms exceeds the noise.
 
-        Gradients e + n of a term with noise n give E[H] = H_true + N. In unobserved directions H is N instead of zero,
-        and the registration settles at the best fit of the noise. Terms with precise and with poor gradients count by
-        their variances s^2. The generalised eigenvalues of
+        Gradient noise gives E[H] = H_true + N. In unobserved directions H is N, and the registration fits noise. Each
+        term counts by its gradient variance s^2. The generalised eigenvalues of
 
             (H_d / s_d^2 + H_c / s_c^2) v = mu (N_d / s_d^2 + N_c / s_c^2) v
 
@@ -107,7 +105,7 @@ class GradientNoise:
 
 
 def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Generalised eigenvalues (6,) of ``H v = mu noise v``, ascending, and eigenvectors in the columns of (6, 6)."""
+    """Ascending solutions of ``H v = mu noise v``; eigenvectors in columns."""
     factor = np.linalg.inv(np.linalg.cholesky(noise))
     ratios, vectors = np.linalg.eigh(factor @ H @ factor.T)
     return ratios, np.asarray(factor.T @ vectors, dtype=np.float64)
@@ -125,15 +123,15 @@ def gradient_noise(
     H: NDArray[np.float64],
     least: float,
 ) -> GradientNoise | None:
-    """Information in H from noise of the gradients in a view.
+    """Information in H from gradient noise in a view.
 
-    Noise of standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient variance
-    sigma^2 a^2 / (8 pi s^4): the variance sigma^2 a^2 / (4 pi s^2) over 2 s^2. s combines the filter and half a voxel.
-    A voxel takes the nearest pixel. On a slanted surface its error is uniform over the depth step g between two pixels,
-    independently per voxel. Trilinear interpolation of distances of variance g^2 / 12 has the gradient variance 2
-    (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent: 2 (2/3)^2 sigma_I^2 / voxel^2. The
-    noise is isotropic: a measurement at p from the camera centre contributes its variance times J' J with J = [I,
-    -hat(p)].
+    * Filtered noise: standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient
+      variance sigma^2 a^2 / (8 pi s^4). s combines the filter and half a voxel.
+    * Sampling: a voxel takes the nearest pixel, with an error uniform over the depth step g between two pixels.
+      Trilinear interpolation gives the gradient variance 2 (2/3)^2 g^2 / 12 / voxel^2.
+    * Intensities of neighbouring voxels are independent: 2 (2/3)^2 sigma_I^2 / voxel^2.
+
+    A measurement at p from the camera centre contributes its variance times J' J with J = [I, -hat(p)].
 
     Args:
         level: The image.
@@ -148,9 +146,8 @@ def gradient_noise(
         least: Smallest information of a determined direction, in units of the noise.
 
     Returns:
-        The noise, or None in one of three cases. H exceeds ``least`` times the noise in every direction, because one
-        term does. Too few measurements are on the map. The pixels of the source images are wider than the voxels:
-        neighbouring voxels then take the same measurement, and this noise model does not apply.
+        None in these cases: H exceeds ``least`` times the noise in every direction; too few measurements are on the
+            map; source pixels are wider than voxels, to which this model does not apply.
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
@@ -169,7 +166,7 @@ def gradient_noise(
 
 
 def unobserved_motion(unobservable: NDArray[np.float64]) -> str:
-    """Reason why a pose is uncertain: the directions (k, 6) that a view does not determine, empty if there are none."""
+    """Why a pose is uncertain: the unobservable directions (k, 6); empty if there are none."""
     if len(unobservable) == 0:
         return ""
     strongest = np.abs(unobservable).max(axis=0)
@@ -178,22 +175,18 @@ def unobserved_motion(unobservable: NDArray[np.float64]) -> str:
 
 
 ACROSS = 80
-"""Number of compared gradients across the image."""
+"""Compared gradients across the image."""
 MIN_AGREEMENT = 0.2
-"""Smallest correlation of map and image gradients, of distances and intensities together, along an observed direction.
-Noise gives 1 / sqrt(n) in n measurements, 0.02. In rendered corridors, an endless tunnel and an untextured wall gave up
-to 0.06; papered walls with the same H gave 0.3 to 0.6."""
+"""Smallest correlation of map and image gradients along an observed direction. n noisy measurements give 1 / sqrt(n),
+0.02; untextured rendered scenes gave up to 0.06, papered walls 0.3 to 0.6."""
 
 
 class GradientAgreement:
-    """Compares the gradients of a linearisation with the gradients of its image.
+    """Compares the gradients of a linearisation with the image gradients.
 
-    Noise of the map's gradients adds to H and cannot be separated within H. The image has gradients with independent
-    noise, so that the sum of products of both is unbiased. The image gradient is an instrumental variable, the remedy
-    for errors in the variables of a regression (Fuller 1987, Measurement error models, section 1.4).
-
-    Only intensities have independent errors. The depth filter rounds distant corners of a tunnel in every image alike.
-    The tunnel then seems to narrow and to move with the camera.
+    Noise of the map's gradients cannot be separated within H. The image has independent noise, so that products of both
+    are unbiased: an instrumental variable (Fuller 1987, Measurement error models, section 1.4). Only intensities have
+    independent errors, because the depth filter rounds distant corners alike in every image.
 
     Args:
         level: The image.
@@ -238,18 +231,17 @@ class GradientAgreement:
         self._weights = residual_weights(level.depth[self._sampled], seen, static, parameters)
 
     def along(self, twist: NDArray[np.float64], forth: ImageStack, back: ImageStack, step: float) -> float:
-        """Correlation in [-1, 1] of the gradients of map and image along a twist, from the ``sums``
+        """Correlation in [-1, 1] of map and image gradients along a twist, from the ``sums``
 
-            sum w_c g_map g_image / sqrt(sum w g_map^2 sum w g_image^2),
+            sum w_c g_map g_image / sqrt(sum w g_map^2 sum w g_image^2).
 
-        with intensities in the numerator, and distances and intensities in the denominator.
+        The numerator holds intensities alone.
         """
         of_map, _, of_image = (sums := self.sums(twist, forth, back, step)).sum(axis=0)
         return float(sums[1, 1] / max(np.sqrt(of_map * of_image), 1e-30))
 
     def sums(self, twist: NDArray[np.float64], forth: ImageStack, back: ImageStack, step: float) -> NDArray[np.float64]:
-        """Sums of w g_map^2, w g_map g_image and w g_image^2 (columns) over distances and intensities (rows), with the
-        weights w of the registration.
+        """Sums of w g_map^2, w g_map g_image and w g_image^2 (columns) over distances and intensities (rows).
 
         Args:
             twist: (6,) about the camera's centre, world axes.
@@ -273,7 +265,6 @@ def _differences(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 
 
 def _complete(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether the four neighbours of a pixel are known; False at the border."""
     out = np.zeros_like(known)
     out[1:-1, 1:-1] = known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1] & known[:-2, 1:-1]
     return out

@@ -18,17 +18,17 @@ from dudmap.core.tracking.motion_model import MotionModel
 from dudmap.core.tracking.tracker import Tracker
 
 CLEARLY_BETTER = 0.95
-"""A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
+"""Largest cost of a clearly better pose, as a share of the other cost."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """Initial pose of a registration, and the scene motion visible in two images.
+    """Initial pose of a registration, and scene motion between two images.
 
     Attributes:
         T_world_camera: (4, 4).
-        image_pose: Computes the pose (4, 4) by the motion since the previous image; None if unknown.
-        image_motion: Computes this motion with its labelled corners; None if unknown.
+        image_pose: Computes the pose (4, 4) by the motion since the previous image.
+        image_motion: Computes this motion with its labelled corners.
         moving: (h, w) bool, label resolution, pixels that do not follow the camera's motion; None if not computed.
         undecided: (h, w) bool, pixels not verified as static while most of the view moves; None for none.
     """
@@ -51,13 +51,13 @@ class PosePrediction:
 
 
 class PosePredictor(Stateful):
-    """Predicts by constant velocity, and by image motion while the map is young or most of the view is dynamic.
+    """Predicts by constant velocity, and by image motion while the map is young or the view mostly dynamic.
 
     Args:
         config: All parameters.
         motion: Velocity of the camera.
         tracker: Evaluates the cost of a pose.
-        known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
+        known_poses: Poses (4, 4) by timestamp from a first pass.
     """
 
     image_motion: Remembered[ImageMotion]
@@ -79,7 +79,7 @@ class PosePredictor(Stateful):
         self._single_frame_map = True
 
     def predict(self, volume: TsdfVolume, view: FrameView) -> PosePrediction:
-        """Initial pose for the registration of a frame to a map."""
+        """Initial pose for the registration of a frame."""
         timestamp = view.timestamp
         if self._known_poses and not self.image_motion.started:
             self.image_motion.start(timestamp)
@@ -108,7 +108,7 @@ class PosePredictor(Stateful):
         return replace(by_velocity, T_world_camera=T_image, moving=moving, undecided=undecided)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Set the image for the next comparison: a frame with an accepted pose."""
+        """Set the image for the next comparison."""
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
         self._last_dynamic = dynamic
         self.mostly_dynamic = dynamic is not None and is_majority_dynamic(dynamic, view.labelled)
@@ -121,7 +121,7 @@ class PosePredictor(Stateful):
     def _fits_better(
         self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
     ) -> bool:
-        """Whether a pose explains the image clearly better than another one, without measurements in free space."""
+        """Whether T explains the image clearly better, without measurements in free space."""
         weights = initial_weights([level], self._last_dynamic, []) or [np.ones_like(level.depth)]
         static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
         cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
@@ -140,6 +140,5 @@ class PosePredictor(Stateful):
 
 
 def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Occupancy (h, w) of the map at the points of an image: UNKNOWN, SURFACE or FREE."""
     volume.look_at(T_world_camera)
     return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).occupancy

@@ -1,8 +1,4 @@
-"""Acceptance of registered frames: the metrics of ``checks.py``, and their usual values in the frames before.
-
-A camera that jumps may converge to a wrong pose that fits the map. Seen from there, the last image differs. Shape alone
-does not reveal this, because walls and desks resemble each other; their texture differs.
-"""
+"""Acceptance of registered frames: the metrics of ``checks.py`` and their usual values."""
 
 import statistics
 from collections import deque
@@ -38,10 +34,10 @@ from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.core.verdict import Outcome, Verdict
 
 CLEARLY_LESS = 0.5
-"""Another motion explains two images clearly better if its misregistration is below this share. Noise and blur add half
-a pixel to both in the median frame of a hand-held camera."""
+"""Another motion explains two images clearly better below this share of misregistration. Noise and blur add half a
+pixel to both."""
 MIN_PIXELS = 100
-"""Smallest number of pixels of the coarsest level that show the same static surface in both images."""
+"""Fewest pixels of the coarsest level that show the same static surface."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +45,10 @@ class ImageComparison:
     """The last tracked frame, seen from the pose of this one.
 
     Attributes:
-        shift: Misregistration of the static pixels of both images, pixels of the coarsest level. NaN if too few are
-            common, or an image carries no information.
-        share: Share of the measurements, static and dynamic, whose depth agrees with the last frame.
-        share_of_seen: The same share of the measurements that the last frame shows, too.
+        shift: Misregistration of static pixels, pixels of the coarsest level. NaN if too few are common, or an image
+            carries no information.
+        share: Share of the measurements whose depth agrees with the last frame.
+        share_of_seen: The same share of the measurements visible in the last frame.
     """
 
     shift: float = np.nan
@@ -61,7 +57,7 @@ class ImageComparison:
 
     @property
     def confirms(self) -> bool:
-        """Whether both frames show the same surface: their depths agree."""
+        """Whether the depths of both frames agree."""
         return self.share >= CONFIRMED_SHARE and self.share_of_seen >= CONFIRMED_OF_SEEN
 
     @property
@@ -71,7 +67,8 @@ class ImageComparison:
 
 
 class ImageConsistency:
-    """Measures how well the motion since the last tracked frame explains both frames.
+    """Measures how well the motion since the last tracked frame explains both frames. It detects wrong poses that fit
+    the shape of the map but not its texture.
 
     Args:
         config: Noise of the sensor.
@@ -94,9 +91,9 @@ class ImageConsistency:
 
         They are incompatible if the last image is misregistered by more than MAX_IMAGE_SHIFT and one of these holds:
 
-        * The corners of both images follow no common motion. Exceptions: few corners, or a sudden change of exposure.
-        * Their motion explains the images clearly better. Exception: the depths confirm the pose and not this motion.
-          Colour and depth were then captured at different times, and the pose is correct for the depth.
+        * The corners follow no common motion. Exceptions: few corners, or a sudden change of exposure.
+        * Their motion explains the images clearly better. Exception: the depths confirm only the pose, because colour
+          and depth were captured at different times.
 
         Args:
             last: The last tracked frame; None if unknown.
@@ -126,11 +123,9 @@ class ImageConsistency:
 
             d = sqrt(2) median |I_last - I| / median |grad I|
 
-        over pixels that show the same surface in both images, after the best gain and offset. Unrelated images give the
-        correlation length of the texture, a few pixels. Two depths agree within three standard deviations of their
-        difference.
+        over common surface, after the best gain and offset. Two depths agree within three standard deviations.
 
-        ``T_world_camera``: (4, 4) another pose of this frame; None for the pose of the estimate.
+        ``T_world_camera``: (4, 4) another pose of this frame; None for the estimate's.
         """
         if last is None:
             return ImageComparison()
@@ -153,31 +148,29 @@ class ImageConsistency:
 
 
 def _reduced(mask: NDArray[np.bool_] | None, level: Level) -> NDArray[np.bool_]:
-    """A mask at the size of a level (h, w); None becomes an empty mask."""
     return np.zeros(level.depth.shape, bool) if mask is None else reduced(mask, level)
 
 
 HISTORY = 30
-"""Number of remembered accepted registrations."""
+"""Remembered accepted registrations."""
 MIN_HISTORY = 5
-"""Number of accepted registrations before new ones are compared with them."""
+"""Registrations before new ones are compared with them."""
 SMALL_COLOR_RESIDUAL = 0.005
-"""Intensity difference (0..1) that is good with any sensor."""
+"""Intensity difference (0..1) that is always good."""
 UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
-"""Multiples of the median residuals above which a registration is repeated from another initial pose."""
+"""Multiples of the median residuals above which a registration is repeated."""
 
 
 INNOVATION = 6.0
-"""Largest rise of a residual over its median, in standard deviations of its logarithm. Of 2284 residuals of six
-recordings 2 rose by more than 5, none by more than 6."""
+"""Largest rise of a residual over its median, in standard deviations of its logarithm. None of 2284 residuals of six
+recordings rose by more."""
 SPREADS = 0.12, 0.23
-"""Smallest and largest standard deviation of the logarithm: on six recordings it is 0.10 to 0.27 in the median, and
-up to 0.6 while few registrations are known. Limits are 2 to 4 times the median."""
+"""Smallest and largest standard deviation of the logarithm; on six recordings its median is 0.10 to 0.27. Limits are 2
+to 4 times the median."""
 
 
 def _highest(values: Sequence[float]) -> float:
-    """Largest residual that earlier ones let expect: their median, raised by the innovation in log space (the standard
-    deviation is 1.4826 median absolute deviations)."""
+    """Largest expected residual: the median, raised by the innovation in log space."""
     logarithms = np.log(np.maximum(values, 1e-6))
     median = np.median(logarithms)
     spread = np.clip(1.4826 * np.median(np.abs(logarithms - median)), *SPREADS)
@@ -200,7 +193,7 @@ class RegistrationHistory:
 
 
 class QualityMonitor(Stateful):
-    """Decides whether the registration of a frame can be trusted.
+    """Decides whether a registration can be trusted.
 
     Args:
         config: ``tracker`` and the sensor's noise.
@@ -219,7 +212,7 @@ class QualityMonitor(Stateful):
         self.reset()
 
     def reset(self) -> None:
-        """Forget all registrations, because a new map begins."""
+        """Forget all registrations."""
         self._residuals = deque(maxlen=HISTORY)
         self._shares = deque(maxlen=HISTORY)
         self._colors = deque(maxlen=HISTORY)
@@ -227,7 +220,7 @@ class QualityMonitor(Stateful):
 
     @property
     def history(self) -> RegistrationHistory:
-        """The registrations that new ones are compared with."""
+        """The remembered registrations."""
         return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
 
     def continue_from(self, history: RegistrationHistory) -> None:
@@ -244,8 +237,7 @@ class QualityMonitor(Stateful):
         Args:
             last: The last tracked frame; None if unknown.
             view, estimate: The frame, its pose and labels.
-            image_pose: Computes the pose (4, 4) from the last image and this one alone; None without a common motion of
-                corners.
+            image_pose: Computes the pose (4, 4) from the last two images; None without a common motion.
         """
         tracking, labels = estimate.tracking, estimate.labels
         with view.timer("check"):
@@ -273,11 +265,11 @@ class QualityMonitor(Stateful):
             return judged(CHECKS, figures, limits, evidence)
 
     def misfit(self, tracking: TrackingResult) -> Verdict:
-        """Whether the registration of a frame at a recognised place is much worse than usual."""
+        """Whether the registration at a recognised place is much worse than usual."""
         return judged(RELATIVE, tracking.figures, replace(self.limits(), overlap=np.nan))
 
     def limits(self, *, mostly_dynamic: bool = False, blind: bool = False) -> Limits:
-        """Configuration and earlier registrations, from which limits follow; NaN before there are enough."""
+        """Limits from the configuration and earlier registrations; NaN before there are enough."""
         config, known = self.config, len(self._residuals) >= MIN_HISTORY
         residual, color = (
             _highest(values) if known and values else np.nan for values in (self._residuals, self._colors)
@@ -286,7 +278,7 @@ class QualityMonitor(Stateful):
         return Limits(config.tracker, config.sensor, RULES, mostly_dynamic, blind, 1000 * residual, color, overlap)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
-        """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
+        """Distance and intensity residual over their medians; (1, 1) before there are any."""
         if len(self._residuals) < MIN_HISTORY:
             return 1.0, 1.0
         residual = statistics.median(self._residuals)
@@ -294,7 +286,7 @@ class QualityMonitor(Stateful):
         return tracking.residual / max(residual, 1e-6), tracking.color_residual / max(color, SMALL_COLOR_RESIDUAL)
 
     def is_unusual(self, tracking: TrackingResult) -> bool:
-        """Whether a registration failed or fits badly enough to be repeated from another initial pose."""
+        """Whether to repeat a registration from another initial pose."""
         residual, color = self.relative_misfit(tracking)
         return not tracking.accepted or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR_RESIDUAL
 
@@ -307,5 +299,5 @@ class QualityMonitor(Stateful):
         self.recovering = False
 
     def lose(self) -> None:
-        """Compare the overlap with the usual one, too, until a frame is accepted again."""
+        """Check the overlap, too, until a frame is accepted again."""
         self.recovering = True

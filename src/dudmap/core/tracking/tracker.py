@@ -1,4 +1,4 @@
-"""Direct registration of a frame to the distances and intensities of the map (thesis section 4.4, algorithm 2)."""
+"""Direct registration of a frame to distances and intensities of the map (thesis section 4.4, algorithm 2)."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -25,28 +25,28 @@ from dudmap.core.tracking.observability import COMPLETE, MIN_AGREEMENT, Gradient
 from dudmap.core.verdict import ACCEPTED, Verdict
 
 FINEST_DAMPING = 1e-4
-"""Largest initial damping of the finest level, relative to the diagonal of J^T J. It is well below the eigenvalues of
-weak directions, in which more damping shortens the steps until they seem converged."""
+"""Largest initial damping of the finest level, relative to the diagonal of J^T J. More damping shortens steps along
+weak directions until they seem converged."""
 NO_STEP = DescentRules(np.eye(6), damping=0.0, max_steps=0, stop=0.0, stop_gain=0.0)
-"""Rules for the normal equations at the initial pose, without a step."""
+"""Evaluates the normal equations at the initial pose."""
 COLOR_HUBER = 0.07
-"""Huber threshold of the intensity residual, intensity in [0, 1]."""
+"""Huber threshold of the intensity residual, 0..1."""
 STOP, STOP_COARSE = 5e-4, 1e-3
-"""Norms of the twist update (m, rad) below which the finest level and the coarser ones have converged (thesis algorithm
-2: 1e-3). They shrink with scenes that are smaller than a room."""
+"""Twist updates (m, rad) below which the finest and the coarser levels have converged (thesis algorithm 2: 1e-3). They
+shrink with scenes smaller than a room."""
 STOP_GAIN = 3e-3
-"""Relative change of the cost below which a short step also ends a coarse level."""
+"""Relative change of the cost below which a short step ends a coarse level."""
 EXPOSURE_NOISE = 0.01
-"""Largest change of gain and offset in total that is noise of the fit and not applied."""
+"""Largest summed change of gain and offset that is noise and not applied."""
 NEAREST_STEPS = 3
-"""Largest number of steps to a nearby minimum."""
+"""Steps to a nearby minimum."""
 BLOCKS_ACROSS = 20
-"""Blocks across the image whose sums of residuals give their variance: 16 pixels of 320, several times the widths of
-filter and voxels. Errors of rendered sequences then have the covariance within a factor of 4."""
+"""Blocks across the image whose summed residuals give their variance: 16 of 320 pixels, several widths of filter and
+voxel. The covariance of rendered sequences is then correct within a factor of 4."""
 UNKNOWN = np.full((6, 6), np.nan)
 """Covariance of a rejected registration."""
 MEDIAN_STRIDE = 4
-"""Step between the pixels of a median over the image, across and down."""
+"""Step between sampled pixels, across and down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +56,18 @@ class TrackingResult:
     Attributes:
         T_world_camera: (4, 4).
         exposure: Gain and offset from the frame's intensities to the map's.
-        verdict: Outcomes of the checks of the registration by itself.
+        verdict: Outcomes of the checks of the registration.
         inlier_share: Share of the static measurements on the map.
         residual: Root mean square of the distance residuals scaled by sigma(1 m) / sigma(z), metres at 1 m depth.
-        condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is
-            unconstrained.
-        iterations: Number of linearisations over all levels.
-        color_residual: Median absolute intensity difference (0..1) to the map at the static measurements, after the
-            best gain and offset; NaN for a textureless image.
-        converged: Whether the last level ended by a stop criterion and not at the iteration limit.
-        unobservable: (k, 6) twists, camera axes, that the view does not determine and along which the initial pose was
-            kept (``core/tracking/observability.py``).
-        readings: Number of static measurements on the map, weighted.
-        covariance: (6, 6) of the pose's error, a twist (v, omega) about the camera's centre in world axes, m and rad;
-            0 along unobservable directions. NaN unless accepted.
+        condition: Smallest over largest eigenvalue of the scaled H; near 0 a direction of motion is unconstrained.
+        iterations: Linearisations over all levels.
+        color_residual: Median absolute intensity difference (0..1) at the static measurements, after the best gain and
+            offset; NaN for a textureless image.
+        converged: Whether the last level ended before its iteration limit.
+        unobservable: (k, 6) twists, camera axes, that the view does not determine; the initial pose is kept along them.
+        readings: Weighted number of static measurements on the map.
+        covariance: (6, 6) of the pose error, a twist (v, omega) about the camera's centre in world axes, m and rad; 0
+            along unobservable directions. NaN unless accepted.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -86,20 +84,19 @@ class TrackingResult:
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
 
     def covariance_with(self, drift: float) -> NDArray[np.float64]:
-        """Covariance (6, 6) of the pose with the standard deviation ``drift`` of the prediction, metres and radians,
-        along the unobservable directions."""
+        """Covariance (6, 6) with the standard deviation ``drift`` (m, rad) along the unobservable directions."""
         basis, _ = np.linalg.qr(np.kron(np.eye(2), self.T_world_camera[:3, :3]) @ self.unobservable.T)
         return self.covariance + drift**2 * basis @ basis.T
 
     @property
     def accepted(self) -> bool:
-        """Whether all checks of the registration by itself passed."""
+        """Whether all checks of the registration passed."""
         return self.verdict.accepted
 
     @property
     def figures(self) -> dict[str, float]:
-        """Metrics of ``checks.REGISTRATION`` and ``checks.RELATIVE``. Known unobservable directions do not count as
-        badly conditioned, unless all six are unobservable."""
+        """Metrics of ``checks.REGISTRATION`` and ``checks.RELATIVE``. The condition counts only if no direction or
+        every direction is unobservable."""
         missing = len(self.unobservable)
         return {
             "readings": self.readings,
@@ -112,13 +109,12 @@ class TrackingResult:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """End of a registration.
+    """End of a registration; further attributes as in ``TrackingResult``.
 
     Attributes:
-        T_world_camera, exposure, iterations, converged: See ``TrackingResult``.
-        equations: Normal equations at this pose.
-        level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
-        seen: Directions of motion that the view determines.
+        equations: Normal equations at the pose.
+        level: Finest image, in the exposure of the map, with its ``weights`` (h, w).
+        seen: Directions that the view determines.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -133,10 +129,10 @@ class Minimum:
 
 
 class Tracker:
-    """Coarse-to-fine registration of a frame to the map by Levenberg-Marquardt.
+    """Coarse-to-fine Levenberg-Marquardt registration of a frame to the map.
 
     Args:
-        config: Residual weights, iterations, stop criteria, checks.
+        config: Residual weights, iterations, limits.
         sensor: Noise of the depth measurements.
         filter_px: Spatial standard deviation of the depth filter, pixels.
         rules: Damping and limits.
@@ -165,8 +161,7 @@ class Tracker:
         exposure: tuple[float, float] = (1.0, 0.0),
         color_weight: float | None = None,
     ) -> TrackingResult:
-        """Pose with the smallest distances and intensity differences of a frame to the map, and whether it can be
-        trusted; arguments as for ``minimize``."""
+        """Pose of the frame and its checks; arguments as for ``minimize``."""
         found = self.minimize(volume, levels, T_init, static_weights, first_level, exposure, color_weight)
         T = found.T_world_camera.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
@@ -191,11 +186,11 @@ class Tracker:
             levels: Image pyramid, coarse to fine.
             T_init: (4, 4) initial T_world_camera.
             static_weights: Per level (h, w) float32 in [0, 1]; None = 1.
-            first_level: Index of the first of these levels in the configuration.
-            exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
-            color_weight: Weight of the intensity term; None takes the configured weight.
-            relit: Whether the light may differ from the map's. If not, a large gain comes from an image of another
-                surface and is not applied.
+            first_level: Index of the first given level in the configuration.
+            exposure: Initial gain and offset; fitted if ``first_level`` is 0.
+            color_weight: Weight of the intensity term; None = configured.
+            relit: Whether the light may differ from the map's. If not, a large gain is not applied, because it comes
+                from an image of another surface.
         """
         volume.look_at(T_init)
         T, iterations, system, converged, seen = T_init, 0, None, True, None
@@ -262,8 +257,8 @@ class Tracker:
         """Minimum (4, 4) next to a pose, and distances (h, w) of the measurements to the map there, metres, NaN off the
         map.
 
-        It takes at most NEAREST_STEPS steps of the finest level's rules. The window of the map must cover the view.
-        ``weights``: (h, w) float32 static weights in [0, 1]; None = 1.
+        Takes at most NEAREST_STEPS steps. The window of the map must cover the view. ``weights``: (h, w) float32 static
+        weights in [0, 1]; None = 1.
         """
         weights = np.ones(level.depth.shape, np.float32) if weights is None else weights
         rules, parameters = self._rules(NEAREST_STEPS, finest=True), self.parameters(volume.band)
@@ -279,7 +274,7 @@ class Tracker:
         system: NormalEquations,
         parameters: RegistrationParameters,
     ) -> Observability:
-        """Directions that a level determines at a pose; all directions if too little is on the map to decide."""
+        """Directions that a level determines; all if too few measurements are on the map."""
         least, R = self.rules.min_information, T_world_camera[:3, :3]
         if least == 0:
             return COMPLETE
@@ -313,14 +308,12 @@ class Tracker:
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps on one level from a pose (4, 4); ``system``: normal equations there, if known."""
         image = LevelImage(level.depth, level.intensity, weights, level.camera.intrinsics)
         darkest, brightest = level.shown
         parameters = parameters._replace(darkest=darkest, brightest=brightest)
         return volume.backend.register(volume.grid, image, T_world_camera, system, rules, parameters)
 
     def _rules(self, limit: int, *, finest: bool) -> DescentRules:
-        """Step rules of a level for all directions."""
         basis, damping, unit = COMPLETE.observable, self.rules.damping, min(self.sensor.reference_depth, 1.0)
         if finest:
             return DescentRules(basis, min(damping, FINEST_DAMPING), limit, STOP * unit, stop_gain=0.0)
@@ -334,16 +327,16 @@ class Tracker:
         weights: NDArray[np.float32],
         color_weight: float | None = None,
     ) -> NormalEquations:
-        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose (4, 4).
+        """Normal equations (eq. 4.43, weights of 4.46) of a level at a pose (4, 4).
 
         The window of the map must cover the view. ``weights``: (h, w) float32 static weights in [0, 1].
-        ``color_weight``: weight of the intensity term; None takes the configured weight.
+        ``color_weight``: None = configured.
         """
         parameters = self.parameters(volume.band, color_weight)
         return self._descend(volume, level, T_world_camera, weights, None, NO_STEP, parameters).equations
 
     def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
-        """Cost parameters in a map with this truncation band; ``color_weight`` None: as configured."""
+        """Cost parameters in a map with this band; ``color_weight``: None = configured."""
         config = self.config
         return RegistrationParameters(
             band=band,
@@ -354,10 +347,7 @@ class Tracker:
         )
 
     def _judge(self, found: Minimum, T_world_camera: NDArray[np.float64]) -> TrackingResult:
-        """Result of a registration that ended at a pose (4, 4), with the outcomes of its checks.
-
-        Intensities are judged after the best gain and offset, even if the registration does not apply them.
-        """
+        """Checked result. Intensities are judged after the best gain and offset, applied or not."""
         config, system, level, weights = self.config, found.equations, found.level, found.weights
         share = system.weight / max(system.readings, 1.0)
         residual = math.sqrt(system.chi_square / max(system.weight, 1e-9))
@@ -381,11 +371,10 @@ class Tracker:
         return replace(result, verdict=verdict, covariance=self._covariance(found) if verdict.accepted else UNKNOWN)
 
     def _covariance(self, found: Minimum) -> NDArray[np.float64]:
-        """Covariance (6, 6) of the pose of a minimum along the observable directions: s^2 H^-1.
+        """s^2 H^-1 along the observable directions.
 
-        The variance s^2 of a weighted residual r is the mean over both terms of (sum of r)^2 over blocks of pixels, per
-        measurement. The sums hold the correlation of neighbouring residuals, which filter, voxels and errors of the map
-        cause.
+        s^2 is the mean over both terms of (sum of weighted residuals)^2 over blocks, per measurement. Sums over blocks
+        include the correlation between neighbours.
         """
         import cv2
 
