@@ -38,7 +38,7 @@ class AdaptiveVolume(TsdfVolume):
     """A map with smaller voxels at surface detail (curvature or texture) that the sensor resolves.
 
     Registration and labels read the coarsest level: several voxel sizes change no pose and no mask. Mesh and views read
-    the finest level (``docs/adaptive.md``). ``levels`` are the finer levels, larger voxels first.
+    the finest level (``docs/ranges.md``). ``levels`` are the finer levels, larger voxels first.
     """
 
     def _empty(self) -> None:
