@@ -53,7 +53,7 @@ def _public(app: Any, env: Any, node: Any, text: Any) -> Any:
     name = node.get("reftarget", "").rpartition(".")[2]
     if node.get("refdomain") != "py" or name not in dudmap.__all__:
         return None
-    page = node.get("refdoc", "python")
+    page = node.get("refdoc", "api")
     return env.get_domain("py").resolve_xref(env, page, app.builder, "obj", f"dudmap.{name}", node, text)
 
 
@@ -61,5 +61,5 @@ def setup(app: Any) -> dict[str, bool]:
     """Connect this file's hooks."""
     app.connect("source-read", _read)
     app.connect("missing-reference", _public)
-    app.connect("env-get-outdated", lambda *_: ["commands", "python"])  # they change with the code
+    app.connect("env-get-outdated", lambda *_: ["commands", "api"])  # they change with the code
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -15,7 +15,8 @@ import dudmap
 from dudmap import ConfigError, DatasetError, Frame, Slam
 from wavy_wall import CAMERA, wall
 
-PAGE = (Path(__file__).parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = "".join((DOCS / name).read_text(encoding="utf-8") for name in ("python.md", "api.rst"))
 
 
 @pytest.mark.parametrize("name", dudmap.__all__)

@@ -59,7 +59,7 @@ def test_every_command_with_its_options_is_on_the_site(site):
 
 @pytest.mark.slow
 def test_every_public_name_is_on_the_site(site):
-    page = text(site, "python")
+    page = text(site, "api")
     for name in dudmap.__all__:
         assert name == "__version__" or re.search(rf"\.{name}\b", page), name
 
