@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def annotations(name):
         return [value.__annotations__]
     if not inspect.isclass(value) or issubclass(value, Exception) or name == "FrameView":  # only passed on
         return []
-    options = re.search(rf"autoclass:: dudmap\.{name}\n((?:   :.*\n)*)", PAGE)[1]
+    (options,) = re.findall(rf"autoclass:: dudmap\.{name}\n((?:   :.*\n)*)", PAGE)
     listed = re.search(r":members: (.+)", options)
     left_out = re.findall(r"\w+", (re.search(r":exclude-members: (.+)", options) or ["", ""])[1])
     members = re.findall(r"\w+", listed[1]) if listed else [key for key in dir(value) if key[0] != "_"]
@@ -113,7 +114,8 @@ def test_arrays_give_the_same_result_as_frames():
     one, other, scaled = Slam(CAMERA), Slam(CAMERA), Slam(CAMERA)
     for number in range(3):
         frame = wall(1.5 + 0.01 * number, seed=number)
-        frame = Frame(frame.timestamp / 30, np.rint(1000 * frame.depth).astype(np.float32) / 1000, frame.color)
+        depth = np.rint(1000 * frame.depth).astype(np.float32) / np.float32(1000)
+        frame = Frame(frame.timestamp / 30, depth, frame.color)
         expected = one.process(frame)
         arrays = {"rgb": frame.color, "timestamp": frame.timestamp}
         found = other.process(depth=frame.depth, **arrays)
@@ -134,7 +136,9 @@ def test_units_and_readings_of_arrays():
     assert found.dtype == np.float32
 
 
-GOOD = {"depth": np.ones(CAMERA.shape, np.float32), "rgb": np.zeros((*CAMERA.shape, 3), np.uint8), "timestamp": 0.0}
+GOOD: dict[str, Any] = {
+    "depth": np.ones(CAMERA.shape, np.float32), "rgb": np.zeros((*CAMERA.shape, 3), np.uint8), "timestamp": 0.0,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -154,6 +158,7 @@ def test_bad_arrays_are_one_sentence(changed, sentence):
 
 
 def test_frames_and_arrays_are_not_mixed():
-    for arguments in ({}, GOOD | {"frame": wall(1.0)}, {"depth": GOOD["depth"], "rgb": GOOD["rgb"]}):
+    mixed: list[dict[str, Any]] = [{}, GOOD | {"frame": wall(1.0)}, {"depth": GOOD["depth"], "rgb": GOOD["rgb"]}]
+    for arguments in mixed:
         with pytest.raises(ConfigError, match="either a frame, or depth=, timestamp="):
             Slam(CAMERA).process(**arguments)
