@@ -1,4 +1,4 @@
-"""Fuse frames with known poses: mapping without tracking."""
+"""Fuse frames at known poses, without tracking."""
 
 import sys
 

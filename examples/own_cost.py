@@ -1,4 +1,4 @@
-"""A registration with a robust weight of your own: Tukey's, which gives distances beyond a limit no weight at all."""
+"""Register with a robust weight of your own: Tukey's, which is 0 for distances beyond a limit."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The output of a segmentation network as a cue: people are left out of the map although they stand still."""
+"""Use a segmentation network as a cue, so that people are left out of the map although they stand still."""
 
 from collections.abc import Callable
 
@@ -18,11 +18,11 @@ class PersonCue:
         self.network = network
 
     def log_odds(self, volume: TsdfVolume, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Positive where the network sees a person, else 0."""
+        """Log odds: positive at pixels of people, else 0."""
         rows, columns = view.labelled.depth.shape
         p = cv2.resize(self.network(view.timestamp), (columns, rows), interpolation=cv2.INTER_AREA)
         p = np.clip(np.asarray(p, np.float32), 1e-3, 1 - 1e-3)
-        return np.where(p > 0.5, 2 * np.log(p / (1 - p)), np.float32(0))  # twice: more than the evidence of the map
+        return np.where(p > 0.5, 2 * np.log(p / (1 - p)), np.float32(0))  # doubled, to overrule the map
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The stages of ``Slam`` by hand: prepare, track, fuse. Without labels and places, the poses are those of ``Slam``."""
+"""Call the stages of ``Slam`` by hand: prepare, track, fuse. The poses equal a ``Slam`` without labels and places."""
 
 from dudmap import Camera, Config, Frame, Slam, TsdfVolume, synthetic
 from dudmap.core.frames.observation import Pyramid, exposed_color
@@ -25,4 +25,6 @@ for frame in sequence:
         T_world_camera, exposure = found.T_world_camera, found.exposure
     motion.update(image.timestamp, T_world_camera)
     volume.integrate(Frame(image.timestamp, image.depth, exposed_color(image.rgb, exposure)), T_world_camera)
-    print("difference from Slam: {} m, {} deg".format(*difference(T_world_camera, slam.process(frame).T_world_camera)))
+    expected = slam.process(frame).T_world_camera
+    assert expected is not None
+    print("difference from Slam: {} m, {} deg".format(*difference(T_world_camera, expected)))

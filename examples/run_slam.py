@@ -14,8 +14,8 @@ sequence = synthetic.sequence("room", movers=("person",), frames=12, camera=came
 slam = Slam(sequence.camera)
 for index in range(len(sequence)):
     result = slam.process(sequence[index])
-    print(f"{result.timestamp:.3f} s: {result.status}, {result.dynamic_share:.0%} of the readings are dynamic")
+    print(f"{result.timestamp:.3f} s: {result.status}, {result.dynamic_share:.0%} of the measurements are dynamic")
 slam.trajectory.save(out / "trajectory.txt")
 slam.volume.extract_mesh().save(out / "mesh.ply")
-view = slam.volume.raycast(slam.trajectory.Ts_world_camera[0])  # the thesis' artificial camera view
+view = slam.volume.raycast(slam.trajectory.Ts_world_camera[0])  # the artificial camera view of the thesis
 cv2.imwrite(str(out / "view.png"), view.color[..., ::-1])

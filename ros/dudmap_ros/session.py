@@ -63,7 +63,8 @@ class Session:
     Attributes:
         slam: The system; None before the first pair.
         watch: Changes against the saved map; None before the first pair or without a saved map.
-        processed, stale: Numbers of processed pairs, and of dropped pairs that were not newer than the previous one.
+        processed: Number of processed pairs.
+        stale: Number of dropped pairs, which were not newer than the previous pair.
 
     Raises:
         ConfigError: ``localize`` or ``watch`` without a saved map.
@@ -119,9 +120,9 @@ class Session:
         if stamp <= self._last:
             self.stale += 1
             return None
-        frame = Frame(stamp, depth_of(depth, 1000.0, "the depth image"), color_of(color, "the colour image"))
-        if frame.depth.shape != frame.color.shape[:2]:
-            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (frame.depth, frame.color)]
+        z, rgb = depth_of(depth, 1000.0, "the depth image"), color_of(color, "the colour image")
+        if z.shape != rgb.shape[:2]:
+            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (z, rgb)]
             raise DatasetError(
                 f"depth is {sizes[0]} and colour {sizes[1]}; subscribe to the depth that the driver aligns to colour"
             )
@@ -129,6 +130,7 @@ class Session:
             self.slam = self._started(info)
         self._last = stamp
         self.processed += 1
+        frame = Frame(stamp, z, rgb)
         result = self.slam.process(frame)
         if self.watch is not None:
             self.watch.look(self.processed - 1, frame, result)
@@ -182,7 +184,7 @@ class Session:
         slam = Slam(camera, self.config, live=True, saved_map=saved, ignore=ignored)
         slam.localize = self.localize
         if self.watching:
-            # an own copy, because the run changes the other one
+            # a copy, because the system changes its saved map
             self.watch = ChangeWatch(SavedMap.load(self.saved_map))
             self.watch.start(slam, None, None)
         return slam
