@@ -189,7 +189,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name when it is first used, so that importing dudmap loads neither numba nor cv2."""
+    """Import a public name at first use, so that importing dudmap loads neither numba nor cv2."""
     if name not in __all__ or name not in _HOMES:
         raise AttributeError(f"module 'dudmap' has no attribute {name!r}")
     home = f"dudmap.{_HOMES[name]}"

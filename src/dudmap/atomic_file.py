@@ -1,7 +1,4 @@
-"""Write files either completely or not at all.
-
-An ``OSError`` names the file that cannot be written.
-"""
+"""Write files completely or not at all. An ``OSError`` names the file."""
 
 import errno
 import os
@@ -28,20 +25,18 @@ __all__ = [
 ]
 
 UNFINISHED = r"\..+\.\d+\.part(\.\w+)?"
-"""Regular expression of the temporary names under which a killed process leaves unfinished files."""
+"""Temporary names that a killed process leaves."""
 
 
 @contextmanager
 def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> Iterator[IO[bytes]]:
     """Open a binary file that replaces ``path`` when the block ends without an error.
 
-    It is written under a temporary name in the same folder, flushed to the disk and renamed. A killed process leaves
-    the old file, a power cut the old or the new one. A link at ``path`` is replaced.
+    A killed process leaves the old file, a power cut the old or the new one. A link at ``path`` is replaced.
 
     Args:
-        sync: Wait until the file and its name are on the disk. Without it a power cut may lose the new and the old
-            file.
-        own: The folder of the file was made by dudmap and must be no link.
+        sync: Wait until file and name are on the disk. Without it a power cut may lose both files.
+        own: The folder was made by dudmap and must be no link.
     """
     with _unfinished(Path(path), sync, own) as (_, number), open(number, "wb") as file:
         yield file
@@ -100,7 +95,7 @@ def write_bytes(path: str | Path, content: bytes, *, sync: bool = True, own: boo
 
 
 def write_image(path: str | Path, image: "NDArray", *, sync: bool = True, own: bool = False) -> None:
-    """Write a PNG file of a grey or RGB image, or of a mask, whose True is 255."""
+    """Write a PNG file of a grey or RGB image, or of a mask (True = 255)."""
     import cv2
     import numpy as np
 
@@ -109,12 +104,12 @@ def write_image(path: str | Path, image: "NDArray", *, sync: bool = True, own: b
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 text file as ``atomic_file`` does; characters of file names that UTF-8 cannot hold are escaped."""
+    """Write a UTF-8 text file as ``atomic_file`` does; other characters are escaped."""
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def bring_to_disk(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    """Wait until a file's content, or a folder's names, are on the disk."""
     handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
     try:
         os.fsync(handle)

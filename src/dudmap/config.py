@@ -37,24 +37,23 @@ class SensorConfig(ConfigSection):
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
     reference_depth: float = Field(default=1.0, ge=0.1, le=10)
-    """Depth at which distance thresholds are given, metres, and unit of the program's constant lengths: 1 for rooms.
+    """Depth at which distance thresholds are given, metres, and unit of constant lengths: 1 for rooms.
     ``Config.for_range`` scales it with all other lengths."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between colour and depth of a pixel, seconds; 0 for synchronous global shutters.
-    The default is the row time of a rolling shutter with 30 ms readout (30 ms / sqrt 12). An estimated timing brings
-    its own standard deviation."""
+    The default is a rolling shutter with 30 ms readout (30 ms / sqrt 12). An estimated timing brings its own."""
 
     self_calibration: bool = True
     """Calibrate the colour camera against the depth camera during the run, unless a given calibration was estimated.
-    The result repaints the map. It needs the stored frames of loop closing or submaps."""
+    The result repaints the map. Needs the stored frames of loop closing or submaps."""
 
     @property
     def reference_sigma(self) -> float:
-        """Standard deviation of a depth measurement at ``reference_depth``, metres."""
+        """Standard deviation at ``reference_depth``, metres."""
         return float(self.sigma(self.reference_depth))
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
-        """Standard deviation of a depth measurement, metres, at depth ``z`` in metres (a number or an array)."""
+        """Standard deviation, metres, at depth ``z`` in metres (a number or an array)."""
         return reading_sigma(z, self.sigma_base, self.sigma_scale)
 
 
@@ -62,13 +61,13 @@ class PreprocessConfig(ConfigSection):
     """Depth range, hole filling and smoothing of the depth image (thesis section 4.3)."""
 
     depth_min: float = Field(default=0.2, ge=0)
-    """Smallest valid depth, metres; nearer measurements are ignored."""
+    """Smallest valid depth, metres."""
     depth_max: float = Field(default=6.0, gt=0)
-    """Largest valid depth, metres; farther measurements are ignored."""
+    """Largest valid depth, metres."""
     drop_mixed: bool = False
-    """Drop depth between foreground and background at depth edges (flying pixels), for sensors with many."""
+    """Drop depth between foreground and background at depth edges (flying pixels)."""
     fill_holes: bool = True
-    """Fill pixels without depth with the mean of their 5x5 neighbours, if these lie on one surface."""
+    """Fill pixels without depth with the mean of their 5x5 neighbours on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11) or no filter."""
     filter_sigma_px: float = Field(default=4.0, gt=0)
@@ -78,7 +77,7 @@ class PreprocessConfig(ConfigSection):
 
     @property
     def smoothing_px(self) -> float:
-        """Spatial standard deviation of the filter in use, pixels; 0 without one."""
+        """Spatial standard deviation of the filter in use, pixels; 0 without."""
         return self.filter_sigma_px if self.filter == "bilateral" else 0.0
 
     @model_validator(mode="after")
@@ -94,7 +93,7 @@ class SimilarityConfig(ConfigSection):
     enabled: bool = True
     """Do not fuse frames whose view the map already contains; they are still tracked."""
     threshold: float = Field(default=0.84, gt=0, le=1)
-    """Share of the view that the map knows by its weights above which it is redundant (thesis section 4.3)."""
+    """Share of the view known to the map by its weights above which it is redundant (thesis section 4.3)."""
     max_translation: float = Field(default=0.005, ge=0)
     """Translation since the last fused frame above which a view counts as new without the test, metres; 0 tests all."""
 
@@ -115,8 +114,8 @@ class VolumeConfig(ConfigSection):
     max_weight: int = Field(default=255, ge=1, le=255)
     """Largest weight of the running average (thesis eq. 4.19)."""
     max_readings: int = Field(default=48, ge=1, le=255)
-    """Largest weight to which a measurement can raise a voxel, in multiples of its own weight. Measurements of low
-    weight so lose influence once better ones arrive."""
+    """Largest weight of a voxel that a measurement can reach, in multiples of its own. Measurements of low weight so
+    lose influence once better ones arrive."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
@@ -128,12 +127,11 @@ class VolumeConfig(ConfigSection):
     free_after: int = Field(default=4, ge=1, le=200)
     """Number of free-space observations after which a block counts as free space."""
     adaptive: bool = False
-    """Halve voxels on surfaces that are curved or finely coloured and that the sensor resolves (thesis section 7.1)."""
+    """Halve voxels on curved or finely coloured surfaces that the sensor resolves (thesis section 7.1)."""
     adaptive_levels: int = Field(default=1, ge=1, le=2)
     """Most halvings of the voxel size: one or two (adaptive only)."""
     adaptive_bend: float = Field(default=0.4, gt=0)
-    """Smallest curvature times voxel size at which voxels are halved (adaptive only): 0.4 is a radius of two and a half
-    voxels, as of edges and thin things."""
+    """Smallest curvature times voxel size at which voxels are halved (adaptive only): 0.4 is a radius of 2.5 voxels."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":
@@ -151,8 +149,8 @@ class TrackerConfig(ConfigSection):
     huber: float = Field(default=0.01, gt=0)
     """Huber threshold of the distance residual, metres at the reference depth (thesis eq. 4.44, table 6.1)."""
     color_weight: float = Field(default=0.1325, ge=0)
-    """Weight of the squared intensity residual (intensity in [0, 1]) relative to the squared distance residual
-    (metres); thesis eq. 4.32, table 6.2."""
+    """Weight of the squared intensity residual (0..1) relative to the squared distance residual (metres); thesis eq.
+    4.32, table 6.2."""
     exposure: bool = True
     """Fit gain and offset between image and map intensities on the coarsest pyramid level."""
     iterations: tuple[int, ...] = (8, 6, 6)
@@ -183,11 +181,10 @@ class DynamicsConfig(ConfigSection):
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; rounded to a halving of the camera image."""
     settle_time: float = Field(default=1.5, gt=0, le=60)
-    """Time for which an object must be at rest before it counts as static again and is fused, seconds."""
+    """Time at rest after which an object is static again and fused, seconds."""
     start_seconds: float = Field(default=1.0, ge=0)
-    """Time after the first frame in which motion between images, with compensated ego-motion, also detects objects,
-    seconds; the map has no free space yet. It is extended while this finds objects that the map does not reveal; 0
-    disables it."""
+    """Time after the first frame in which motion between images also detects objects, seconds, because the map has no
+    free space yet. It is extended while this finds objects; 0 disables it."""
     margin_px: int = Field(default=5, ge=0, le=50)
     """Margin around dynamic regions that is not fused, pixels of an image 640 wide."""
 
@@ -213,7 +210,7 @@ class LoopsConfig(ConfigSection):
     enabled: bool = True
     """Detect and close loops."""
     min_age: float = Field(default=5.0, gt=0)
-    """Smallest time since the camera was last near a place for it to close a loop, seconds."""
+    """Smallest time since the camera was last near a place that closes a loop, seconds."""
     gap: int = Field(default=15, ge=1)
     """Smallest number of frames between two attempts."""
     keep_distance: float = Field(default=0.08, gt=0)
@@ -239,7 +236,7 @@ class MoversConfig(ConfigSection):
     min_area: float = Field(default=0.015, ge=0)
     """Smallest visible surface area of an object, square metres."""
     meshes: bool = False
-    """Also reconstruct each rigid object and estimate its pose (movers/<id>.ply and .txt of a run)."""
+    """Reconstruct each rigid object and estimate its pose (movers/<id>.ply and .txt of a run)."""
     mesh_voxel_size: float = Field(default=0.005, ge=0.001, le=0.1)
     """Edge length of the voxels of these objects, metres."""
 
@@ -248,11 +245,11 @@ class Config(ConfigSection):
     """All parameters."""
 
     system: Literal["dudmap", "thesis"] = "dudmap"
-    """System that processes the frames: ``dudmap``, or ``thesis``, the thesis as written, which uses only the
-    parameters of the section ``thesis``."""
+    """System that processes the frames: ``dudmap``, or ``thesis``, the thesis as written, which uses only the section
+    ``thesis``."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
-    """Device of the computation: cpu, cuda, cuda:1 for the second GPU (extra gpu), or auto. auto takes a working GPU if
-    ``volume.adaptive`` is off. warp-cpu runs the GPU kernels on the CPU, slowly, for tests."""
+    """Device: cpu, cuda, cuda:1 for the second GPU (extra gpu), or auto, a working GPU if ``volume.adaptive`` is off.
+    warp-cpu runs the GPU kernels slowly on the CPU, for tests."""
     sensor: SensorConfig = SensorConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     similarity: SimilarityConfig = SimilarityConfig()
@@ -294,7 +291,7 @@ class Config(ConfigSection):
 
     @classmethod
     def load(cls, path: str | Path, size: float = 1.0) -> "Config":
-        """Load a TOML file; other parameters keep their defaults for a scene of ``size`` rooms.
+        """Load a TOML file; other parameters keep the defaults of a scene of ``size`` rooms.
 
         Raises:
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
@@ -309,7 +306,7 @@ class Config(ConfigSection):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], size: float = 1.0) -> "Config":
-        """Configuration from nested dictionaries; other parameters keep their defaults for a scene of ``size`` rooms.
+        """Configuration from nested dictionaries, as ``load``.
 
         Raises:
             ConfigError: A key is unknown or a value invalid.
@@ -319,9 +316,7 @@ class Config(ConfigSection):
         return cls(**_merged(scaled(cls().model_dump(), size), tree))
 
     def override(self, assignments: Iterable[str]) -> "Config":
-        """Configuration with assignments ``key=value`` applied, e.g. ``tracker.huber=0.02``.
-
-        Values are TOML or plain words.
+        """Configuration with assignments ``key=value``, e.g. ``tracker.huber=0.02``; values are TOML or plain words.
 
         Raises:
             ConfigError: An assignment is malformed, its key unknown or its value invalid.
@@ -346,7 +341,7 @@ class Config(ConfigSection):
         """Refuse changed parameters that ``system`` does not have.
 
         Raises:
-            ConfigError: There is such a parameter; the message names it.
+            ConfigError: It names such a parameter.
         """
         used, default = self.system == "thesis", Config()
         for key in keys():

@@ -4,6 +4,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class ConfigSection(BaseModel):
-    """Base class of all sections: immutable, rejects unknown keys, documented by the docstrings of its fields."""
+    """Immutable section that rejects unknown keys; docstrings of its fields describe them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)

@@ -1,26 +1,19 @@
-"""Exceptions of dudmap, with one common base class.
-
-A message is one sentence that states the finding, the expectation and the remedy.
-"""
+"""Exceptions of dudmap. A message is one sentence: finding, expectation, remedy."""
 
 LARGEST_MESSAGE = 2000
-"""Most characters of a message: messages quote lines of damaged files."""
+"""Characters of a message: messages quote damaged files."""
 
 
 def printable(text: object) -> str:
     """Text as one printable line, for terminals, pages and files in UTF-8.
 
-    Unprintable characters are escaped: line breaks, terminal escape sequences, changes of the writing direction, bytes
-    of file names that are no UTF-8.
+    Escapes line breaks, terminal sequences, changes of writing direction, bytes that are no UTF-8.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 class DudmapError(Exception):
-    """Base class of all errors of dudmap; the command line prints them without a traceback.
-
-    A message is made ``printable``.
-    """
+    """Base class; the command line prints errors without a traceback. The message is made ``printable``."""
 
     def __init__(self, message: object = "") -> None:
         text = str(message)

@@ -1,4 +1,4 @@
-"""Optional libraries, which come with the extras of the package."""
+"""Optional libraries of the package's extras."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,10 +11,10 @@ STUDY = ("pyDOE3", "statsmodels", "optuna", "pandas", "threadpoolctl")
 
 @contextmanager
 def extra(name: str, purpose: str) -> Iterator[None]:
-    """Around the imports of an extra's libraries; ``purpose`` begins the sentence that says that one is missing.
+    """Around imports of an extra; ``purpose`` begins the sentence on a missing one.
 
     Raises:
-        MissingExtraError: A library is not installed, or cannot be loaded because a system library is missing.
+        MissingExtraError: A library, or a system library that it needs, is missing.
     """
     try:
         yield
@@ -38,7 +38,7 @@ def need(name: str, purpose: str, modules: tuple[str, ...]) -> None:
 
 
 def install(name: str) -> str:
-    """The command that installs an extra from the sources of the package, because no index has it."""
+    """The command that installs an extra."""
     return f'pip install ".[{name}]" in the folder of the sources of dudmap'
 
 

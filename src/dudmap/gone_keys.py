@@ -1,4 +1,4 @@
-"""Configuration keys of earlier versions: the value that is left, and the key that takes the place of other values."""
+"""Configuration keys of earlier versions."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -58,20 +58,20 @@ GONE: dict[str, tuple[Any, str]] = {
     "movers.memory": (0.7, f"{FIXED}core/objects/object_tracker.py"),
     "movers.velocity_window": (0.2, f"{FIXED}core/objects/object_tracker.py"),
 }
-"""Value that changes nothing, and the end of the sentence that refuses any other, by key."""
+"""By key: value that changes nothing, and the end of the sentence that refuses others."""
 LENGTHS = {
     "preprocess.filter_alpha": -1, "dynamics.noise_threshold": 1, "relocalization.max_distance": 1,
     "loops.min_distance": 1, "movers.merge_distance": 1, "movers.max_jump": 1, "tracker.tukey": 1,
     "dynamics.threshold": 1, "tracker.stop": 1, "tracker.stop_coarse": 1,
 }  # fmt: skip
-"""Exponent of the size of the scene in such a value (``dudmap.ranges``)."""
+"""Exponent of the scene's size in such a value (``dudmap.ranges``)."""
 
 
 def without_gone(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The nested keys without those of earlier versions.
+    """The nested keys without keys of earlier versions.
 
     Raises:
-        ConfigError: A key that is gone has another value than the one that is left.
+        ConfigError: Such a key has another value than the remaining one.
     """
     kept: dict[str, Any] = {}
     sensor = tree.get("sensor")
@@ -94,7 +94,7 @@ def _is_gone(key: str, value: Any, size: Any) -> bool:  # noqa: ANN401 - TOML va
 
 
 def _is_scaled(key: str, value: Any, size: Any) -> bool:  # noqa: ANN401 - TOML values have many types
-    """Whether a value is the former default for a scene of a ``size``, in rooms."""
+    """Whether a value is the former default for a scene of ``size`` rooms."""
     if key not in LENGTHS or not all(isinstance(number, int | float) and number > 0 for number in (value, size)):
         return False
     scale = min(size, 1.0) if key.startswith("tracker.stop") else size ** LENGTHS[key]

@@ -1,10 +1,10 @@
-"""Read files of unknown origin: only plain files of limited size, without objects, and with limited nesting.
+"""Read files of unknown origin: plain files of limited size and nesting, without objects.
 
-Recordings, maps and configurations may come from anybody. All their readers use this module: a pipe does not block, a
-device does not fill the memory, and declared sizes are checked before memory is allocated.
+Recordings, maps and configurations may come from anybody. A pipe does not block, a device does not fill the memory, and
+declared sizes are checked before allocation.
 
-A file that cannot be read, is no plain file or is too large raises ``OSError``. Content that violates its format, is
-nested too deeply, or unpacks to too much raises ``ValueError`` or an error of zipfile and zlib (``DAMAGE``).
+Unreadable, special and too large files raise ``OSError``. Damaged, too deeply nested or oversized content raises
+``ValueError`` or an error of zipfile and zlib (``DAMAGE``).
 """
 
 import codecs
@@ -31,35 +31,34 @@ from numpy.typing import NDArray
 from dudmap.errors import DudmapError
 
 LARGEST_TEXT = 2**28
-"""Largest text file, bytes: poses of 100 hours at 30 Hz have 1 GB."""
+"""Bytes of a text file: poses of 100 hours at 30 Hz have 1 GB."""
 LARGEST_TREE = 2**26
-"""Largest JSON file, bytes; transforms.json with 10 000 frames has 5 MB."""
+"""Bytes of a JSON file; transforms.json with 10 000 frames has 5 MB."""
 LARGEST_TOML = 2**20
-"""Largest TOML file, bytes: all parameters have 30 kB; this takes 1 s to parse."""
+"""Bytes of a TOML file: all parameters have 30 kB; this takes 1 s to parse."""
 LARGEST_COUNT = 2**23
-"""Largest number of values of a JSON text, less than 1 GB. transforms.json with 10 000 frames has 200 000."""
+"""Values of a JSON text, less than 1 GB; transforms.json with 10 000 frames has 200 000."""
 DEEPEST = 64
-"""Largest depth of a JSON or TOML tree; known formats have at most 8 levels."""
+"""Levels of a JSON or TOML tree; known formats have at most 8."""
 LARGEST_FILE = 2**28
-"""Largest file that is read as a whole, bytes: an uncompressed image of ``LARGEST_PIXELS``."""
+"""Bytes of a file read as a whole: an uncompressed image of ``LARGEST_PIXELS``."""
 LARGEST_ARCHIVE = 2**36
-"""Largest content of a NumPy archive, bytes. A map of 16 million voxel blocks has 64 GiB."""
+"""Content of a NumPy archive, bytes; a map of 16 million blocks has 64 GiB."""
 LARGEST_RATIO = 100
-"""Largest unpacked over packed size of an archive: maps shrink to a tenth; deflate reaches 1000."""
+"""Unpacked over packed size of an archive: maps reach 10, deflate 1000."""
 RATIO_FREE_BYTES = 2**26
 """Unpacked size below which the ratio does not matter."""
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
-"""First bytes of a pointer file, which replaces a large file if a repository is cloned without Git LFS."""
+"""First bytes of a pointer file, which replaces a large file in a clone without Git LFS."""
 LARGEST_POINTER = 1024
-"""Upper bound of the size of such a pointer, bytes (specification of Git LFS)."""
+"""Bytes of such a pointer (specification of Git LFS)."""
 SAFE_KINDS = "biufUS"
-"""Kinds of NumPy types that contain no objects: numbers and text."""
+"""Kinds of NumPy types without objects."""
 DAMAGE = (
     ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RecursionError, struct.error,
     zlib.error, lzma.LZMAError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, OSError,
 )  # fmt: skip
-"""Errors of the standard library and NumPy for content that violates its format; sizes are limited before memory is
-allocated."""
+"""Errors of the standard library and NumPy for damaged content."""
 
 
 def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
@@ -102,13 +101,12 @@ def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
-    """Content of a UTF-8 or UTF-16 text file of at most ``largest`` bytes, with line ends as ``\\n``."""
+    """Content of a UTF-8 or UTF-16 text file of at most ``largest`` bytes, with line ends ``\\n``."""
     return decode_text(read_bytes(path, largest)).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def decode_text(data: bytes) -> str:
-    """Decode UTF-8, or UTF-16 if a byte order mark or a zero byte in the first character indicates it; the mark is
-    removed."""
+    """Decode UTF-8, or UTF-16 by its byte order mark, which is removed, or by a zero byte in the first character."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     zeros = data[0:1] == b"\0", data[1:2] == b"\0"
@@ -178,10 +176,10 @@ def inflated(packed: bytes, largest: int) -> bytes:
 
 @contextmanager
 def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None) -> Iterator[None]:
-    """Turn parser errors for damaged content into one sentence of class ``kind`` about ``what``.
+    """Turn parser errors into one sentence of class ``kind`` about ``what``.
 
-    It surrounds readers with their own checks and catches remaining defects. ``errors`` are the classes that mean
-    damage, by default ``DAMAGE`` and the errors of OpenCV; errors of dudmap pass unchanged.
+    ``errors``: classes that mean damage, by default ``DAMAGE`` and the errors of OpenCV; errors of dudmap pass
+    unchanged.
     """
     import cv2
 
@@ -197,7 +195,7 @@ def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception]
 
 
 def foreign(kind: type[DudmapError], what: object) -> AbstractContextManager[None]:
-    """Like ``damaged``, for packages whose exceptions for damaged content have no common base: rosbags, trimesh."""
+    """Like ``damaged``, for packages without a common base of their exceptions: rosbags, trimesh."""
     return damaged(kind, what, (Exception,))
 
 
@@ -212,14 +210,14 @@ def describe(error: BaseException) -> str:
 
 @contextmanager
 def open_arrays(path: str | Path) -> "Iterator[Mapping[str, NDArray[Any]]]":
-    """Open a NumPy archive (``.npz``) as a mapping of names to arrays of numbers or text, read on access."""
+    """Open a NumPy archive (``.npz``) as a mapping of names to arrays, read on access."""
     with open_plain(path) as file, zipfile.ZipFile(file) as archive:
         check_unpacked(archive, os.fstat(file.fileno()).st_size)
         yield _Arrays(archive)
 
 
 def check_unpacked(archive: zipfile.ZipFile, packed: int) -> None:
-    """Check the declared unpacked size of a ZIP file of ``packed`` bytes; no more than declared is ever read."""
+    """Check the declared unpacked size of a ZIP file of ``packed`` bytes; no more is ever read."""
     limit = min(LARGEST_ARCHIVE, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed))
     total = sum(info.file_size for info in archive.infolist())
     if total > limit:
@@ -246,7 +244,7 @@ class _Arrays(Mapping[str, NDArray[Any]]):
 
 
 def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
-    """Array of a stream of ``size`` bytes in NumPy's format; ``name`` is used in messages."""
+    """Array of a stream of ``size`` bytes in NumPy's format; ``name`` is for messages."""
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
     if read is None:

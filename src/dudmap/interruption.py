@@ -1,7 +1,7 @@
 """Requests to end: Ctrl-C, SIGTERM (docker stop, systemd, Slurm) and SIGHUP (a closed terminal).
 
-The command line treats them alike: each raises a ``KeyboardInterrupt`` in the main thread. A request waits until a
-frame is processed or results are written (``postponed``). Programs that use dudmap as a library keep their handlers.
+The command line turns each into a ``KeyboardInterrupt`` in the main thread, after the frame or file in progress
+(``postponed``). As a library, dudmap leaves handlers alone.
 """
 
 import os
@@ -13,8 +13,7 @@ from types import FrameType
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 SECOND = 1.0
-"""Seconds after which another request counts as a second one; sooner it is a repetition by ``timeout``, shell or
-kernel."""
+"""Seconds after which a request is a second one; sooner it is a repetition by ``timeout``, shell or kernel."""
 
 
 class _Request:
@@ -40,12 +39,12 @@ def name() -> str:
 
 
 def must_end() -> bool:
-    """Whether the process must end, not only its current work."""
+    """Whether the process must end, not only its work."""
     return _Request.signal not in (0, signal.SIGINT)
 
 
 def exit_code(code: int) -> int:
-    """Exit code of the process: 128 and the number of the signal that ended it, else ``code``."""
+    """128 plus the signal that ended the process, else ``code``."""
     return 128 + _Request.signal if must_end() else code
 
 
@@ -61,10 +60,10 @@ def check() -> None:
 
 @contextmanager
 def postponed() -> Iterator[None]:
-    """Delay a first request until the end of a block, which processes a frame or writes results.
+    """Delay a first request until the end of a block.
 
     Raises:
-        KeyboardInterrupt: At the end of the block, if a request came in it.
+        KeyboardInterrupt: At the end, if a request came.
     """
     before = _Request.signal
     _Request.postponed += 1

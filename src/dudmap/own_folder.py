@@ -1,9 +1,7 @@
-"""Folders that dudmap writes; files in them are opened, made and deleted only as plain files or folders inside them.
+"""Folders that dudmap writes, possibly of unknown origin.
 
-A run may continue in a folder of unknown origin, or replace its results. Files are accessed relative to the open
-folder, so that links in it are not followed. Only names that dudmap gives are ever deleted.
-
-A link, a pipe, or anything else that is no plain file or folder raises an ``OSError`` that names it.
+Files are opened, made and deleted only as plain files or folders inside them: links are not followed, and only names
+that dudmap gives are deleted. Everything else raises an ``OSError`` that names it.
 """
 
 import errno
@@ -23,10 +21,10 @@ class OwnFolder:
     """An open folder; names are single ones, without a separator.
 
     Args:
-        linked: The folder itself may be a link, such as one named on the command line; its content may not.
+        linked: The folder itself may be a link; its content may not.
 
     Raises:
-        OSError: There is no such folder, or it is something else; the text names it.
+        OSError: There is no such folder.
     """
 
     def __init__(self, path: Path, *, linked: bool = False) -> None:
@@ -48,7 +46,7 @@ class OwnFolder:
         self.close()
 
     def status(self, name: str) -> os.stat_result | None:
-        """Status of a file itself, without following links; None if it does not exist."""
+        """Status of a file without following links; None if it does not exist."""
         try:
             return os.stat(self._place(name), dir_fd=self._at, follow_symlinks=False)
         except FileNotFoundError:
@@ -64,12 +62,12 @@ class OwnFolder:
         return number
 
     def create(self, name: str) -> int:
-        """Create a file for writing; an old file of this name, or a link, is removed."""
+        """Create a file for writing; replaces an old file or link."""
         self.remove(name)
         return os.open(self._place(name), os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666, dir_fd=self._at)
 
     def check(self, name: str, *, alone: bool = False) -> None:
-        """Check that a name is free or a plain file, with ``alone`` one without other hard links."""
+        """Check that a name is free or a plain file; ``alone``: without other hard links."""
         status = self.status(name)
         if status is not None and not (stat.S_ISREG(status.st_mode) and (status.st_nlink == 1 or not alone)):
             raise _refused(self.path / name, "is a link or no plain file")
@@ -97,7 +95,7 @@ def check_outside(path: Path, recording: object, option: str = "--out") -> None:
     """Check that an output path lies outside of a recording, whose ``path`` is its folder or file.
 
     Raises:
-        DudmapError: The output path lies in the recording, directly or through links.
+        DudmapError: It lies inside, directly or through links.
     """
     place = getattr(recording, "path", None)
     if place is not None and path.resolve().is_relative_to(place.resolve()):
@@ -105,15 +103,15 @@ def check_outside(path: Path, recording: object, option: str = "--out") -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder in one of dudmap's folders, unless it exists."""
+    """Make a folder inside dudmap's folders, unless it exists."""
     path.mkdir(exist_ok=True)
     OwnFolder(path).close()
 
 
 def remove_files(folder: Path, written: Mapping[str, str]) -> None:
-    """Delete the files of a folder that ``written`` describes: a pattern per sub-folder, ``""`` for the folder itself.
+    """Delete the files of a folder that match ``written``: a pattern per sub-folder, ``""`` for the folder itself.
 
-    Nothing is deleted if a sub-folder is a link, or something other than a plain file has such a name.
+    Nothing is deleted if a sub-folder is a link, or something else has such a name.
     """
     there = {name: form for name, form in written.items() if not name or os.path.lexists(folder / name)}
     found = {}

@@ -1,8 +1,7 @@
-"""Ranges of the camera: every length of the configuration scaled to the size of the scene.
+"""Ranges of the camera: every length of the configuration scaled to the scene.
 
-Let a scene be s times as large as a room, with the noise of its camera scaled likewise. If every length is multiplied
-by s, residuals (in standard deviations), labels and decisions stay the same. So the noise is s sigma(z / s), which is s
-sigma_base + (sigma_scale / s) z^2.
+If a scene, the noise of its camera and every length are scaled by s, residuals in standard deviations, labels and
+decisions stay the same. The noise s sigma(z / s) is s sigma_base + (sigma_scale / s) z^2.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,15 +12,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RANGES = {"near": 0.2, "room": 1.0, "far": 2.5}
-"""Size of the scene, in rooms. near: voxels of 2 mm, depth from 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
+"""Size of the scene, rooms. near: voxels of 2 mm, depth 0.04 to 1.2 m; far: 2.5 cm, 0.5 to 15 m."""
 SMALLEST, LARGEST = 0.2, 5.0
 """Bounds of the size: voxels of 2 mm and of 5 cm."""
 MEDIAN, FARTHEST = 5.0, 6.0
-"""Largest median and 98 % quantile of the depth, metres, for the voxels of a room: 500 and 600 voxels."""
+"""Largest median and 98 % quantile of the depth, metres, of a room: 500 and 600 voxels."""
 NEAREST_MEDIAN = 0.3
-"""Smallest median depth of a room, metres. Below it many measurements are nearer than the room's range (0.2 m)."""
+"""Smallest median depth of a room, metres; below it many measurements are nearer than 0.2 m."""
 FEW = 0.2
-"""Smallest share of pixels with a measurement for the choice of a range."""
+"""Smallest share of measured pixels for the choice of a range."""
 
 POWERS = {
     "sensor": {"reference_depth": 1, "sigma_base": 1, "sigma_scale": -1},
@@ -33,11 +32,11 @@ POWERS = {
     "loops": {"keep_distance": 1},
     "movers": {"min_area": 2, "mesh_voxel_size": 1},
 }
-"""Exponent of the size of the scene in a parameter's scale. All other parameters contain no length."""
+"""Exponent of the scene's size in a parameter's scale; other parameters contain no length."""
 
 
 def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
-    """The values of a whole configuration for a scene of a ``size``, in rooms; a size of 1 changes nothing."""
+    """The values of a whole configuration for a scene of ``size`` rooms."""
     if size == 1:
         return dict(tree)
     out = {key: dict(values) if isinstance(values, Mapping) else values for key, values in tree.items()}
@@ -50,8 +49,8 @@ def scaled(tree: Mapping[str, Any], size: float) -> dict[str, Any]:
 def size_of(depths: "Iterable[NDArray[np.float32]]") -> float:
     """Size of the scene in some depth images (H, W), metres, relative to a room (1).
 
-    The voxel size of other scenes is the larger of 1/500 of the median depth and 1/600 of the 98 % quantile. It is
-    clipped to 2 mm to 5 cm.
+    The voxel size of other scenes is the larger of 1/500 of the median depth and 1/600 of the 98 % quantile, within 2
+    mm to 5 cm.
     """
     import numpy as np
 

@@ -16,12 +16,12 @@ class ThesisConfig(ConfigSection):
     """Nearest over second nearest descriptor distance of a good match (Lowe 2004, section 7.1; thesis: "RATIO")."""
 
     depth_min: float = Field(default=0.2, ge=0)
-    """Smallest depth measurement that is used, metres."""
+    """Smallest used depth, metres."""
     depth_max: float = Field(default=6.0, gt=0)
-    """Largest depth measurement that is used, metres."""
+    """Largest used depth, metres."""
     alpha: float = Field(default=12.0, gt=0)
-    """Range standard deviation of the filter at 1 m, millimetres (eq. 4.11). Reading: 12 has no unit in the text; in
-    metres the filter would average over all depths."""
+    """Range standard deviation of the filter at 1 m, millimetres (eq. 4.11). Reading: 12 has no unit; in metres the
+    filter would average over all depths."""
     sigma_s: float = Field(default=4.0, gt=0)
     """Spatial standard deviation of the filter, pixels (section 4.3)."""
     filter_radius: int = Field(default=8, ge=1, le=32)
@@ -30,8 +30,8 @@ class ThesisConfig(ConfigSection):
     tau: float = Field(default=0.01, gt=0, le=1)
     """Voxel size, metres (table 6.1)."""
     d_max: float = Field(default=0.1, gt=0)
-    """Largest distance stored in front of a surface, metres. The thesis gives no number. 10 cm is three standard
-    deviations of a Kinect at 4 m. It exceeds ``theta``; otherwise no point in free space could be dynamic."""
+    """Largest distance stored in front of a surface, metres; no number in the thesis. Three standard deviations of a
+    Kinect at 4 m, and more than ``theta``, so that points in free space can be dynamic."""
     d_min: float = Field(default=0.1, gt=0)
     """Largest distance stored behind a surface, metres."""
     w_max: int = Field(default=255, ge=1, le=255)

@@ -1,4 +1,4 @@
-"""Copies of a caller's arrays: dudmap never shares their memory."""
+"""Copies of a caller's arrays."""
 
 from typing import Any
 
@@ -11,11 +11,11 @@ from dudmap.errors import DatasetError
 def copied(
     values: object, what: str, dtype: DTypeLike | None = np.float64, shape: tuple[int, ...] | None = None
 ) -> NDArray[Any]:
-    """Copy of an array or of an array-like object.
+    """Copy of an array or array-like object.
 
     Args:
         what: Name in messages.
-        dtype: Type of the copy; None keeps the type of ``values``.
+        dtype: Type of the copy; None keeps the type.
         shape: Required shape; None allows all.
 
     Raises:

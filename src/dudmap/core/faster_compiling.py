@@ -1,7 +1,7 @@
-"""Changes of Numba that shorten its compilations, for all code of the process; made when the first kernel is compiled.
+"""Changes of Numba that shorten compilation, for all code of the process; made when the first kernel is compiled.
 
-35 kernels take 69.7 s of a processor with all changes, 80.2 s without ``_optimize_callers`` and 81.9 s without
-``_compare_flags_at_once`` (one run each, on a busy machine). A process that loads all its kernels changes nothing.
+35 kernels take 69.7 s with all changes, 80.2 s without ``_optimize_callers``, 81.9 s without
+``_compare_flags_at_once``.
 """
 
 import gc
@@ -23,8 +23,7 @@ def change_numba() -> None:
 
 
 class _Uncollected(event.Listener):
-    """Suspends garbage collection while a kernel is compiled. Nearly all objects of a compilation live until its end,
-    and scanning them repeatedly takes a tenth of the time."""
+    """Suspends garbage collection during a compilation, whose objects nearly all live until its end."""
 
     def __init__(self) -> None:
         self._nested, self._collects = 0, True
@@ -42,7 +41,7 @@ class _Uncollected(event.Listener):
 
 
 def _optimize_callers() -> None:
-    """Optimise an always inlined function only as far as inlining needs: its callers optimise the rest."""
+    """Optimise always inlined functions only as far as inlining needs."""
     optimize = CPUCodeLibrary._optimize_final_module
 
     def optimize_less(self: CPUCodeLibrary) -> None:
@@ -59,8 +58,7 @@ def _optimize_callers() -> None:
 
 
 def _compare_flags_at_once() -> None:
-    """Compare compilation flags by their set values, and hash them by type; there are a hundred thousand
-    comparisons."""
+    """Compare compilation flags by their set values, and hash them by type."""
     compare = TargetConfig.__eq__
     TargetConfig.__hash__ = lambda self: hash(type(self))
     TargetConfig.__eq__ = lambda self, other: (

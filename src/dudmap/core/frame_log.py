@@ -1,4 +1,4 @@
-"""Log of a system: changes of the tracking state and of the map, by the time of the frame."""
+"""Log of changes of the tracking state and the map."""
 
 import logging
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ log = logging.getLogger(__name__)
 
 
 def log_changes(before: "FrameResult | None", result: "FrameResult") -> None:
-    """Log how a frame differs from the frame ``before`` it: lost, found again, a new map, a closed loop."""
+    """Log how a frame differs from the frame ``before``: lost, found again, a new map, a closed loop."""
     time, was_lost = result.timestamp, before is not None and before.status == "lost"
     if result.status == "rejected":
         log.warning("%.3f s: frame ignored, %s", time, result.verdict.reason)

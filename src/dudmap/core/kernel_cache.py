@@ -1,7 +1,7 @@
 """Compiled kernels: of the wheel, of a folder, or of this process.
 
-Numba refuses to define a kernel if it can write none of its folders. The kernels of dudmap are then stored in a private
-folder of this user in the temporary folder, or compiled in memory.
+Numba refuses to define a kernel if none of its folders is writable. Kernels are then stored in a private temporary
+folder of this user, or compiled in memory.
 """
 
 import os
@@ -29,11 +29,11 @@ _DAMAGED: type[Exception] = vars(caching)["pickle"].UnpicklingError
 
 
 counts = Counter[str]()
-"""Kernels of this process that were ``shipped`` in the wheel, ``stored`` in the folder, or ``compiled``."""
+"""Kernels of this process: ``shipped`` in the wheel, ``stored`` in the folder, or ``compiled``."""
 
 
 def folder() -> Path | None:
-    """Folder of the compiled kernels of a frame; None if they are compiled in memory."""
+    """Folder of the compiled kernels; None if compiled in memory."""
     place = _Locator.from_function(folder, str(Path(__file__).parent / "backends" / "cpu" / "__init__.py"))
     return None if place is None else Path(place.get_cache_path())
 
@@ -56,17 +56,17 @@ def is_temporary() -> bool:
 
 
 def environment() -> dict[str, str]:
-    """Environment variables that make a child process store its kernels in the same folder, without a warning."""
+    """Environment variables that make a child process use the same folder."""
     return {"NUMBA_CACHE_DIR": str(_private())} if is_temporary() else {}
 
 
 def store(kernel: Dispatcher) -> None:
-    """Load the compiled forms of a kernel from the folder and store them there, until its ``digest`` changes."""
+    """Load and store the compiled forms of a kernel in the folder, by its ``digest``."""
     vars(kernel)["_cache"] = _Store(kernel)
 
 
 class _Store(caching.NullCache):
-    """Compiled forms of one kernel. The folder is only opened for a form that the wheel does not bring."""
+    """Compiled forms of one kernel. The folder is only opened for forms that the wheel lacks."""
 
     def __init__(self, kernel: Dispatcher) -> None:
         self._kernel = kernel
@@ -81,11 +81,9 @@ class _Store(caching.NullCache):
 
     @property
     def cache_path(self) -> Any:  # noqa: ANN401 - as Numba has it
-        """The folder, None if there is none."""
         return self._folder.cache_path
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
-        """The compiled form for a signature, None if it has to be compiled."""
         if found := shipped_kernels.load(self._kernel, sig, target_context):
             counts["shipped"] += 1
         elif found := self._folder.load_overload(sig, target_context):
@@ -95,12 +93,10 @@ class _Store(caching.NullCache):
         return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ANN401
-        """Store a compiled form."""
         counts["compiled"] += 1
         self._folder.save_overload(sig, cres)
 
     def flush(self) -> None:
-        """Forget the compiled forms."""
         self._folder.flush()
 
 
@@ -116,14 +112,12 @@ class _Cache(caching.FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401
-        """The compiled form for a signature, None if it must be compiled."""
         try:
             return super().load_overload(sig, target_context)
         except (OSError, EOFError, _DAMAGED):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401
-        """Store a compiled form if possible."""
         try:
             try:
                 super().save_overload(sig, data)
@@ -142,7 +136,6 @@ class _Locator:
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> Any:  # noqa: ANN401 - a locator of Numba
-        """Locator of the first writable folder, None if there is none."""
         kinds = [_KINDS["UserProvided"], _KINDS["InTree"]]
         if os.path.isabs(os.path.expanduser("~")):  # otherwise Numba would make a folder named ~
             kinds.append(_KINDS["UserWide"])
@@ -151,15 +144,12 @@ class _Locator:
 
 
 class _PrivateLocator(_KINDS["InTree"]):
-    """The folder of this user in the temporary folder."""
-
     def __init__(self, py_func: Any, py_file: str) -> None:  # noqa: ANN401
         super().__init__(py_func, py_file)
         self._cache_path = os.path.join(str(_private()), self.get_suitable_cache_subpath(py_file))
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:  # noqa: ANN401
-        """Locator for a kernel, None if there is no such folder."""
         found = None if _private() is None else super().from_function(py_func, py_file)
         if found is not None:
             _say_once(f"in {_private()}, which may not last")
@@ -175,7 +165,7 @@ _Cache._impl_class = _Impl
 
 @cache
 def _private() -> Path | None:
-    """Folder of this user in the temporary folder; no other user can add or replace a file."""
+    """Temporary folder of this user; no other user can add or replace a file."""
     try:
         base = Path(tempfile.gettempdir())
         temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}

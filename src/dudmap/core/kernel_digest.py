@@ -1,4 +1,4 @@
-"""Digest of everything that determines the machine code of a kernel, in all files."""
+"""Digest of everything that determines the machine code of a kernel."""
 
 import hashlib
 import inspect
@@ -16,15 +16,13 @@ PLAIN = (bool, int, float, complex, str, bytes, np.generic, type(None))
 
 
 def digest(kernel: Any) -> str:  # noqa: ANN401 - a dispatcher of Numba
-    """Digest of a kernel: its code, its options, and all functions and constants that it reads, recursively.
-
-    Comments, docstrings and line numbers do not change it.
-    """
+    """Digest of a kernel: code, options, and all functions and constants that it reads, recursively; not comments,
+    docstrings and line numbers."""
     return hashlib.sha256("\n".join(sorted(reached(kernel).values())).encode()).hexdigest()
 
 
 def reached(kernel: Any) -> dict[Any, str]:  # noqa: ANN401
-    """A kernel and all functions that it inlines or calls, each with its text for the digest."""
+    """A kernel and all functions that it calls, each with its text for the digest."""
     found: dict[Any, str] = {}
     waiting = [kernel]
     while waiting:
@@ -36,7 +34,7 @@ def reached(kernel: Any) -> dict[Any, str]:  # noqa: ANN401
 
 
 def layout(type_: Any) -> str:  # noqa: ANN401 - a type of Numba, or several
-    """Name of an argument type with the field names of named tuples, which Numba's name lacks."""
+    """Name of an argument type with the field names of named tuples."""
     parts: Any = type_ if isinstance(type_, tuple | types.BaseTuple) else ()
     if not parts:
         return str(type_)
@@ -79,11 +77,7 @@ def _name(function: Any) -> str:  # noqa: ANN401
 
 
 def _text(value: Any, called: list[Any] | None = None) -> str:  # noqa: ANN401
-    """Text of a value that a kernel reads; a function is added to ``called``.
-
-    Raises:
-        TypeError: The value has an unsupported type.
-    """
+    """Text of a value that a kernel reads; functions are added to ``called``."""
     value = getattr(value, "inlined", value)
     if isinstance(value, PLAIN):
         return f"{type(value).__name__} {value!r}"

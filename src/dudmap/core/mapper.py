@@ -1,4 +1,4 @@
-"""Mapping: fusion of frames with known poses, and the second registration of the first frames of a map."""
+"""Fusion of frames with known poses, and the second registration of the first frames."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ class Mapper:
         self._localize = localize
 
     def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Rebuild the map of the first frame with colours registered by the velocity to the second frame."""
+        """Rebuild the map of the first frame with colours registered by the velocity to the second."""
         first = self._young_map.first
         if first is not None:
             colored = self._color_motion.first_frame(first.view, view.timestamp, estimate.T_world_camera)
@@ -56,7 +56,7 @@ class Mapper:
                 self.begin_anew(self._young_map.recolored(colored), view.timer)
 
     def begin_anew(self, first: StartFrame, timer: StageTimer) -> None:
-        """Build the current map again from its first frame."""
+        """Rebuild the current map from its first frame."""
         self._atlas.clear_map()
         self._young_map.restart_window()
         mask = first.dynamic_mask | first.undecided_mask
@@ -64,7 +64,7 @@ class Mapper:
         self.integrate(replace(first.view, timer=timer), replace(first.estimate, tracking=tracking), mask)
 
     def extend(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool) -> None:
-        """Fuse a frame, and keep it for relocalization if no keyframe is near."""
+        """Fuse a frame, and keep it as keyframe if none is near."""
         if fuse:
             self.integrate(view, estimate, dynamic_mask)
         if self._config.relocalization.enabled and not view.without_image:
@@ -76,17 +76,14 @@ class Mapper:
                     keyframes.add(*place)
 
     def refine_first_poses(self, tracker: Tracker) -> NDArray[np.float64] | None:
-        """Register the first frames of a map again to the more complete map, and rebuild it from them.
+        """Register the first frames again to the more complete map, and rebuild it from them.
 
-        The first frames were registered to a map of few frames and followed its noise. In the later map each frame has
-        little weight, so that its own noise does not bind it. Poses between the refined frames are interpolated.
-
-        Args:
-            tracker: Registers frames.
+        The first frames followed the noise of a map of few frames. In the later map their own noise has little weight.
+        Poses between refined frames are interpolated.
 
         Returns:
-            (4, 4) motion of the last pose. None if the map is unchanged: it is too young, was refined before, is
-            incomplete, or does not fit one of the frames.
+            (4, 4) motion of the last pose. None if the map is unchanged: too young, refined before, incomplete, or not
+            fitting one of the frames.
         """
         window, atlas = self._young_map.complete_window(), self._atlas
         if not window or self._localize or atlas.current == atlas.saved or atlas.current in atlas.rebuildings:
@@ -116,11 +113,11 @@ class Mapper:
         return corrections[-1]
 
     def _static(self, dynamic_mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Pixels (H, W) that are fused: none within the margin of a dynamic measurement."""
+        """Fused pixels: none within the margin of a dynamic measurement."""
         return ~grown_mask(dynamic_mask & (depth > 0), self._config.dynamics.margin_px * self._camera.width // 640)
 
     def integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Fuse the static pixels of a frame, in the exposure of the map, and store it for corrections."""
+        """Fuse the static pixels of a frame, and store it for corrections."""
         observation = view.observation
         with view.timer("integrate"):
             static = self._static(dynamic_mask, observation.depth)

@@ -1,4 +1,4 @@
-"""Results of a system: the result of each frame, and the maps, trajectories and calibration so far."""
+"""Results: of each frame, and the maps, trajectories and calibration so far."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -34,11 +34,11 @@ from dudmap.core.verdict import Verdict
 
 
 class Status(StrEnum):
-    """What became of a frame.
+    """Outcome of a frame.
 
-    * TRACKED: it has a pose, by registration to the map or as the start of a map.
-    * REPEATED: its images, or its depth image, equal the frame before. It has the same pose; if only the depth repeats,
-      the predicted pose, which the trajectory interpolates once the next frame is tracked.
+    * TRACKED: it has a pose.
+    * REPEATED: its images, or its depth, equal the frame before. It has the same pose; if only the depth repeats, the
+      predicted pose, which the trajectory interpolates once the next frame is tracked.
     * LOST: its pose cannot be trusted.
     * REJECTED: it is ignored for a fault of the stream, such as a wrong time stamp.
     """
@@ -52,10 +52,10 @@ class Status(StrEnum):
 Event = Literal["started", "relocalized", "corrected", "calibrated"]
 """Event of a frame.
 
-* started: A map starts with this frame.
-* relocalized: The pose comes from a recognised place after tracking was lost.
-* corrected: Earlier poses of the submap changed: a loop was closed, or a young map started again.
-* calibrated: A new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
+* started: A map starts.
+* relocalized: The pose comes from a recognised place.
+* corrected: Earlier poses changed: a loop was closed, or a young map started again.
+* calibrated: ``Slam.calibration`` is new after this frame.
 """
 
 
@@ -67,27 +67,25 @@ UNCERTAIN = "unobservable", "saturated"
 class FrameResult:
     """Result of processing one frame.
 
-    The covariance is the variance of a residual times the inverse of the Hessian of the registration. Residuals are
-    correlated, so that the variance comes from sums over blocks of pixels. Along directions that the view does not
-    observe it is the variance of the predicted motion. It holds the noise of one registration to the map as it is. It
-    contains neither errors of the map, which grow with the path (drift), nor errors of the calibration. The frame that
-    starts a map defines the world, with a covariance of 0.
+    The covariance is the variance of a residual, from sums over blocks of pixels because neighbours are correlated,
+    times the inverse Hessian of the registration. Unobserved directions have the variance of the predicted motion.
+    Errors of the map (drift) and of the calibration are not included. The frame that starts a map has a covariance of
+    0.
 
     Attributes:
-        timestamp: Time of the depth image, seconds; after a change of the clock, on the clock of the first frames.
-        status: What became of the frame.
+        timestamp: Time of the depth image, seconds; after a change of the clock, on the first clock.
+        status: Outcome of the frame.
         T_world_camera: Camera pose (4, 4); None unless tracked or repeated.
-        covariance: (6, 6) of the pose's error: displacement of the camera's centre (m), then rotation about it (rad),
-            both in world axes, as in a ROS ``PoseWithCovariance``. None without a pose or with a given one.
-        verdict: Outcomes of the checks that decided on the frame.
+        covariance: (6, 6) of the pose error: displacement of the camera's centre (m), then rotation about it (rad), in
+            world axes, as in a ROS ``PoseWithCovariance``. None without a pose or with a given one.
+        verdict: Outcomes of the checks.
         dynamic_mask: (H, W) bool, dynamic pixels of the recorded image.
         dynamic_share: Share of the depth measurements in the mask.
-        residuals: (h, w) float32 signed distances of the measurements to the map, metres, at label resolution; NaN off
-            the map.
+        residuals: (h, w) float32 signed distances to the map, metres, label resolution; NaN off the map.
         timings: Milliseconds per stage.
-        submap: Number of the submap of the pose, 0 the first.
+        submap: Number of the submap, 0 the first.
         events: Events of the frame.
-        shed: Work that was omitted from the frame, see ``Slam.shed``.
+        shed: Omitted work, see ``Slam.shed``.
     """
 
     timestamp: float
@@ -113,32 +111,32 @@ class FrameResult:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the frame is lost, rejected or repeated, or is tracked and not fused; the first reason decided."""
+        """Why the frame is lost, rejected, repeated or not fused; the first reason decided."""
         return tuple(outcome.reason for outcome in self.verdict.failed)
 
     @property
     def fused(self) -> bool:
-        """Whether the map takes the static pixels of the frame; a map younger than 0.4 s may hold them back."""
+        """Whether the map takes the static pixels; a map younger than 0.4 s may hold them back."""
         return self.status is Status.TRACKED and self.verdict.accepted
 
     @property
     def blind(self) -> bool:
-        """Whether only the distances determine the pose, because the image carries no information."""
+        """Whether only distances determine the pose, because the image carries no information."""
         return "blind" in self.verdict or "color_repeats" in self.verdict
 
     @property
     def uncertain(self) -> str:
-        """Reason why pose and labels of a tracked frame may be wrong; empty if there is none."""
+        """Why pose and labels of a tracked frame may be wrong; empty if certain."""
         return next((one.reason for one in self.verdict.failed if one.name in UNCERTAIN), "")
 
     @property
     def histogram(self) -> NDArray[np.int64] | None:
-        """(BINS,) counts of the residuals in standard deviations of a measurement; None if no pixel was labelled."""
+        """(BINS,) counts of the residuals in standard deviations; None if no pixel was labelled."""
         return None if self._labels is None else self._labels.histogram
 
     @cached_property
     def movers(self) -> tuple[Mover, ...]:
-        """Moving objects, by id; none in a lost frame. They are computed at the first access."""
+        """Moving objects by id, computed at the first access; none in a lost frame."""
         return () if self._find_movers is None else deepcopy(self._find_movers())
 
     def without_details(self) -> "FrameResult":
@@ -146,7 +144,7 @@ class FrameResult:
         return replace(self, events=(), shed=Shed.NOTHING, _labels=None, _tracking=None, _find_movers=None)
 
     def detached(self) -> "FrameResult":
-        """Copy with copies of all arrays, which the caller may keep and change."""
+        """Copy with copies of all arrays."""
         return replace(deepcopy(replace(self, _find_movers=None)), _find_movers=self._find_movers)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -156,7 +154,7 @@ class FrameResult:
 
 @dataclass(frozen=True, eq=False)
 class SlamArguments:
-    """Arguments of ``Slam``, except a first pass and a saved map, whose used parts belong to the state."""
+    """Arguments of ``Slam`` that are no state: all except a first pass and a saved map."""
 
     camera: Camera
     config: Config
@@ -170,7 +168,7 @@ class SlamArguments:
 
 
 class SlamResults:
-    """The read-only side of ``Slam``; a map in rebuilding after a correction is completed first.
+    """The read-only side of ``Slam``.
 
     Attributes:
         config, camera: Configuration, and camera of the images without lens distortion.
@@ -196,42 +194,41 @@ class SlamResults:
 
     @property
     def reference(self) -> TsdfVolume:
-        """Map for registration: the current one, or in a second pass the map of the first pass."""
+        """Map for registration: the current one, or the first pass's in a second pass."""
         return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     @property
     def volume(self) -> TsdfVolume:
-        """Complete map of the current submap; a rebuilding after a correction is finished first.
+        """Complete map of the current submap; finishes a rebuilding after a correction.
 
-        A new or joined submap is another object. ``atlas.volume`` is the map in its current state.
+        A new or joined submap is another object.
         """
         self.atlas.complete()
         return self.atlas.volume
 
     @property
     def live_volume(self) -> TsdfVolume:
-        """Map of the current submap in its current state, for viewers."""
+        """Map of the current submap as it is, for viewers."""
         return self.atlas.volume
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all tracked frames of the largest submap, at their time stamps, after all corrections."""
+        """Corrected poses of all tracked frames of the largest submap, at their time stamps."""
         return self._trajectory(self.atlas.by_size()[0])
 
     def _trajectory(self, number: int) -> Trajectory:
-        """Trajectory of a submap. Given poses belong to the time stamps, even if the images were captured at other
-        times."""
+        """Trajectory of a submap. Given poses belong to the time stamps, not to the capture times."""
         given = self.arguments.poses == "given"
         return self.atlas.image_poses(number) if given else self.atlas.trajectory(number)
 
     @property
     def image_poses(self) -> Trajectory:
-        """The trajectory at the capture times, if a calibration finds the stamps of the depth images late."""
+        """The trajectory at the capture times, if a calibration finds the depth stamps late."""
         return self.atlas.image_poses(self.atlas.by_size()[0])
 
     @property
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
-        """Trajectory and complete map of each submap, largest first; each has its own world frame."""
+        """Trajectory and complete map of each submap, largest first, each in its own world frame."""
         self.atlas.complete()
         return [(self._trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
@@ -247,16 +244,16 @@ class SlamResults:
 
     @property
     def calibration_waits(self) -> int:
-        """Number of frames that waited for a calibration from another process."""
+        """Frames that waited for a calibration from another process."""
         return self.color_calibration.waits
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
-        """The moving objects so far, if ``movers.meshes`` is set: shape and trajectory of rigid objects."""
+        """Shapes and trajectories of rigid objects so far, if ``movers.meshes`` is set."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
     def as_prior_map(self) -> PriorMap:
-        """The largest submap and the state that a second pass over the same recording needs."""
+        """The largest submap and the state that a second pass needs."""
         self.atlas.complete()
         self.atlas.keyframes.settle()
         main = self.atlas.by_size()[0]

@@ -1,4 +1,4 @@
-"""Temporary file of byte strings, which the operating system removes."""
+"""Temporary file of byte strings."""
 
 import sqlite3
 import tempfile
@@ -10,11 +10,7 @@ from dudmap.errors import MapError
 
 
 class ScratchStore:
-    """Lists of byte strings by keys, in a temporary SQLite database that reuses the space of removed lists.
-    Thread-safe.
-
-    Args:
-    """
+    """Lists of byte strings by keys, in a temporary SQLite database. Thread-safe."""
 
     def __init__(self, content: str) -> None:
         self._content = content
@@ -25,7 +21,7 @@ class ScratchStore:
         self.close = weakref.finalize(self, _close, connection, self._lock)
 
     def write(self, key: str, parts: Sequence[bytes | memoryview]) -> None:
-        """Store the parts of a key, replacing its previous parts.
+        """Replace the parts of a key.
 
         Raises:
             MapError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""Work that is omitted from a frame if there is no time for it."""
+"""Work that is omitted from a frame without time for it."""
 
 from enum import IntEnum
 
@@ -10,6 +10,6 @@ class Shed(IntEnum):
     MOVERS = 1
     """No moving objects."""
     LABELS = 2
-    """The dynamic pixels of the last frame, carried over by the pose."""
+    """Labels are carried from the last frame."""
     FUSION = 3
-    """The frame is not fused."""
+    """No fusion."""

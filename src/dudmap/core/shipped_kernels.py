@@ -1,7 +1,7 @@
-"""Compiled kernels that a wheel brings, by level of the processor, and the choice of the level.
+"""Compiled kernels of a wheel by processor level.
 
-The wheel holds one file for each kernel and each tuple of argument types, in ``compiled/VERSIONS/LEVEL/``. The name of
-the file tells the kernel's digest, so that the kernel of an edited source is not found.
+The wheel holds one file per kernel and argument types, in ``compiled/VERSIONS/LEVEL/``. Its name contains the kernel's
+digest.
 """
 
 import hashlib
@@ -35,12 +35,12 @@ LEVELS = {
     "x86-64-v3": _V3,
     "generic": set[str](),
 }
-"""Instructions of each level of the x86-64 ABI, in LLVM's words, the highest level first."""
+"""Instructions of each level of the x86-64 ABI in LLVM's words, highest first."""
 VERSIONS = (
     f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
     f"-numba-{numba.__version__}-llvmlite-{llvmlite.__version__}-numpy-{np.lib.NumpyVersion(np.__version__).major}"
 )
-"""Name of the folder of the kernels that this interpreter can load."""
+"""Folder of the kernels that this interpreter can load."""
 _settings: Any = config
 FOLDER = Path(__file__).parent / "compiled"
 DIGEST_BYTES = hashlib.sha256().digest_size
@@ -53,7 +53,7 @@ class KernelCacheWarning(UserWarning):
 def force_level(name: str) -> None:
     """Compile all kernels of this process for a level, and use the kernels of this level.
 
-    Numba has one target per process: code of others that it compiles later is compiled for this level, too.
+    Numba's target is per process, so that other code is compiled for this level, too.
 
     Raises:
         ConfigError: There is no such level, the processor does not have it, or Numba has compiled for another one.
@@ -71,13 +71,13 @@ def force_level(name: str) -> None:
 
 
 def available() -> set[str]:
-    """Instructions of this processor that the operating system supports, in LLVM's words."""
+    """Usable instructions of this processor, in LLVM's words."""
     return {name for name, present in get_host_cpu_features().items() if present}
 
 
 @cache
 def folder() -> Path | None:
-    """Folder of the kernels that this process uses; None, with a warning if a wheel brought some, if there is none."""
+    """Folder of shipped kernels in use; None for none, with a warning if a wheel brought some."""
     if not FOLDER.is_dir():
         return None
     given = _settings.CPU_NAME or _settings.CPU_FEATURES  # of the user, or of ``force_level``
@@ -91,7 +91,7 @@ def folder() -> Path | None:
 
 
 def load(kernel: Dispatcher, sig: Any, target_context: Any) -> Any:  # noqa: ANN401 - types of Numba
-    """Compiled form of a kernel for argument types, None if the wheel does not bring it or its file is damaged."""
+    """Compiled form of a kernel for argument types; None if missing or damaged."""
     place = folder()
     if place is None:
         return None
@@ -117,7 +117,7 @@ def load(kernel: Dispatcher, sig: Any, target_context: Any) -> Any:  # noqa: ANN
 
 
 def file_name(kernel: Dispatcher, sig: Any) -> str:  # noqa: ANN401
-    """Name of the file of a kernel for argument types."""
+    """File name of a kernel for argument types."""
     types = hashlib.sha256(layout(sig).encode()).hexdigest()
     return f"{kernel.__module__}.{kernel.__qualname__}-{digest(kernel)[:16]}-{types[:16]}.nbc"
 
@@ -126,7 +126,7 @@ _said = set[str]()
 
 
 def say_once(sentence: str, subject: str = "") -> None:
-    """Warn of the first sentence about a subject, in the first of several processes."""
+    """Warn of the first sentence about a subject, once for all child processes."""
     if multiprocessing.parent_process() is None and (subject or sentence) not in _said:
         _said.add(subject or sentence)
         warnings.warn(sentence, KernelCacheWarning, stacklevel=2)

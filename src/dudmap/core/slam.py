@@ -1,4 +1,4 @@
-"""The algorithm: register a frame to the map, label moving pixels, fuse the static pixels (thesis algorithm 4)."""
+"""The algorithm: register a frame to the map, label moving pixels, fuse static ones (thesis algorithm 4)."""
 
 import time
 from collections.abc import Sequence
@@ -55,26 +55,25 @@ class Slam(SlamResults, Stateful):
     Args:
         camera: Camera of the frames.
         config: All parameters; None for the defaults.
-        first_pass: A system that has processed the whole recording. The second pass repeats all frames. They are
-            registered and labelled with the map of the first pass and fused into a new map. It excludes objects that
-            seemed static before they moved or were seen through.
-        calibration: Calibration of the colour camera; None for registered colour. An estimated one is not changed. With
-            ``sensor.self_calibration``, any other is the start of the estimation.
-        live: No frame waits for a calibration, and the first poses are not estimated a second time.
-        saved_map: Map of an earlier run to continue; the system takes it over. All poses are in its world frame. Frames
-            are lost until one is recognised in it, or until a new submap starts, which may be joined later.
-        localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
+        first_pass: A system that has processed the whole recording. Frames are registered and labelled with its map and
+            fused into a new one, without objects that seemed static before they moved.
+        calibration: Calibration of the colour camera; None for registered colour. With ``sensor.self_calibration``, one
+            that is not estimated starts the estimation.
+        live: No frame waits for a calibration, and the first poses are not refined.
+        saved_map: Map of an earlier run to continue, taken over with its world frame. Frames are lost until one is
+            recognised in it, or a new submap starts, which may be joined later.
+        localize: Only find the camera in ``saved_map``; the map does not change.
         max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results do not
             change.
         timed: Whether the times of the frames are measured; False for assumed times.
         poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
-        ignore: (H, W) bool, pixels of the depth or colour image that are never used, fused or dynamic.
-        cues: Further evidence of motion, asked for each frame. They are not stored with the state.
+        ignore: (H, W) bool, pixels of the depth or colour image that are never used.
+        cues: Further evidence of motion, not stored with the state.
 
     Attributes:
-        shed: Work to omit from the next frames, to save time. Labels and fusion are only omitted within 0.05 s of a
-            labelled frame (every second frame at 30 Hz), and never in a young map, if most of the last view moved, or
-            if the last frame was not tracked. It is not stored with the state.
+        shed: Work to omit from the next frames. Labels and fusion are only omitted within 0.05 s of a labelled frame
+            (every second one at 30 Hz), and never in a young map, after a mostly moving view, or after a frame that was
+            not tracked. Not stored with the state.
     """
 
     stream: Remembered[StreamCheck]
@@ -186,11 +185,11 @@ class Slam(SlamResults, Stateful):
         Args:
             frame: Depth and colour, in order of arrival, prepared or not. A frame with an impossible time stamp or
                 image is rejected and changes nothing.
-            dynamic_mask: (H, W) bool, known dynamic pixels, excluded from all registrations and from the map.
-            T_world_camera: (4, 4) given pose of the depth camera, see ``poses``; metres.
+            dynamic_mask: (H, W) bool, known dynamic pixels, excluded from registration and map.
+            T_world_camera: (4, 4) given pose of the depth camera, metres, see ``poses``.
             arrays: ``depth``, ``timestamp`` and ``rgb`` instead of a frame. ``depth`` (H, W) is float32 in metres or
-                uint16 with ``camera.depth_scale`` units per metre (default 1000: millimetres), 0 = no measurement.
-                ``timestamp`` is in seconds. ``rgb`` (H, W, 3) is uint8, optional. The arrays may be changed afterwards.
+                uint16 with ``camera.depth_scale`` units per metre (default 1000), 0 = no measurement. ``timestamp`` is
+                in seconds. ``rgb`` (H, W, 3) is uint8, optional. The arrays may be changed afterwards.
 
         Raises:
             ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
@@ -205,7 +204,7 @@ class Slam(SlamResults, Stateful):
     # -- steps of process ---------------------------------------------------------------------------------------------
 
     def _processed(self, view: FrameView) -> FrameResult:
-        """``process`` for a prepared frame; the result shares memory with the state of the system."""
+        """``process`` for a prepared frame; the result shares memory with the state."""
         with view.timer("check"):
             arrival = self.stream.judge(view.observation)
             arrival = self.motion.verdict if arrival.accepted else arrival
@@ -261,14 +260,14 @@ class Slam(SlamResults, Stateful):
         )  # fmt: skip
 
     def _omitted(self, timestamp: float) -> Shed:
-        """Work that is omitted from this frame, see ``shed``."""
+        """Work that ``shed`` omits from this frame."""
         young = self.young_map.first is not None or self.predictor.image_motion.active
         followed = self._last is not None and self._last.status is Status.TRACKED and not self.predictor.mostly_dynamic
         labelled = self.detector.memory.is_recent(timestamp)
         return self.shed if followed and labelled and not young else min(self.shed, Shed.MOVERS)
 
     def _rectified(self, view: FrameView) -> FrameView:
-        """The frame rectified to the time of its middle row; unchanged with a global shutter or a camera at rest."""
+        """The frame rectified to the time of its middle row."""
         with view.timer("rectify"):
             observation = self.color_motion.rectified(view.observation)
             if observation is view.observation:
@@ -279,8 +278,8 @@ class Slam(SlamResults, Stateful):
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the frame before, or its depth.
 
-        It has the pose of the repeated frame, or with new colours the predicted pose, which is interpolated once the
-        next frame is tracked. Neither is used longer than predictions are valid.
+        It has the repeated pose, or with new colours the predicted pose until the next frame is tracked. Neither
+        outlasts the validity of predictions.
         """
         depth_only, time, drift = self.stream.repeats == "depth", view.timestamp, self.motion.drift(view.timestamp)
         images = "the depth image" if depth_only else "both images"
@@ -313,7 +312,7 @@ class Slam(SlamResults, Stateful):
         return view
 
     def _start_map(self, view: FrameView) -> FrameResult:
-        """Start a map with a single frame, at its given pose or in its camera frame."""
+        """Start a map with a frame, at its given pose or in its camera frame."""
         T_start = self.motion.start
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
@@ -337,7 +336,7 @@ class Slam(SlamResults, Stateful):
         )  # fmt: skip
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> Relocalization | None:
-        """Pose of a frame from keyframes after a failed registration; atlas and motion model follow it."""
+        """Pose of a frame from keyframes; atlas and motion model follow it."""
         self.monitor.lose()
         view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
@@ -366,7 +365,7 @@ class Slam(SlamResults, Stateful):
         return self._start_map(view)
 
     def _decide_start(self, view: FrameView, prediction: PosePrediction) -> bool:
-        """Register and fuse the first frames of a map again, if slow motion that is now visible contradicts the map."""
+        """Register and fuse the first frames of a map again, if visible slow motion contradicts the map."""
         if self.young_map.first is None:
             return False
         with view.timer("parallax"):
@@ -378,8 +377,7 @@ class Slam(SlamResults, Stateful):
         return bool(frames) and self._replay(frames, view.timer)
 
     def _replay(self, frames: list[StartFrame], timer: StageTimer) -> bool:
-        """Process the first frames of a map again, with the poses and moving pixels that are known now; returns whether
-        poses changed."""
+        """Process the first frames again with revised poses and moving pixels; returns whether poses changed."""
         first, replayed = frames[0], [frames[0]]
         corrections = [first.T_world_camera @ se3.inverse(first.estimate.T_world_camera)]
         for remembered in (self.detector, self.redundancy):
@@ -405,7 +403,7 @@ class Slam(SlamResults, Stateful):
         return len(frames) > 1
 
     def _forget_map(self) -> None:
-        """Reset the state learnt from the frames of a map that ends."""
+        """Reset the state learnt from the frames of a map."""
         self.color_calibration.interrupt()
         for remembered in (self.monitor, self.detector, self.predictor.image_motion, self.redundancy):
             remembered.reset()
@@ -418,7 +416,7 @@ class Slam(SlamResults, Stateful):
         self.predictor.update(view, estimate)
 
     def _fusion_verdict(self, view: FrameView, estimate: PoseEstimate) -> Verdict:
-        """Whether to fuse a tracked frame: its pose is certain, and its view is not redundant."""
+        """Whether the pose of a tracked frame is certain, and its view not redundant."""
         repeats, unused = self.stream.repeats == "color", "map without texture" if self.young_map.textureless else ""
         certain = Verdict((
             Outcome.of("color_repeats", repeats, 0, "the colour image equals the one before", overruled_by=unused),
@@ -434,7 +432,7 @@ class Slam(SlamResults, Stateful):
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Correction (4, 4) of the world by a loop closure; None if no loop was closed."""
+        """Correction of the world by a loop closure; None if none was closed."""
         if self.atlas.history is None or view.without_image or self.motion.is_given:
             return None
         with view.timer("loops"):
@@ -450,7 +448,7 @@ class Slam(SlamResults, Stateful):
     def _calibrate(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
     ) -> bool:
-        """Update the calibration of the colour camera; returns whether the next frame uses a new one."""
+        """Update the colour calibration; returns whether the next frame uses a new one."""
         calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
         if calibrated:  # earlier images have colours registered with another calibration
             self.predictor.image_motion.reset()

@@ -1,4 +1,4 @@
-"""Verdict of a gate: every check with its figure, its limit and the evidence that overruled it."""
+"""Verdict of a gate: every check with its figure, limit and overruling evidence."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ class Outcome(NamedTuple):
     """Outcome of one check.
 
     Attributes:
-        at_least: The limit is a lower bound instead of an upper bound.
-        overruled_by: Evidence that accepts a figure beyond its limit; empty if there is none.
+        at_least: The limit is a lower bound.
+        overruled_by: Evidence that accepts a figure beyond its limit; empty for none.
     """
 
     name: str
@@ -34,19 +34,19 @@ class Outcome(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the figure is within its limit, or evidence accepts it."""
+        """Whether the figure is within its limit or accepted by evidence."""
         return not self.reason or bool(self.overruled_by)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcomes of the checks of a gate, in order of application; the first failed one decides."""
+    """Outcomes of the checks of a gate, in order; the first failed one decides."""
 
     outcomes: tuple[Outcome, ...] = ()
 
     @classmethod
     def of(cls, outcomes: Iterable[Outcome]) -> "Verdict":
-        """Verdict of checks that are computed one by one, up to the first failed one."""
+        """Verdict of checks computed one by one, up to the first failed one."""
         done = list[Outcome]()
         for outcome in outcomes:
             done.append(outcome)
@@ -67,7 +67,7 @@ class Verdict:
         return any(outcome.name == name for outcome in self.failed)
 
     def figure(self, name: str) -> float:
-        """Figure of the check of this name; NaN if it is unknown."""
+        """Figure of the check of this name; NaN if unknown."""
         return next((outcome.figure for outcome in self.outcomes if outcome.name == name), np.nan)
 
     @property
@@ -77,7 +77,7 @@ class Verdict:
 
     @property
     def reason(self) -> str:
-        """Sentence of the first failed check; empty if all passed."""
+        """Reason of the first failed check; empty if all passed."""
         return self.failed[0].reason if self.failed else ""
 
 

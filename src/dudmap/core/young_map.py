@@ -1,8 +1,8 @@
 """The first frames of a map: their static world is decided when slow motion is visible.
 
-A single image shows no motion, so the first frame is fused as a whole. The next frames are fused without the motion
-that consecutive images show. After UNDECIDED seconds, ``YoungMap.decide`` compares them over longer times. If fused
-surface has moved, or if the poses followed a crowd, the frames are registered and fused again (``Slam._replay``).
+The first frame is fused as a whole, the next ones without the motion between consecutive images. After UNDECIDED
+seconds, ``YoungMap.decide`` compares them over longer times. If fused surface has moved, or the poses followed a crowd,
+the frames are registered and fused again (``Slam._replay``).
 """
 
 from dataclasses import dataclass, replace
@@ -28,14 +28,14 @@ from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 from dudmap.core.verdict import Outcome, Verdict
 
 SAME_POSE = 0.01, 0.25
-"""Poses nearer to each other than this (reference depths, deg) count as equal."""
+"""Nearer poses (reference depths, deg) count as equal."""
 UNDECIDED = 0.4, 0.8
-"""Times after which slow motion is visible, seconds: crowds at 0.2 and 0.1 m/s have moved by 10 pixels at 2 m (262 px
+"""Seconds after which slow motion is visible: crowds at 0.2 and 0.1 m/s have moved by 10 pixels at 2 m (262 px
 focal)."""
 FASTEST = 1.5
-"""Speed of people who walk, m/s."""
+"""Walking speed, m/s."""
 WINDOW, WINDOW_STEP = 30, 2
-"""Number of fused frames after which the poses of a new map are refined, and step between the refined frames."""
+"""Fused frames after which the poses of a map are refined, and step between refined frames."""
 MIN_READINGS = 0.02
 """Smallest share of pixels with static depth in a first frame."""
 
@@ -48,7 +48,7 @@ class StartFrame:
         view: The frame.
         estimate: Its provisional pose and labels.
         T_world_camera: (4, 4) pose by comparison of images; at first the provisional one.
-        moving: (h, w) bool, label resolution, pixels that move; None if unknown.
+        moving: (h, w) bool, label resolution, moving pixels; None if unknown.
         undecided: (h, w) bool, pixels not verified as static while most of the view moves; None for none.
     """
 
@@ -72,7 +72,7 @@ class StartFrame:
 
     @property
     def dynamic_mask(self) -> NDArray[np.bool_]:
-        """Pixels (H, W) that move or that the caller declares dynamic."""
+        """Pixels (H, W) that move or are declared dynamic."""
         mask, known = self._full_size(self.moving), self.view.known_dynamic
         return mask if known is None else mask | known
 
@@ -106,7 +106,7 @@ class FusedFrame:
 
     @classmethod
     def of(cls, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> "FusedFrame":
-        """The parts of a frame that the refinement needs."""
+        """The parts that the refinement needs."""
         observation, fine = view.colored(), view.pyramid.fine
         frame = Frame(observation.timestamp, observation.depth, observation.rgb)
         level = Level(fine.camera, fine.depth, fine.intensity)  # without the images it is made from
@@ -117,12 +117,12 @@ class YoungMap(Stateful):
     """The first frames of a map.
 
     Args:
-        refines: Whether the first frames are kept for a second registration.
-        decides: Whether the first frames are kept until their static world is decided.
+        refines: Whether frames are kept for a second registration.
+        decides: Whether frames are kept until their static world is decided.
         reference_depth: Reference depth of the sensor, metres.
 
     Attributes:
-        textureless: Whether the image of the first frame carries no information; later ones are then not called blind.
+        textureless: Whether the first image carries no information; later ones are then not called blind.
     """
 
     textureless: Remembered[bool] = False
@@ -156,7 +156,7 @@ class YoungMap(Stateful):
         self.restart_window()
 
     def restart_window(self) -> None:
-        """Forget the frames for the second registration, because the map is built again."""
+        """Forget the frames for the second registration."""
         self._window, self._num_fused, self._collects = [], 0, self._refines
 
     @property
@@ -180,7 +180,7 @@ class YoungMap(Stateful):
         self._num_fused += 1
 
     def complete_window(self) -> list[FusedFrame]:
-        """Every ``WINDOW_STEP``-th fused frame, in order of time, after ``WINDOW`` fused frames, and forget them; empty
+        """Every ``WINDOW_STEP``-th fused frame in order, after ``WINDOW`` fused frames, and forget them; empty
         before."""
         if self._num_fused < WINDOW or not self._window:
             return []
@@ -188,25 +188,23 @@ class YoungMap(Stateful):
         return window
 
     def replace_frames(self, frames: list[StartFrame]) -> None:
-        """Keep frames that were registered again, unless the static world is decided."""
+        """Keep re-registered frames, unless the static world is decided."""
         if self._frames:
             self._frames = frames[::2] if self._slow else frames
 
     def decide(self, now: TrackedImage) -> list[StartFrame]:
         """Decide the static world of the first frames: fast motion with the second frame, slow motion after UNDECIDED.
 
-        Backwards in time, hop by hop:
-
-        1. Find a reference, the oldest frame with a sure comparison (``_reference``).
-        2. Compare the frames after it, without the pixels that move between reference and present image.
-        3. Continue from the reference to older frames.
+        Backwards in time, hop by hop: find a reference, the oldest frame with a sure comparison (``_reference``);
+        compare the frames after it, without the pixels that move between reference and present image; continue from the
+        reference.
 
         Args:
             now: The present image at its predicted pose, with its known moving pixels.
 
         Returns:
-            The compared frames in order of time, with poses relative to the oldest one, if a pose or a mask contradicts
-            the map. Empty otherwise.
+            The compared frames in order of time, relative to the oldest one, if a pose or a mask contradicts the map.
+            Empty otherwise.
         """
         frames = self._frames
         if len(frames) > 1 and now.timestamp < frames[0].view.timestamp + UNDECIDED[self._decisions]:
@@ -242,10 +240,10 @@ class YoungMap(Stateful):
         return self._revised([(before, after) for before, after in pairs if after is not None])
 
     def _reference(self, now: TrackedImage, frames: list[StartFrame]) -> tuple[int, DominantMotion] | None:
-        """Number of the frame that an image is compared with, and its motion; None if no comparison is sure.
+        """Number of the frame to compare with, and its motion; None if no comparison is sure.
 
-        A comparison is sure if the static world has most of the surface, and more corners than chance. The reference is
-        the oldest sure one that most of the surface shares (AGREED), or that contradicts the map; else the oldest one.
+        A sure comparison has most of the surface, and more corners than chance. The reference is the oldest sure one
+        that most of the surface shares (AGREED), or that contradicts the map; else the oldest one.
         """
         sure = None
         for number, frame in enumerate(frames):
@@ -270,7 +268,7 @@ class YoungMap(Stateful):
     def _compared(self, now: TrackedImage, frame: StartFrame) -> StartFrame | None:
         """An older frame as its comparison with an image shows it; None if unknown.
 
-        In a crowd that was too slow for consecutive images, pixels that are not verified as static are undecided.
+        In a crowd that was too slow for consecutive images, pixels not verified as static are undecided.
         """
         motion = self._motion(now, frame, doubtful=False)
         if motion is None:
@@ -280,7 +278,7 @@ class YoungMap(Stateful):
         return replace(frame, T_world_camera=T, moving=propagate_to_segments(motion.after), undecided=undecided)
 
     def _contradicts(self, motion: DominantMotion, now: TrackedImage, older: StartFrame) -> bool:
-        """Whether a comparison contradicts the map: by the poses, or by fused surface that moves."""
+        """Whether the poses, or moving fused surface, contradict the map."""
         T = now.T_world_camera @ se3.inverse(motion.T_after_before)
         moving = propagate_to_segments(motion.after)
         hidden = moving if older.moving is None else moving & ~older.moving
@@ -290,7 +288,7 @@ class YoungMap(Stateful):
     def _revised(self, compared: list[tuple[StartFrame, StartFrame]]) -> list[StartFrame]:
         """Compared frames in the world of the oldest one, with their earlier moving pixels if their poses agree.
 
-        ``compared``: pairs of provisional and compared frame, in order of time.
+        ``compared``: provisional and compared frames, in order of time.
         """
         if not compared:
             return []
@@ -305,15 +303,13 @@ class YoungMap(Stateful):
         return out if _drags_smoothly(out) else []
 
     def abandon(self) -> None:
-        """Forget the frames, because the camera is tracked in another map."""
+        """Forget the frames."""
         self._frames, self._window, self._collects = [], [], False
 
 
 def _drags_smoothly(frames: list[StartFrame]) -> bool:
-    """Whether people can have dragged the camera away from the revised poses: at most at the speed FASTEST.
-
-    A wrong reference moves all frames of its hop at once, so that the first third of the frames would be too fast.
-    """
+    """Whether people can have dragged the camera away from the revised poses, at most at FASTEST. A wrong reference
+    moves its whole hop at once."""
     if len(frames) == 1:
         return True
     moved = [f.T_world_camera[:3, 3] - f.estimate.T_world_camera[:3, 3] for f in frames[1:]]
