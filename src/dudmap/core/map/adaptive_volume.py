@@ -1,8 +1,8 @@
 """Map with several voxel sizes (thesis section 7.1).
 
-The blocks of ``TsdfVolume`` cover everything observed, and alone hold free space, carving and the band far from the
-surface. Finer blocks, with a half and a quarter of the voxel size, refine them near detail (``refinement.py``). An
-observed finer voxel replaces the coarser one.
+The blocks of ``TsdfVolume`` cover everything observed and alone hold free space. Finer blocks, with a half and a
+quarter of the voxel size, refine them near detail (``refinement.py``). An observed finer voxel replaces the coarser
+one.
 """
 
 import numpy as np
@@ -30,15 +30,15 @@ def make_volume(
     backend: Backend | None = None,
     max_blocks: int | MemoryLimit | None = None,
 ) -> TsdfVolume:
-    """An empty map with one voxel size, or several with ``volume.adaptive``; arguments as of ``TsdfVolume``."""
+    """An empty map, with several voxel sizes if ``volume.adaptive``; arguments of ``TsdfVolume``."""
     return TsdfVolume.kinds[config.adaptive](camera, config, sensor, depth_max, backend, max_blocks)
 
 
 class AdaptiveVolume(TsdfVolume):
     """A map with smaller voxels at surface detail (curvature or texture) that the sensor resolves.
 
-    Registration and labels read the coarsest level: several voxel sizes change no pose and no mask. Mesh and views read
-    the finest level (``docs/ranges.md``). ``levels`` are the finer levels, larger voxels first.
+    Registration and labels read the coarsest level, so that poses and masks do not change. Mesh and views read the
+    finest level (``docs/ranges.md``). ``levels``: finer levels, larger voxels first.
     """
 
     def _empty(self) -> None:
@@ -50,7 +50,7 @@ class AdaptiveVolume(TsdfVolume):
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: coarsest level and finer levels."""
+        """Memory of all levels."""
         finer = 0
         for parents, level in zip(self._coarser, self.levels, strict=True):
             links = parents.num_slots * 8 * 4 + level.blocks.num_slots * (4 + 1)  # children; parent and calm
@@ -62,7 +62,7 @@ class AdaptiveVolume(TsdfVolume):
         return self.all_blocks.parents
 
     def _parameters_of(self, n: int) -> FusionParameters:
-        """Parameters of a level, 0 = coarsest; all levels store distances in its steps."""
+        """Parameters of a level, 0 = coarsest; distances have its steps."""
         if n == 0:
             return self.parameters
         finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
@@ -93,7 +93,7 @@ class AdaptiveVolume(TsdfVolume):
     def _average_finer(
         self, n: int, view: DepthView, touched: TouchedBlocks, candidates: NDArray[np.int32], count: int
     ) -> NDArray[np.int32]:
-        """Fuse an image into candidate blocks of a finer level, drop the empty ones; returns the slots (m,)."""
+        """Fuse an image into candidate blocks of a finer level, drop empty ones; returns the slots."""
         if len(candidates) == 0:
             return candidates
         level, number = self.levels[n], self._frame_number
@@ -117,7 +117,7 @@ class AdaptiveVolume(TsdfVolume):
         self.blocks.written[slots] = self._frame_number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
-        """See ``PagedMap``; blocks without finer ones in the other map take its interpolated colours."""
+        """See ``PagedMap``; blocks without finer ones in the other map take interpolated colours."""
         assert isinstance(other, AdaptiveVolume)
         if level == 0:
             super()._take_level_colors(level, slots, other, number)
@@ -134,7 +134,7 @@ class AdaptiveVolume(TsdfVolume):
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
     ) -> list[Mesh]:
-        """See ``TsdfVolume.extract_chunks``; ``slots`` are slots of the coarsest level."""
+        """See ``TsdfVolume.extract_chunks``; ``slots`` are of the coarsest level."""
         return level_meshes(self.blocks, self.levels, slots, chunks, self._mesh_parameters(min_weight))
 
 

@@ -1,5 +1,4 @@
-"""Paging of regions of 16x16x16 blocks far from the view to a store on disk, and back (Niessner et al. 2013, section
-5)."""
+"""Paging of regions of 16x16x16 blocks to disk and back (Niessner et al. 2013, section 5)."""
 
 from collections.abc import Callable
 from itertools import product
@@ -20,7 +19,7 @@ REGION_BITS = 4
 REGION = 1 << REGION_BITS
 """Blocks along the edge of a region, and its base-2 logarithm."""
 MARGIN = 4
-"""Blocks around the view that stay in memory: the neighbours of a changed chunk."""
+"""Blocks around the view that stay in memory."""
 ROOM = 0.85
 """Share of the allowed blocks that remains after paging out."""
 RETRY_AFTER = 100
@@ -29,8 +28,7 @@ Region = tuple[int, int, int]
 
 
 class Away(NamedTuple):
-    """A region in the store: serial number of its content, and numbers of its blocks, of blocks with voxels, and of
-    finer blocks."""
+    """A region in the store: serial number, and numbers of blocks, of blocks with voxels, and of finer blocks."""
 
     serial: int
     blocks: int
@@ -39,16 +37,12 @@ class Away(NamedTuple):
 
 
 class BlockPager(Stateful):
-    """Moves regions of a map between memory and a store on disk.
-
-    A region is in one of both, so that the content of the map does not depend on paging. Writing or reading a region
-    takes a few milliseconds.
+    """Moves regions of a map between memory and disk, without a change of content. A region takes a few milliseconds.
 
     Attributes:
-        max_blocks: Largest number of blocks with voxels in memory, of all levels, or a limit that is evaluated each
-            time. Blocks in view stay in memory even beyond it.
-        failure: Why the last write to the store failed; empty on success. After a failure the regions stay in memory,
-            and no data is lost.
+        max_blocks: Largest number of blocks with voxels in memory, of all levels, or a limit evaluated each time.
+            Blocks in view stay.
+        failure: Why the last write failed; empty on success. The regions then stay in memory.
     """
 
     failure: Remembered[str] = ""
@@ -78,7 +72,7 @@ class BlockPager(Stateful):
         return sum(away.voxel_blocks for away in self._away.values())
 
     def is_away(self, coords: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Whether the region of each block (n, 3) is in the store."""
+        """Whether the region of each block (n, 3) is on disk."""
         if not self._away:
             return np.zeros(len(coords), dtype=bool)
         regions, which = np.unique(np.asarray(coords) >> REGION_BITS, axis=0, return_inverse=True)
@@ -86,11 +80,11 @@ class BlockPager(Stateful):
         return away[which.reshape(-1)]
 
     def away(self) -> dict[Region, Away]:
-        """The regions in the store."""
+        """The regions on disk."""
         return self._away
 
     def records(self, region: Region) -> BlockRecords:
-        """Content of a region in the store.
+        """Content of a region on disk.
 
         Raises:
             MapError: It cannot be read.
@@ -101,16 +95,16 @@ class BlockPager(Stateful):
         return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
 
     def continue_from(self, archive: Callable[[Region], BlockRecords]) -> None:
-        """Read the regions that are away from an archive until they return to memory."""
+        """Read regions from an archive until they return to memory."""
         self._archived, self._archive = set(self._away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
-        """Mark the region that begins at a block (3,) as changed by something other than a frame."""
+        """Mark the region that begins at a block (3,) as changed other than by a frame."""
         self._returned.pop(_key(first >> REGION_BITS), None)
 
     def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
-        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` around it. If too many are in
-        memory, the farthest regions leave, and the entries are renumbered."""
+        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` around it. The farthest regions leave
+        if there are too many; entries are then renumbered."""
         first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
         last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
         wanted = self._stored_in(first, last) if self._away else []
@@ -136,7 +130,7 @@ class BlockPager(Stateful):
     def _make_room(
         self, tree: BlockTree, first: NDArray[np.integer], last: NDArray[np.integer], number: int, coming: list[Region]
     ) -> None:
-        """Store the regions farthest from the box until the blocks, with the incoming ones, fit."""
+        """Store the farthest regions until the blocks, with the incoming ones, fit."""
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(tree)
         needed = tree.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
@@ -156,10 +150,7 @@ class BlockPager(Stateful):
             tree.remove(np.flatnonzero(leaving[region_of]), number + 1)
 
     def page_out(self, tree: BlockTree, frame_number: int) -> bool:
-        """Move all regions to the store and return whether that succeeded.
-
-        The caller then replaces the blocks of ``tree`` by empty ones.
-        """
+        """Move all regions to disk and return whether that succeeded. The caller then empties ``tree``."""
         keys, region_of = _regions_of_entries(tree)
         return self._send_away(tree, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
 
@@ -171,8 +162,8 @@ class BlockPager(Stateful):
         leaving: NDArray[np.bool_],
         frame_number: int,
     ) -> bool:
-        """Write the leaving regions (r, 3); returns success, after a failure none has left. ``region_of`` (n,) is
-        the region of each entry, which the caller removes."""
+        """Write the leaving regions; after a failure none has left. ``region_of``: region of each entry, which the
+        caller removes."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))
@@ -204,7 +195,7 @@ class BlockPager(Stateful):
 
 
 def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:
-    """All regions of a map in Morton order, so that consecutive regions are close."""
+    """All regions of a map in Morton order."""
     near, _ = _regions_of_entries(tree)
     stored = np.array(list(() if pager is None else pager.away()), np.int64).reshape(-1, 3)
     regions = np.unique(np.concatenate([near, stored]), axis=0)
@@ -212,7 +203,7 @@ def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:
 
 
 def _regions_of_entries(tree: BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
+    """Regions with blocks in memory, and the region number of each entry."""
     x, y, z = (tree.blocks.coords[: tree.blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
     parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]

@@ -11,24 +11,24 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.errors import MapError
 
 MARGIN = 3
-"""Blocks that the view may move before the window follows; the window has this margin on each side."""
+"""Blocks that the view may move before the window follows."""
 
 LOCAL_GRID = 4096
-"""Spacing of the local origins, blocks: with blocks of 8 cm at most 164 m away, where float32 resolves 15
+"""Spacing of the local origins, blocks: at most 164 m away with blocks of 8 cm, so that float32 resolves 15
 micrometres."""
 
 
 class BlockWindow(Stateful):
-    """Dense copy of the hash table around the view; the hash table stays the authoritative index.
+    """Dense copy of the hash table around the view.
 
     Attributes:
-        block_size: Edge of a block, metres.
+        block_size: Metres.
         shape: (3,) int64, blocks along each axis, at least the requested ``cells``.
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
         mirror: ``cells`` for back ends, which may hold a copy on a device.
-        stamps: Shape of ``cells``, number of the last frame whose truncation band touched the block.
+        stamps: Shape of ``cells``, last frame whose truncation band touched the block.
         near: (n,) int32, slots inside the window.
-        origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
+        origin: (3,) int64 first block; None before the first ``fill``.
     """
 
     near: Remembered[NDArray[np.int32]]
@@ -45,7 +45,7 @@ class BlockWindow(Stateful):
 
     def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
         """Origin (3,) of a window centred on a point (3,), metres; None while the centre moves by at most ``MARGIN``
-        blocks. A window emptied by paging then returns to its old origin ``left`` (3,)."""
+        blocks. After paging out, the window returns to its old origin ``left`` (3,)."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         last = self.origin if left is None else left
         if last is None:
@@ -65,7 +65,7 @@ class BlockWindow(Stateful):
         self.mirror.wrote()
 
     def refill(self, blocks: VoxelBlocks) -> None:
-        """Place a stored window at its old origin, and keep the order of its slots, in which they are fused.
+        """Place a stored window at its old origin, keeping the order of its slots.
 
         Raises:
             ValueError: It was not a window of these blocks.
@@ -80,12 +80,12 @@ class BlockWindow(Stateful):
 
     @property
     def local_origin(self) -> NDArray[np.int64]:
-        """Blocks (3,) from the origin of the map to the local origin nearest to the window."""
+        """Blocks (3,) from the map origin to the local origin nearest to the window."""
         assert self.origin is not None
         return LOCAL_GRID * np.rint((self.origin + self.shape // 2) / LOCAL_GRID).astype(np.int64)
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
+        """Camera to the window's lattice (3, 4) float32: voxels, origin at its first voxel."""
         assert self.origin is not None
         return to_lattice(T_world_camera, self.block_size / BLOCK, self.origin)
 
@@ -119,10 +119,10 @@ class BlockWindow(Stateful):
         self.mirror.wrote(cells)
 
     def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
-        """Entries (n,) of cells (n,), new ones for cells without an entry.
+        """Entries (n,) of cells (n,), new ones where missing.
 
         Raises:
-            MapError: A cell lies too far from the origin of the map.
+            MapError: A cell lies too far from the map origin.
         """
         assert self.origin is not None
         coords, (_, size_y, size_z) = np.empty((len(cells), 3), np.int64), self.shape

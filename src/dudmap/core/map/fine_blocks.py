@@ -1,4 +1,4 @@
-"""Blocks with half the voxel size inside blocks of the next coarser level, and the tree of all levels."""
+"""Blocks with half the voxel size inside blocks of the next coarser level."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,19 +17,19 @@ from dudmap.errors import MapError
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
-"""Offset (8, 3) of each child in its parent, in units of the child's size; number 4 dx + 2 dy + dz."""
+"""Offset (8, 3) of each child in its parent, in child sizes; number 4 dx + 2 dy + dz."""
 
 
 class FineBlocks(Stateful):
-    """One level of refinement. A block covers one octant of its parent in the next coarser level.
+    """One level of refinement. A block covers one octant of its parent.
 
     Attributes:
-        voxel_size: Edge of a voxel of this level, metres.
-        blocks: Blocks of this level; their coordinates are in units of their own size.
-        children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
-        parents: (slots,) int32 slot of the parent of each block.
+        voxel_size: Metres.
+        blocks: Blocks; coordinates in units of their own size.
+        children: (slots of the parents, 8) int32 slot of the child in each octant, -1 = none.
+        parents: (slots,) int32 slot of the parent.
         calm: (slots,) uint8 successive evaluations in which a block was not needed.
-        voxels: Geometry and colours of all blocks, stored whole because they are few.
+        voxels: Geometry and colours of all blocks, stored whole.
     """
 
     blocks: Remembered[VoxelBlocks]
@@ -49,7 +49,7 @@ class FineBlocks(Stateful):
         return {"blocks": blocks, "calm": self.calm[:m], "voxels": (blocks.geometry[:m], blocks.colors[:m])}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore a stored level; the caller then links it (``link``)."""
+        """Restore a stored level, to be linked (``link``)."""
         blocks, (geometry, colors) = self.blocks, state["voxels"]
         if not len(state["calm"]) == len(geometry) == len(colors) == blocks.num_slots:
             raise ValueError("the arrays of the finer blocks have different lengths")
@@ -57,7 +57,7 @@ class FineBlocks(Stateful):
         self.calm = grown(state["calm"], len(blocks.entry_of), 0)
 
     def make_room(self, parents: VoxelBlocks) -> None:
-        """Grow the link arrays to the slots of the parents and of this level."""
+        """Grow the link arrays to the slots of parents and level."""
         if len(self.children) < len(parents.entry_of):
             self.children = grown(self.children, len(parents.entry_of), -1)
         if len(self.parents) < len(self.blocks.entry_of):
@@ -67,8 +67,7 @@ class FineBlocks(Stateful):
     def open(
         self, parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64], frame_number: int
     ) -> NDArray[np.int32]:
-        """Create empty blocks in octants (n,) of parents in slots (n,) without a child there; returns their slots
-        (n,) int32."""
+        """Create empty blocks in free octants (n,) of parents in slots (n,); returns their slots (n,) int32."""
         coords = (2 * parents.slot_coords[slots] + OCTANTS[octants]).astype(np.int32)
         entries = self.blocks.entries_at(coords, len(coords))
         new = self.blocks.allocate(entries, frame_number)
@@ -78,7 +77,7 @@ class FineBlocks(Stateful):
         return new
 
     def drop(self, slots: NDArray[np.int32]) -> None:
-        """Remove blocks (n,) and all finer blocks inside them."""
+        """Remove blocks (n,) and all finer ones inside."""
         if len(slots) == 0:
             return
         if self._finer is not None:
@@ -89,7 +88,7 @@ class FineBlocks(Stateful):
         self.parents[slots] = -1
 
     def records(self, slots: NDArray[np.int32]) -> BlockRecords:
-        """Copies of blocks (n,); field ``free_count`` holds ``calm``."""
+        """Copies of blocks (n,); ``free_count`` holds ``calm``."""
         owners = np.arange(len(slots), dtype=np.int32)
         voxels = self.blocks.geometry[slots], self.blocks.colors[slots], self.blocks.fused[slots]
         return BlockRecords(self.blocks.slot_coords[slots], self.calm[slots], owners, *voxels)
@@ -112,8 +111,8 @@ class FineBlocks(Stateful):
     def take_colors(
         self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
     ) -> None:
-        """Give blocks (n,) the colours and intensities of this level of another map. Missing ones take the
-        ``interpolated`` voxels and colours (n, 512) of its coarser level."""
+        """Give blocks (n,) colours and intensities of this level of another map; missing ones take the ``interpolated``
+        voxels and colours (n, 512)."""
         blocks, (voxels, colors) = self.blocks, interpolated
         there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
         painted = (there[:, None] >= 0) & (other.blocks.colors[there] != 0)
@@ -122,19 +121,17 @@ class FineBlocks(Stateful):
         blocks.write(slots, (blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
 
     def octants_of(self, slots: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Octant (n,) of the parent that each of these blocks (n,) covers."""
+        """Octant (n,) of the parent that each block (n,) covers."""
         low = (self.blocks.slot_coords[slots] & 1).astype(np.int64)
         return 4 * low[:, 0] + 2 * low[:, 1] + low[:, 2]
 
     def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all children of the parents in slots (m,), in the parents' order."""
+        """Slots (n,) int32 of all children of parents in slots (m,), in the parents' order."""
         found = self.children[slots[slots < len(self.children)]].ravel()  # slots beyond the array have no children yet
         return found[found >= 0]
 
     def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
-        """Rebuild the parent links of all blocks from coordinates; returns whether each active slot (n,) has a
-        parent.
-        """
+        """Rebuild the parent links from coordinates; returns whether each active slot (n,) has a parent."""
         self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = grown(self.calm[: len(self.parents)], len(self.parents), 0)
@@ -146,7 +143,7 @@ class FineBlocks(Stateful):
         return known
 
     def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
-        """The voxels for ``Backend.fuse``, with coordinates relative to ``origin`` (3,), in blocks of this level."""
+        """The voxels for ``Backend.fuse``, relative to ``origin`` (3,), in blocks of this level."""
         coords = self.blocks.slot_coords
         coords = coords if not origin.any() else (coords - origin).astype(coords.dtype)
         nothing = np.empty(0, dtype=np.int32)
@@ -157,8 +154,8 @@ class FineBlocks(Stateful):
 
 
 class BlockTree:
-    """Blocks of the coarsest level, the entries, with all finer blocks inside them, for ``BlockPager``. Slots and
-    memory count all levels, larger voxels first."""
+    """Blocks of the coarsest level, the entries, with all finer blocks inside. Slots and memory count all levels,
+    larger voxels first."""
 
     def __init__(self, blocks: VoxelBlocks, levels: Sequence[FineBlocks]) -> None:
         self.blocks, self.levels = blocks, levels
@@ -179,7 +176,7 @@ class BlockTree:
         return self.blocks.num_voxel_blocks + sum(level.blocks.num_voxel_blocks for level in self.levels)
 
     def owned_slots(self) -> NDArray[np.int64]:
-        """Number (entries,) of slots of each entry and of all blocks inside it."""
+        """Slots (entries,) of each entry and all blocks inside."""
         finest = self.levels[-1].blocks if self.levels else self.blocks
         inside = np.zeros(len(finest.entry_of), np.int64)
         for level, parents in zip(self.levels[::-1], self.parents[::-1], strict=True):
@@ -189,7 +186,7 @@ class BlockTree:
         return np.where(slots >= 0, 1 + inside[slots].astype(np.int64), 0)
 
     def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
-        """Copies of the blocks of entries (n,), see ``VoxelBlocks.records``, and of all blocks inside them."""
+        """Copies of entries (n,) and all blocks inside, see ``VoxelBlocks.records``."""
         out, finer = self.blocks.records(entries, by_slot=by_slot), []
         slots = self.blocks.slot_of[entries[out.owners]]
         for level in self.levels:
@@ -198,7 +195,7 @@ class BlockTree:
         return replace(out, finer=tuple(finer))
 
     def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
-        """Remove entries (n,), their voxels and all blocks inside them; see ``VoxelBlocks.remove``."""
+        """Remove entries (n,), their voxels and all blocks inside; see ``VoxelBlocks.remove``."""
         slots = self.blocks.slot_of[entries]
         slots, leaving = slots[slots >= 0], []
         for level in self.levels:
@@ -217,7 +214,7 @@ class BlockTree:
             level.make_room(parents)
 
     def restore(self, finer: Sequence[VoxelBlocks]) -> None:
-        """Fill the finer levels with read blocks, level by level.
+        """Fill the finer levels with read blocks.
 
         Raises:
             MapError: The blocks do not fit the levels or each other.
@@ -236,7 +233,7 @@ class BlockTree:
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
-    """The finer levels of a map (at most two) in the form that ray casting reads."""
+    """The finer levels (at most two) in the form that ray casting reads."""
     if not levels:
         return FinerLevels()
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))

@@ -1,4 +1,4 @@
-"""Copy of a growing map that another thread may read, and a mesh whose changed parts alone are extracted again."""
+"""Copy of a growing map for another thread, and a mesh of which only changed parts are extracted again."""
 
 import copy
 
@@ -11,13 +11,13 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks, grown
 
 GROWTH = 4
-"""Capacity as a multiple of the volume's: spare capacity is only address space."""
+"""Capacity in the volume's capacities; spare capacity is only address space."""
 
 
 class VolumeMirror:
-    """Copy of a volume, updated by copying only the blocks written since the last copy.
+    """Copy of a volume, updated by the blocks written since the last copy.
 
-    ``update`` runs in the thread that changes the volume. Between two updates any thread may read the copy ``volume``,
+    ``update`` runs in the thread that changes the volume. Between updates any thread may read the copy ``volume``,
     whose frames count the updates.
     """
 
@@ -34,8 +34,8 @@ class VolumeMirror:
         self._copied = [np.zeros(0, dtype=np.int32) for _ in range(levels)]  # frame up to which each slot was copied
 
     def update(self, limit: int | None = None) -> None:
-        """Copy at most ``limit`` blocks of the coarsest level written since the last update, the least recently
-        copied first; None copies all."""
+        """Copy at most ``limit`` blocks of the coarsest level written since the last update, the least recently copied
+        first; None copies all."""
         if self._source.map_id != self.volume.map_id:  # the map was cleared
             self._start()
         source, target = self._source.blocks, self.volume.blocks
@@ -74,14 +74,13 @@ Chunk = tuple[int, int, int]
 
 
 class IncrementalMesh:
-    """Mesh of a volume, kept up to date for a live view while the map grows.
+    """Mesh of a growing volume for a live view.
 
-    An update extracts the chunks of 4x4x4 blocks that contain or touch a block written since the last update. Its time
-    grows with the view, not with the map. All chunks together are the surface of ``TsdfVolume.extract_mesh``, with
-    duplicate vertices between chunks. Updates and ``integrate`` must not run at the same time.
+    An update extracts the chunks of 4x4x4 blocks that touch a block written since the last update; its time grows with
+    the view, not with the map. The chunks equal ``TsdfVolume.extract_mesh`` with duplicate vertices between them. Not
+    during ``integrate``.
 
-    ``chunks`` are the meshes of all chunks with a surface, by chunk coordinates. Chunk (i, j, k) begins at block (4 i,
-    4 j, 4 k).
+    ``chunks``: meshes by chunk coordinates; chunk (i, j, k) begins at block (4 i, 4 j, 4 k).
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
@@ -94,8 +93,8 @@ class IncrementalMesh:
         self._reach = 2 if volume.levels else 1
 
     def update(self) -> list[Chunk]:
-        """Extract the changed chunks, and return the coordinates of all that may have changed; those not in
-        ``chunks`` have no surface any more."""
+        """Extract the changed chunks, and return the coordinates of all that may have changed; missing in ``chunks`` =
+        no surface any more."""
         removed: list[Chunk] = []
         if self._volume.map_id != self._map_id:  # the map was cleared: its frame numbers restart
             removed = list(self.chunks)
@@ -152,7 +151,7 @@ def _corners(low: int, high: int) -> NDArray[np.int32]:
 
 
 def _touched(blocks: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
-    """Unique chunks (m, 3) that hold a voxel within ``reach`` blocks of these blocks (n, 3)."""
+    """Unique chunks that hold a voxel within ``reach`` blocks of these blocks."""
     chunks = ((blocks[:, None] + _corners(-reach, reach)) // EDGE).reshape(-1, 3).astype(np.int64)
     packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
     unique = np.unique(packed)

@@ -1,8 +1,8 @@
-"""Mesh of a map with several voxel sizes: marching cubes level by level, on one field shared by all levels.
+"""Mesh of a map with several voxel sizes: marching cubes level by level, on one field.
 
-A lattice point has the value of the smallest voxel observed there. At the border of a level its voxels take the linear
-interpolation of the next coarser level. Both surfaces then share their points on the edges of the larger cells.
-Inside the faces of these cells they differ by the curvature of the field.
+A lattice point has the value of the smallest voxel observed there. At the border of a level its voxels interpolate the
+coarser level, so that both surfaces share their points on the edges of the larger cells; inside their faces they differ
+by the curvature of the field.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def level_meshes(
     groups: NDArray[np.integer],
     parameters: MeshParameters,
 ) -> list[Mesh]:
-    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters`` are for the coarsest level."""
+    """Meshes of groups of blocks, see ``TsdfVolume.extract_chunks``; ``parameters``: of the coarsest level."""
     least = max(int(parameters.min_weight), 1)
     contents, links = [_trusted(blocks, slots, least)], []
     for level in levels:
@@ -65,7 +65,7 @@ def level_meshes(
 
 
 def _trusted(blocks: VoxelBlocks, slots: NDArray[np.int32], least: int) -> BlockRecords:
-    """Copies of blocks (n,); voxels observed fewer than ``least`` times are 0."""
+    """Copies of blocks; voxels observed fewer than ``least`` times are 0."""
     words = blocks.geometry[slots]
     words[(words >> 8) & 0xFF < least] = 0
     return _records(blocks.slot_coords[slots], words, blocks.colors[slots])
@@ -78,7 +78,7 @@ def _records(coords: NDArray[np.int32], geometry: NDArray[np.int32], colors: NDA
 
 
 def _of_level(blocks: VoxelBlocks, content: BlockRecords) -> VoxelBlocks:
-    """Fill empty blocks with one level; the slots are the row numbers of the records."""
+    """Fill empty blocks with one level; slots are row numbers."""
     blocks.insert(content, 0)
     return blocks
 
@@ -93,7 +93,7 @@ def _take_over(coarse: BlockRecords, fine: BlockRecords, rows: NDArray[np.intp],
 
 
 def _filled(fine: VoxelBlocks, coarse: VoxelBlocks) -> VoxelBlocks:
-    """Blocks of a level and their neighbours; unobserved voxels and open sides are filled from the coarser level."""
+    """Blocks of a level and their neighbours; gaps and open sides are filled from the coarser level."""
     count = fine.num_slots
     coords = fine.slot_coords[:count]
     observed = (fine.geometry[:count] != 0).reshape(SHAPE)

@@ -1,4 +1,4 @@
-"""Map file: a NumPy archive written in parts, so that the map need not be in memory as a whole."""
+"""Map file: a NumPy archive written in parts, so that the map need not be in memory."""
 
 import json
 import zipfile
@@ -20,11 +20,11 @@ from dudmap.input_files import DAMAGE, open_arrays
 FORMAT = "dudmap map 1"
 VOXELS = "geometry", "colors"
 LARGEST_DEPTH = 1000.0
-"""Largest depth range of a map file, metres: the steps of a ray cast grow with it."""
+"""Depth range of a map file, metres: the steps of a ray cast grow with it."""
 
 
 class MapParameters(NamedTuple):
-    """Arguments of a map: camera, configuration, sensor, and largest depth in metres."""
+    """Camera, configuration, sensor, and largest depth in metres."""
 
     camera: Camera
     config: VolumeConfig
@@ -53,8 +53,8 @@ def write_map(
     Args:
         path: The file.
         parameters: Arguments of the map.
-        num_frames: Number of its integrated frames.
-        num_levels: Number of its levels of smaller voxels.
+        num_frames: Integrated frames.
+        num_levels: Levels of smaller voxels.
         records: Gives all blocks in parts, the same at each call.
 
     Raises:
@@ -104,7 +104,7 @@ def write_map(
 def _write_array(
     archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: tuple[int, ...], parts: Iterator[NDArray]
 ) -> None:
-    """Add an array that comes in parts along its first axis, in the form of ``numpy.savez_compressed``."""
+    """Add an array that comes in parts along its first axis, as ``numpy.savez_compressed``."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(member, header)
@@ -147,11 +147,7 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> MapParamet
 
 
 def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:
-    """Blocks with smaller voxels, level by level.
-
-    Raises:
-        ValueError: Their arrays do not fit each other.
-    """
+    """Blocks with smaller voxels, level by level."""
     levels, names = [], set(data)
     while f"slot_coords{len(levels) + 1}" in names:
         number = len(levels) + 1

@@ -1,4 +1,4 @@
-"""Number of map blocks that fit into the memory limit of the process."""
+"""Map blocks that fit into the memory limit of the process."""
 
 import ctypes
 import sys
@@ -9,17 +9,15 @@ from dudmap.core.map.fine_blocks import BlockTree
 from dudmap.errors import ConfigError
 
 SAFE_SHARE = 0.75
-"""Share of the limit that maps may use; temporary data, such as the mesh of a region, fits into the rest."""
+"""Share of the limit for maps; temporary data, such as meshes, take the rest."""
 LEAST = 400_000_000
-"""Memory to leave for the kernels, the frames and the part of the map in view, bytes."""
+"""Bytes for kernels, frames and the map in view."""
 _STATM = Path("/proc/self/statm")
 
 
 @dataclass(frozen=True)
 class MemoryLimit:
-    """Memory limit of the process, shared by all its maps.
-
-    The maps may use the rest of ``limit`` bytes of resident memory, measured each time. Paging changes no result.
+    """Memory limit of the process, shared by all its maps: ``limit`` bytes of resident memory, measured each time.
 
     Raises:
         ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.
@@ -36,7 +34,7 @@ class MemoryLimit:
             )
 
     def __call__(self, tree: BlockTree) -> int:
-        """Largest number of blocks with voxels, of all levels, that a map may have in memory now."""
+        """Blocks with voxels, of all levels, that a map may have in memory now."""
         spare = SAFE_SHARE * self.limit - resident_bytes()
         if spare < 0 and _return_freed():
             spare = SAFE_SHARE * self.limit - resident_bytes()
@@ -45,7 +43,7 @@ class MemoryLimit:
 
 
 def resident_bytes() -> int:
-    """Resident memory of the process, bytes; its maximum on platforms that report only this.
+    """Resident memory, bytes; its maximum on platforms that report only this.
 
     Raises:
         ConfigError: It cannot be read on this platform.
@@ -61,7 +59,7 @@ def resident_bytes() -> int:
 
 
 def _return_freed() -> bool:
-    """Make the C library return freed memory to the system, which it otherwise keeps in fragments."""
+    """Make the C library return freed memory to the system."""
     if sys.platform != "linux":
         return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc only

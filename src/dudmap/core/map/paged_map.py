@@ -1,4 +1,4 @@
-"""Blocks of a map in memory and on disk, and iteration over all of them."""
+"""Blocks of a map in memory and on disk."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -30,7 +30,7 @@ class PagedMap(Stateful):
     _left: Remembered[NDArray[np.int64] | None]  # origin of the window when all blocks left the memory
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore a stored map except the voxels of the coarsest level.
+        """Restore a stored map except the coarsest voxels.
 
         Raises:
             ValueError: Its parts do not fit each other.
@@ -45,7 +45,7 @@ class PagedMap(Stateful):
 
     @property
     def all_blocks(self) -> BlockTree:
-        """The blocks in memory with all finer blocks."""
+        """The blocks in memory of all levels."""
         return BlockTree(self.blocks, self.levels)
 
     @property
@@ -60,14 +60,12 @@ class PagedMap(Stateful):
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map as of ``VoxelBlocks.num_bytes``, without the window, whose size depends on the view
-        alone.
-        """
+        """Memory of the map (``VoxelBlocks.num_bytes``), without the window."""
         return self.blocks.num_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks with voxels, ascending."""
+        """Slots (n,) int32 with voxels, ascending."""
         return self.blocks.active_slots
 
     @property
@@ -80,7 +78,7 @@ class PagedMap(Stateful):
         return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
-        """Empty blocks; under a memory limit they reserve address space, so that growing copies nothing."""
+        """Empty blocks; under a memory limit they reserve address space."""
         blocks, limit = VoxelBlocks(), None if self.pager is None else self.pager.max_blocks
         return VoxelBlocks(limit.limit // blocks.slot_bytes) if isinstance(limit, MemoryLimit) else blocks
 
@@ -89,7 +87,7 @@ class PagedMap(Stateful):
         self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
 
     def page_out(self) -> None:
-        """Move all blocks to disk, if paging is enabled, until they are needed again."""
+        """Move all blocks to disk, if paging is enabled."""
         if self.pager is None or self.blocks.num_entries == 0:
             return
         if self.pager.page_out(self.all_blocks, self._frame_number):
@@ -101,12 +99,12 @@ class PagedMap(Stateful):
         self.window.fill(origin, self.blocks)
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
-        """Load the blocks from ``low`` up to ``high`` (3,) and all blocks that touch them."""
+        """Load the blocks from ``low`` up to ``high`` and all that touch them."""
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)
 
     def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
-        """First block (3,) of each region; until the next one the region and its neighbours are in memory."""
+        """First block of each region, which is in memory with its neighbours until the next."""
         for region in regions_of(self.all_blocks, self.pager):
             first = np.array(region, dtype=np.int32) * REGION
             self._bring(first, first + REGION)
@@ -115,7 +113,7 @@ class PagedMap(Stateful):
             self._place_window(self.window.origin)
 
     def records(self) -> Iterator[BlockRecords]:
-        """Copies of all blocks, in parts: one part if all are in memory, else one per region."""
+        """Copies of all blocks: one part if all are in memory, else one per region."""
         if self.pager is None:
             yield self.all_blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # in the order of the mesh
             return
@@ -124,7 +122,7 @@ class PagedMap(Stateful):
 
     def take_colors(self, other: "PagedMap") -> None:
         """Replace colours and intensities from another map of the same world. A voxel without colour there takes the
-        colour of the next measurement near the surface."""
+        next measurement's."""
         assert other.config == self.config
         number = self._frame_number + 1
         for level in range(1 + len(self.levels)):
@@ -139,8 +137,7 @@ class PagedMap(Stateful):
         self._frame_number = number
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
-        """Replace the colours of a level (0 = coarsest) within blocks (n,) of the coarsest level; frame ``number``
-        wrote them."""
+        """Replace the colours of a level (0 = coarsest) within coarsest blocks; frame ``number`` wrote them."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)
 
@@ -150,12 +147,12 @@ class PagedMap(Stateful):
         return self._frame_number
 
     def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Slots (n,) int32 written after frame ``num_integrated``, also released ones, and the coordinates (n, 3)
-        int32 of their last or new blocks."""
+        """Slots (n,) int32 written or released after frame ``num_integrated``, and the coordinates (n, 3) int32 of
+        their last or new blocks."""
         blocks = self.blocks
         slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
         return slots, blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 = no voxels."""
+        """Slots (n,) int32 at coordinates (n, 3) int32; -1 = no voxels."""
         return self.blocks.slots_at(coords)

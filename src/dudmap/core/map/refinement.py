@@ -1,4 +1,4 @@
-"""Selection of blocks that need smaller voxels: curved or finely coloured surface that the sensor resolves."""
+"""Selection of blocks that need smaller voxels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +10,21 @@ from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
 FIRST = 3
-"""Number of fused frames at which a block is examined first."""
+"""Fused frames before the first examination of a block."""
 PERIOD = 16
-"""Frames between two examinations of a block."""
+"""Frames between examinations of a block."""
 TEXTURE = 0.6
-"""Smallest bend of the intensities (0..1) between neighbouring voxels at which they are halved."""
+"""Smallest bend of intensities (0..1) between voxels that halves them."""
 HYSTERESIS = 0.5
-"""Share of the thresholds below which a block with smaller voxels no longer needs them."""
+"""Share of the thresholds below which smaller voxels are not needed."""
 MAX_CALM = 3
-"""Successive examinations below this share after which the smaller voxels are dropped."""
+"""Successive examinations below it after which they are dropped."""
 FILTERED = 0.5
-"""Standard deviation of filtered depth relative to raw depth: assumed."""
+"""Standard deviation of filtered over raw depth: assumed."""
 BEND_NOISE = np.sqrt(6) / 4
-"""Standard deviation of the bend along one axis for distances with the standard deviation 1."""
+"""Standard deviation of the bend along one axis for unit noise of distances."""
 SIGNIFICANT = 2.0
-"""Number of standard deviations of bend noise that a bend must exceed in addition to the threshold."""
+"""Standard deviations of noise by which a bend must exceed the threshold."""
 
 
 def refine(
@@ -37,12 +37,14 @@ def refine(
     sensor: SensorConfig,
     coarser: FusionParameters,
 ) -> NDArray[np.int32]:
-    """Create and drop finer blocks in the blocks (slots (n,)) of the coarser level that a frame was fused into.
+    """Create and drop finer blocks in the blocks that a frame was fused into.
 
     Args:
+        level: The finer level.
         parents: Blocks of the coarser level.
         slots: (n,) of the coarser level.
-        depths: (n,) depths of the block centres in the view, metres.
+        depths: (n,) of the block centres in the view, metres.
+        number: Number of the frame.
         config: Thresholds of bend and texture.
         sensor: Noise of the depth camera.
         coarser: Fusion parameters of the coarser level.
@@ -78,7 +80,7 @@ def refine(
 def _drop_calm(
     level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Drop children (n, 8) that are no longer needed; returns whether a parent (n,) lost one."""
+    """Drop children that are no longer needed; returns whether a parent lost one."""
     rows, octants = np.nonzero(children >= 0)
     slots = children[rows, octants]
     calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
@@ -93,7 +95,7 @@ def _drop_calm(
 def prolonged(
     parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Interpolation of the coarser level in octants (n,) of blocks in slots (n,): voxels and colours (n, 512)."""
+    """Interpolation of the coarser level in octants (n,) of slots (n,): voxels and colours (n, 512)."""
     voxels, colors = np.empty((2, len(slots), BLOCK**3), dtype=np.int32)
     rows = np.arange(len(slots), dtype=np.int32)
     prolong(parents.geometry, parents.colors, parents.neighbourhood(slots), octants, rows, voxels, colors)
@@ -101,9 +103,5 @@ def prolonged(
 
 
 def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Numbers (n,) that distribute the examinations of blocks over the frames: remainders by ``PERIOD`` along each
-    axis.
-
-    They depend on the coordinates alone, so that paging changes no result.
-    """
+    """Remainders of the coordinates by ``PERIOD``, which distribute the examinations independent of paging."""
     return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])

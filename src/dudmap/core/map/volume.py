@@ -1,4 +1,4 @@
-"""Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
+"""Voxel-hashed truncated signed distance field with colour and free space (thesis section 4.5)."""
 
 import itertools
 from collections.abc import Iterator
@@ -47,13 +47,13 @@ from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import MapError
 
 DEPTH_MIN = 0.05
-"""Smallest depth of a block that is updated, metres."""
+"""Smallest depth of an updated block, metres."""
 MIN_LIMIT = 0.3
-"""Smallest limit of the distances that voxels can store, reference depths."""
+"""Smallest limit of stored distances, reference depths."""
 
 
 def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
-    """Parameters of a map whose depth measurements end at ``depth_max`` metres."""
+    """Parameters of a map with measurements up to ``depth_max`` metres."""
     front = config.truncation_voxels * config.voxel_size
     behind = config.truncation_behind_voxels * config.voxel_size
     limit = max(MIN_LIMIT * sensor.reference_depth, front, behind)
@@ -76,42 +76,42 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 _MAP_IDS = itertools.count()
 NO_WEIGHTS = np.empty((0, 0), np.float32)
 MAX_JUMP = 5.0
-"""Largest change of the distance within one cell that is still a surface, voxels. A projective distance grows with 1
-/ cosine of incidence; a steeper change borders free space."""
+"""Largest change of distance within a cell on a surface, voxels. A projective distance grows with 1 / cosine of
+incidence; a steeper change borders free space."""
 MAX_WINDOW = 288
-"""Largest number of blocks along the edge of the window; its cells then take 96 MB."""
+"""Blocks along the edge of the window: 96 MB of cells."""
 
 
 class TsdfVolume(PagedMap):
     """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of known free space.
 
     Args:
-        camera: Camera of the frames that will be integrated.
+        camera: Camera of the frames.
         config: Voxel size, truncation, weights.
         sensor: Noise of the depth measurements.
-        depth_max: Largest depth that will be integrated, metres.
-        backend: Compute device, used by this map alone; None takes the CPU.
-        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process. The farthest
-            blocks are paged to disk. None keeps all in memory.
-        extent: Depth that the window covers, metres; None covers ``depth_max``.
+        depth_max: Largest integrated depth, metres.
+        backend: Compute device of this map alone; None takes the CPU.
+        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the farthest are
+            paged to disk. None keeps all.
+        extent: Depth of the window, metres; None = ``depth_max``.
 
     Attributes:
-        blocks: The blocks of the map that are in memory.
-        pager: Moves blocks between memory and disk; None if all are in memory.
+        blocks: The blocks in memory.
+        pager: Moves blocks to and from disk; None without.
         window: Dense array of the blocks around the view.
-        voxel_size, block_size: Edge of a voxel and of a block, metres.
-        band: Truncation band around a surface; ``truncation``, ``truncation_behind``: its smallest widths, metres.
+        voxel_size, block_size: Metres.
+        band: Truncation band; ``truncation``, ``truncation_behind``: its smallest widths, metres.
         sdf_unit: Metres per step of a stored distance.
-        map_id: Number of the map in this process; ``clear`` gives a new one.
-        num_frames: Number of integrated frames, each counted ``count`` times; 0 if unknown.
-        levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser levels first; none here.
+        map_id: Number of the map in this process; new after ``clear``.
+        num_frames: Integrated frames, each ``count`` times; 0 if unknown.
+        levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser first; none here.
 
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
 
     kinds: ClassVar[dict[bool, type["TsdfVolume"]]] = {}
-    """Class of a map by ``volume.adaptive``; the package imports both."""
+    """Class of a map by ``volume.adaptive``."""
 
     def __init__(
         self,
@@ -171,8 +171,8 @@ class TsdfVolume(PagedMap):
         Args:
             frame: Depth (m) of the volume's camera, and optional colour.
             T_world_camera: (4, 4).
-            static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            count: Number of equal frames that this frame stands for: weights and observations of emptiness add up.
+            static_mask: (H, W) bool; other pixels change nothing. None fuses all.
+            count: Number of equal frames that this one stands for.
 
         Raises:
             MapError: The images do not have the camera's size.
@@ -202,8 +202,7 @@ class TsdfVolume(PagedMap):
         )  # fmt: skip
 
     def _fuse(self, view: DepthView, count: int) -> tuple[NDArray[np.int32], TouchedBlocks]:
-        """Fuse an image inside the window, ``count`` times; returns the slots (n,) int32 that are not empty, and the
-        prepared image."""
+        """Fuse an image inside the window; returns the slots that are not empty, and the prepared image."""
         blocks, window, number, free_after = self.blocks, self.window, self._frame_number, self.config.free_after
         touched = self.backend.touch(self.grid, view, window.stamps, free_after, number, self.parameters)
         if len(touched.cells):
@@ -222,7 +221,7 @@ class TsdfVolume(PagedMap):
         return slots, touched
 
     def take_over(self, other: "TsdfVolume") -> None:
-        """Replace the content by the content of a map with the same parameters, which must not be used afterwards."""
+        """Take the content of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
@@ -231,14 +230,14 @@ class TsdfVolume(PagedMap):
     def for_camera(
         self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
     ) -> "TsdfVolume":
-        """This map for another camera and device. It takes over the blocks: do not use this volume afterwards."""
+        """This map for another camera and device; do not use this volume afterwards."""
         other = type(self)(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.pager, other._frame_number = self.pager or other.pager, self._frame_number
         other.blocks, other.levels, other.num_frames = self.blocks, self.levels, self.num_frames
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
-        """Move the window to cover the view of a camera at this pose."""
+        """Move the window to cover the view of a camera."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
         origin = self.window.moved(middle, self._left)
         if origin is not None:
@@ -249,7 +248,7 @@ class TsdfVolume(PagedMap):
 
     @property
     def grid(self) -> VoxelGrid:
-        """The blocks around the view for the back end; valid until the next ``integrate``."""
+        """The blocks around the view for the back end, until the next ``integrate``."""
         window, blocks = self.window, self.blocks
         assert window.origin is not None
         return VoxelGrid(
@@ -277,8 +276,8 @@ class TsdfVolume(PagedMap):
         camera: Camera,
         T_world_camera: NDArray[np.float64],
     ) -> MapSample:
-        """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
-        at a pose inside the window."""
+        """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) inside the
+        window."""
         T = self.T_grid_camera(T_world_camera)
         image = LevelImage(depth, intensity, NO_WEIGHTS, camera.intrinsics)
         return self.backend.sample(self.grid, image, T, self.config.free_after)
@@ -288,9 +287,9 @@ class TsdfVolume(PagedMap):
     ) -> NDArray[np.float32]:
         """Share of the surface information at each depth pixel (h, w) that the map already has.
 
-        Weights are information: the average of measurements with total weight w has a variance proportional to 1 / w
-        (eq. 4.19). One more measurement of weight g reduces it to 1 / (w + g). The share is w / (w + g), that is n / (n
-        + 1) after n equal measurements. It is 0 at pixels without depth or without surface in the map.
+        An average of total weight w has a variance proportional to 1 / w (eq. 4.19), and 1 / (w + g) with one more
+        measurement of weight g. The share is w / (w + g): n / (n + 1) after n equal measurements. 0 without depth or
+        surface.
         """
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
@@ -306,7 +305,7 @@ class TsdfVolume(PagedMap):
         return out
 
     def extend_range(self, depth: float) -> None:
-        """Extend views to ``depth`` metres, or to the range of the largest window; for maps that are only viewed."""
+        """Extend views to ``depth`` metres, or to the largest window; for maps that are only viewed."""
         spread = 2 * self._reach / self.depth_max  # the window covers depth_max
         longest = ((MAX_WINDOW - 8) * self.block_size - 2 * self.band.limit) / spread
         self.depth_max = min(max(depth, self.depth_max), longest)
@@ -315,7 +314,7 @@ class TsdfVolume(PagedMap):
         self.window = BlockWindow(self.block_size, self._window_cells)
 
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
-        """Render the map for ``camera`` (default: the volume's own) at a pose, by sphere tracing (eq. 4.12)."""
+        """Render the map for ``camera`` (default: the volume's) at a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera
         T_world_camera = copied(T_world_camera, "pose of a view", shape=(4, 4))
         self.look_at(T_world_camera)
@@ -324,7 +323,7 @@ class TsdfVolume(PagedMap):
         return raycasting.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters, finer)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
-        """Triangles of the zero level by marching cubes, where each corner has ``min_weight`` observations.
+        """Triangles of the zero level by marching cubes; each corner has ``min_weight`` observations.
 
         Raises:
             MapError: The map is empty.
@@ -337,8 +336,8 @@ class TsdfVolume(PagedMap):
         return joined(self.extract_chunks(slots, np.zeros(len(slots), np.int64), min_weight))
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
-        """The mesh region by region, in Morton order, each with its own vertices at borders. Blocks are paged
-        meanwhile; frames must not be integrated until the end."""
+        """The mesh region by region, in Morton order, with own vertices at borders. Do not integrate frames until the
+        end."""
         reach = np.arange(-1, REGION + 1, dtype=np.int32)
         offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
         inner = np.all((offsets >= 0) & (offsets < REGION), axis=1)
@@ -350,8 +349,8 @@ class TsdfVolume(PagedMap):
 
     @property
     def min_weight(self) -> int:
-        """Smallest weight of a voxel for mesh and views: the configured one, or half the number of frames in a map
-        of few frames."""
+        """Smallest weight of a voxel for mesh and views: the configured one, or half the number of frames in a map of
+        few."""
         return min(self.config.min_weight, (self.num_frames + 1) // 2 or self.config.min_weight)
 
     def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
@@ -363,8 +362,8 @@ class TsdfVolume(PagedMap):
     ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
-        ``slots`` (n,) are the blocks to mesh and all that touch them. ``chunks`` (n,) is the group of each from 0, -1
-        for blocks that only provide borders.
+        ``slots`` (n,): blocks to mesh and all that touch them. ``chunks`` (n,): group of each from 0, -1 for blocks
+        that only provide borders.
         """
         blocks, near, parameters = self.blocks, self.blocks.neighbourhood(slots), self._mesh_parameters(min_weight)
         return meshing.extract_chunks(
@@ -374,7 +373,7 @@ class TsdfVolume(PagedMap):
     # -- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write the map as NumPy archive, replacing an older file at completion; ``load`` gives an equal volume.
+        """Write the map as NumPy archive, replacing an older file at completion.
 
         Raises:
             MapError: The file cannot be written.

@@ -15,15 +15,15 @@ from dudmap.core.state import Remembered, Stateful
 __all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
 COORDINATE_BITS = 18
-"""Bits of a block coordinate: three, and one of 512 maps, form a key of the database."""
+"""Bits of a block coordinate: three, and one of 512 maps, form a database key."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
-"""Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+"""Bound of a coordinate: 10.4 km with blocks of 8 cm."""
 NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
-"""Offset (27, 3) of a block's neighbours and, in the middle, of the block; number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
+"""Offset (27, 3) of a block's neighbours and itself; number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
 INTENSITY = 0xFF
-"""Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
+"""Intensity bits of a voxel's geometry word (``core/formulas/voxel.py``)."""
 LARGEST_TABLE = 2**26
-"""Largest number of places in the hash table of a stored map, enough for 50 million blocks."""
+"""Places in the hash table of a stored map: 50 million blocks."""
 MAX_LOAD = 0.8
 """Largest load factor: an insertion takes 16 ns then, 9 ns in a larger table."""
 
@@ -37,8 +37,8 @@ class BlockRecords:
         free_count: (n,) uint8 observations of emptiness.
         owners: (m,) int32 rows of ``coords`` of the blocks with voxels.
         geometry, colors: (m, 512) int32 packed voxels.
-        fused: (m,) uint8 frames fused into each block, saturated at 255.
-        finer: Per finer level, the blocks inside these (``FineBlocks.records``).
+        fused: (m,) uint8 frames fused into each block, saturated.
+        finer: Blocks inside these per finer level (``FineBlocks.records``).
     """
 
     coords: NDArray[np.int32]
@@ -60,8 +60,8 @@ _TYPES = {
 class VoxelBlocks(Stateful):
     """The blocks of a map.
 
-    An entry is an observed block; near a surface it owns a slot of 512 voxels. Arrays grow by factors. The constructor
-    reserves ``slots``, which take no memory while unused.
+    An entry is an observed block; near a surface it owns a slot of 512 voxels. Arrays grow by factors; reserved
+    ``slots`` take no memory while unused.
 
     Attributes:
         table: Hash table of entry numbers (``core/backends/cpu/hashing.py``).
@@ -70,9 +70,8 @@ class VoxelBlocks(Stateful):
         geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
         geometry_mirror, colors_mirror: The same for back ends, which may hold copies on a device.
         entry_of, slot_coords, written, fused: Per slot (``num_slots``, in use or released): int32 entry, -1 = unused;
-            (3,) int32 block coordinates; int32 number of the last frame that wrote it; uint8 frames fused into it,
-            saturated at 255.
-        table_size: Number of places in the hash table of stored blocks.
+            (3,) int32 block coordinates; int32 last frame that wrote it; uint8 frames fused into it, saturated.
+        table_size: Places in the hash table of stored blocks.
     """
 
     coords: Remembered[NDArray[np.int32]]
@@ -101,14 +100,14 @@ class VoxelBlocks(Stateful):
         self._released = np.empty(0, dtype=np.int32)
 
     def state(self) -> dict[str, Any]:
-        """The index without spare capacity; voxels are stored block by block (``app/state``)."""
+        """The index without spare capacity; voxels are stored by block (``app/state``)."""
         self.table_size = len(self.table)
         state, n, m = super().state(), self.num_entries, self.num_slots
         state |= {name: state[name][:n] for name in ("coords", "slot_of", "free_count")}
         return state | {name: state[name][:m] for name in ("entry_of", "slot_coords", "written", "fused")}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore the index, without voxels; a ``ValueError`` if its parts do not fit each other."""
+        """Restore the index without voxels; ``ValueError`` if its parts do not fit."""
         room = max(len(self.entry_of), len(state["entry_of"]))
         super().restore(state)
         n, m, owned = len(self.coords), len(self.entry_of), np.flatnonzero(self.entry_of >= 0)
@@ -126,7 +125,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def geometry(self) -> NDArray[np.int32]:
-        """Packed voxels (slots, 512) int32 in host memory, up to date."""
+        """Packed voxels (slots, 512) int32 in host memory."""
         return self.geometry_mirror.host
 
     @geometry.setter
@@ -135,7 +134,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def colors(self) -> NDArray[np.int32]:
-        """Packed colours (slots, 512) int32 in host memory, up to date."""
+        """Packed colours (slots, 512) int32 in host memory."""
         return self.colors_mirror.host
 
     @colors.setter
@@ -149,7 +148,7 @@ class VoxelBlocks(Stateful):
         self.colors_mirror.wrote(slots)
 
     def take_colors(self, slots: NDArray[np.integer], other: "VoxelBlocks") -> None:
-        """Give slots (n,) the colours and intensities of their blocks in another map; 0 for unknown blocks."""
+        """Give slots (n,) the colours and intensities of another map; 0 for unknown blocks."""
         there = other.slots_at(self.slot_coords[slots].astype(np.int32))
         known = there >= 0
         intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
@@ -163,13 +162,13 @@ class VoxelBlocks(Stateful):
         return self.num_slots - len(self._released)
 
     def num_free(self, observations: int) -> int:
-        """Number of blocks without voxels that have at least this many observations of emptiness."""
+        """Blocks without voxels with at least this many observations of emptiness."""
         n = self.num_entries
         return int(np.count_nonzero((self.free_count[:n] >= observations) & (self.slot_of[:n] < 0)))
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all slots, entries and the hash table, without spare capacity, which is only address space."""
+        """Memory of slots, entries and hash table, without spare capacity."""
         return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
 
     @property
@@ -180,7 +179,7 @@ class VoxelBlocks(Stateful):
 
     @property
     def entry_bytes(self) -> float:
-        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
+        """Bytes of a block without voxels, such as free space."""
         return self._index_bytes + self.table.nbytes / max(self.num_entries, 1)
 
     @property
@@ -189,11 +188,11 @@ class VoxelBlocks(Stateful):
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
-        """Slots (n,) int32 of all blocks with voxels, ascending."""
+        """Slots (n,) int32 with voxels, ascending."""
         return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
 
     def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
-        """Entries (n,) int32 of blocks at coordinates (n, 3); at most ``unknown`` entries are new."""
+        """Entries (n,) int32 of blocks at coordinates (n, 3); at most ``unknown`` are new."""
         self.reserve_entries(self.num_entries + unknown)
         entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
         return entries
@@ -242,7 +241,7 @@ class VoxelBlocks(Stateful):
         self.geometry_mirror.used = self.colors_mirror.used = num_slots
 
     def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
-        """Release and empty slots; their entries (n,) int32 get at least this many observations of emptiness."""
+        """Empty slots; their entries (n,) int32 get at least this many observations of emptiness."""
         entries = self.entry_of[slots]
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
@@ -253,12 +252,12 @@ class VoxelBlocks(Stateful):
         return entries
 
     def entries_in(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Entries (n,) of the blocks from ``low`` to ``high`` (3,) (exclusive), ascending."""
+        """Entries (n,) from ``low`` to ``high`` (3,) (exclusive), ascending."""
         coords = self.coords[: self.num_entries]
         return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
 
     def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
-        """Copies of the blocks of entries (n,), with voxels in the order of the entries or of the slots."""
+        """Copies of entries (n,), with voxels in the order of entries or of slots."""
         slots = self.slot_of[entries]
         owners = np.flatnonzero(slots >= 0).astype(np.int32)
         if by_slot:
@@ -270,7 +269,7 @@ class VoxelBlocks(Stateful):
         )  # fmt: skip
 
     def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
-        """Remove entries (n,) and their voxels. The other entries are renumbered; slots keep their numbers."""
+        """Remove entries (n,) and their voxels. Other entries are renumbered; slots are not."""
         n = self.num_entries
         slots = self.slot_of[entries]
         slots = np.sort(slots[slots >= 0])
@@ -293,7 +292,7 @@ class VoxelBlocks(Stateful):
         hashing.rebuild(self.table, self.coords, m)
 
     def insert(self, records: BlockRecords, frame_number: int) -> NDArray[np.int32]:
-        """Add unknown blocks; returns the slots (m,) int32 of the blocks with voxels."""
+        """Add unknown blocks; returns the slots (m,) int32 with voxels."""
         entries = self.entries_at(records.coords, len(records.coords))
         self.free_count[entries] = records.free_count
         slots = self.allocate(entries[records.owners], frame_number)
@@ -302,12 +301,12 @@ class VoxelBlocks(Stateful):
         return slots
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 = no voxels."""
+        """Slots (n,) int32 at coordinates (n, 3) int32; -1 = no voxels."""
         entries = hashing.find_all(self.table, self.coords, coords)
         return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
 
     def neighbourhood(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+        """Slots (n, 27) int32 of each block's ``NEIGHBOURHOOD``; -1 = none."""
         coords = self.slot_coords[slots][:, None] + NEIGHBOURHOOD
         return self.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
@@ -334,7 +333,6 @@ class VoxelBlocks(Stateful):
 
 
 def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
-    """Check the arrays of a map file, because kernels do not; raises a ``ValueError``."""
     n, m = len(coords), len(entries)
     wanted = {
         "coords": (coords, np.int32, (n, 3)), "free_count": (free_count, np.uint8, (n,)),
@@ -357,7 +355,7 @@ def _row_bytes(array: NDArray) -> int:
 
 
 def blobs_of(records: BlockRecords) -> list[list[memoryview]]:
-    """The arrays of records in stored form, in the order of ``COLUMNS``, level by level."""
+    """The arrays of records in stored form, in the order of ``COLUMNS``."""
     levels = [records, *records.finer]
     return [[np.ascontiguousarray(getattr(level, name)).data for name in COLUMNS] for level in levels]
 

@@ -31,9 +31,9 @@ from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 class TimedPose:
     """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
 
-    ``repeats``: "" for a tracked frame; "depth" for a predicted pose, because the depth image repeats; "frame" for a
-    copied or interpolated pose. ``late``: seconds from the capture of the depth image to its time stamp, by the
-    calibration at tracking time.
+    ``repeats``: "" for a tracked frame; "depth" for a predicted pose of a repeated depth image; "frame" for a copied or
+    interpolated pose. ``late``: seconds from capture to time stamp of the depth image, by the calibration at tracking
+    time.
     """
 
     timestamp: float
@@ -48,9 +48,9 @@ class Atlas(Stateful):
 
     Attributes:
         keyframes: Keyframes of all submaps.
-        depth_late: Delay of the depth time stamps in the present calibration, seconds.
-        saved: Number of the submap that began as a saved map, or None. Its world frame is kept: other submaps are
-            joined to it, and loop closures do not change it, because not all its frames are stored.
+        depth_late: Delay of the depth time stamps, seconds.
+        saved: Number of the submap that began as a saved map, or None. Other submaps are joined to it, and loop
+            closures do not change it, because not all its frames are stored.
     """
 
     history: Remembered[FrameStore | None]
@@ -88,23 +88,22 @@ class Atlas(Stateful):
         *,
         keep_frames: bool,
     ) -> "Atlas":
-        """An atlas with one empty map. Frames are stored for corrections if ``keep_frames`` is set and the
-        configuration needs them. A ``prior`` map of a first pass provides the keyframes; no frames are stored then."""
+        """An atlas with one empty map. ``keep_frames``: store frames for corrections if the configuration needs them. A
+        ``prior`` map of a first pass provides the keyframes; no frames are stored then."""
         if prior is not None:
             return cls(make_volume, prior.keyframes, None, prior.submap)
         keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
         return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
     def continue_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
-        """Make a saved map the current submap, for frames of a camera; takes its volume and keyframes. ``max_blocks``:
-        see ``TsdfVolume``."""
+        """Make a saved map the current submap, with its volume and keyframes. ``max_blocks``: see ``TsdfVolume``."""
         self.saved = self.current
         self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend, max_blocks)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
     def unit(self) -> float:
-        """Reference depth of the sensor, metres: the unit of constant lengths."""
+        """Reference depth, metres: the unit of constant lengths."""
         return self.keyframes.sensor.reference_depth
 
     @property
@@ -120,7 +119,7 @@ class Atlas(Stateful):
         exposure: tuple[float, float] = (1.0, 0.0),
         recorded: Frame | None = None,
     ) -> None:
-        """Fuse the static pixels of a frame into the current map, and store the frame for corrections.
+        """Fuse the static pixels of a frame into the current map, and store it for corrections.
 
         ``exposure``: gain and offset to the map's colours. ``recorded``: the frame with its recorded colour, which is
         stored (None = ``frame``).
@@ -131,8 +130,8 @@ class Atlas(Stateful):
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
     def recolor(self) -> None:
-        """Repaint all maps with the colours of the stored frames under the present calibration, the current one
-        during the next frames. A saved map keeps its colours."""
+        """Repaint all maps but a saved one from the stored frames under the present calibration, the current one during
+        the next frames."""
         assert self.history is not None
         self.complete()
         for number in self.volumes:
@@ -144,7 +143,7 @@ class Atlas(Stateful):
         self.switch_to(self.current)
 
     def take_repainted(self) -> bool:
-        """Take the colours of a repainting that has all frames; returns whether no repainting is left."""
+        """Take the colours of a complete repainting; returns whether no repainting is left."""
         if self.repainting is not None and self.repainting.fuse(PER_FRAME):
             self._complete_repainting()
         return self.repainting is None
@@ -156,7 +155,7 @@ class Atlas(Stateful):
             self.volumes[repainting.submap].take_colors(repainting.volume)
 
     def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, at a tracked frame, from the poses before and after it; 0 if unknown."""
+        """Twist per second (6,), camera axes, at a tracked frame; 0 if unknown."""
         number = min(bisect_left(self.poses, timestamp, key=lambda pose: pose.timestamp), len(self.poses) - 1)
         near = [
             pose
@@ -171,14 +170,14 @@ class Atlas(Stateful):
         return motion / (near[-1].timestamp - near[0].timestamp)
 
     def as_saved_map(self) -> SavedMap:
-        """The main map and its keyframes, with an empty registration history."""
+        """The main map and its keyframes, without registration history."""
         self.complete()
         self.keyframes.settle()
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
     def clear_map(self) -> None:
-        """Empty the current map, which is the newest, and forget its stored frames."""
+        """Empty the current map and forget its stored frames."""
         self.volume.clear()
         if self.history is not None:
             self.history.remove_submap(self.current)
@@ -199,33 +198,33 @@ class Atlas(Stateful):
         self.poses.append(new)
 
     def start_submap(self) -> None:
-        """Make a new, empty submap the current one."""
+        """Start an empty submap."""
         number = max(self.volumes) + 1
         self.switch_to(number)
         self.volumes[number] = self.make_volume()
 
     def switch_to(self, number: int) -> None:
-        """Make a submap the current one, and page the other maps out if they have a pager."""
+        """Make a submap current, and page out the others."""
         self.current = number
         for other, volume in self.volumes.items():
             if other != number:
                 volume.page_out()
 
     def make_room(self) -> None:
-        """Page the current map out unless a second map of the same view fits into the memory limit."""
+        """Page the current map out unless a second map of the view fits into the memory limit."""
         limit = None if self.volume.pager is None else self.volume.pager.max_blocks
         if isinstance(limit, MemoryLimit):
             if limit.limit - resident_bytes() < self.volume.view_bytes:
                 self.volume.page_out()
 
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
-        """Map of a submap; during a rebuilding, it includes the surroundings of a pose (4, 4)."""
+        """Map of a submap; during a rebuilding, with the surroundings of a pose (4, 4)."""
         if number in self.rebuildings:
             self.rebuildings[number].show(self.volumes[number], T_world_camera, MAX_ADDED)
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
-        """Advance the repainting and one rebuilding, of the current submap first, by ``PER_FRAME`` frames each."""
+        """Advance the repainting and one rebuilding by ``PER_FRAME`` frames each, the current submap first."""
         if self.repainting is not None:
             self.repainting.fuse(PER_FRAME)
         if not self.rebuildings:
@@ -238,7 +237,7 @@ class Atlas(Stateful):
             self._take(rebuilding)
 
     def complete(self) -> None:
-        """Complete all maps that are being rebuilt or repainted."""
+        """Complete all rebuilding and repainting."""
         self._complete_repainting()
         for rebuilding in list(self.rebuildings.values()):
             self.volumes[rebuilding.submap].clear()  # makes room
@@ -253,7 +252,7 @@ class Atlas(Stateful):
             volume.page_out()
 
     def by_size(self) -> list[int]:
-        """Numbers of the submaps: the saved one first, then by decreasing number of tracked frames."""
+        """Numbers of the submaps: the saved one, then by decreasing number of tracked frames."""
         sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
         return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
 
@@ -264,15 +263,15 @@ class Atlas(Stateful):
         )
 
     def trajectory(self, submap: int) -> Trajectory:
-        """Poses of a submap at the time stamps of the frames, which may be late."""
+        """Poses of a submap at the time stamps of the frames."""
         return self.image_poses(submap).after(np.array([pose.late for pose in self.poses if pose.submap == submap]))
 
     def nodes(self, submap: int) -> list[int]:
-        """Numbers of the stored frames of a submap, see ``FrameStore.in_submap``."""
+        """Stored frames of a submap, see ``FrameStore.in_submap``."""
         return [] if self.history is None else self.history.in_submap(submap)
 
     def kept_nodes(self, submap: int) -> list[int]:
-        """Numbers of the stored frames of a submap whose images are kept."""
+        """Stored frames of a submap with images."""
         return [] if self.history is None else self.history.kept_of(submap)
 
     def correct(
@@ -285,8 +284,8 @@ class Atlas(Stateful):
         """Set new poses of the stored frames of the current submap, and replace its map.
 
         Trajectory and keyframes receive the correction interpolated in time. ``volume`` was built from the stored
-        frames ``nodes`` at their new poses (n, 4, 4). If only from ``fused``, it is provisional until the map is
-        complete. Returns the motion (4, 4) of the newest stored frame.
+        frames ``nodes`` at poses (n, 4, 4), or only from ``fused`` and is then provisional. Returns the motion (4, 4)
+        of the newest stored frame.
         """
         assert self.history is not None
         frames = [self.history.frames[n] for n in nodes]
@@ -307,16 +306,16 @@ class Atlas(Stateful):
         return [place for place in (*self.poses, *self.keyframes.places, *frames) if place.submap == submap]
 
     def move(self, stamps: NDArray[np.float64], corrections: NDArray[np.float64]) -> None:
-        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); a
-        running repainting is cancelled."""
+        """Move all poses of the current submap by corrections (n, 4, 4), interpolated between their times (n,); cancels
+        a repainting."""
         self.repainting = None
         for place in self._places(self.current):
             correction = se3.interpolate_in_time(stamps, corrections, place.timestamp)
             place.T_world_camera = correction @ place.T_world_camera
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
-        """Join submap ``source`` into ``target`` and make that the current one; ``T_target_source`` (4, 4) maps world
-        to world."""
+        """Join submap ``source`` into ``target``, the new current one; ``T_target_source`` (4, 4) maps world to
+        world."""
         assert self.history is not None
         self._complete_repainting()
         moved_nodes = self.kept_nodes(source)

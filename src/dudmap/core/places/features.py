@@ -1,4 +1,4 @@
-"""SIFT features of a reduced grey image and their matching by Lowe's ratio test (Lowe 2004)."""
+"""SIFT features of a reduced grey image and their matching (Lowe 2004)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def reduced_grey(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """Grey image (h, w) uint8 of a colour image (H, W, 3), reduced to ``width`` if it is wider."""
+    """Grey image (h, w) uint8 of a colour image (H, W, 3), at most ``width`` wide."""
     import cv2
 
     grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -26,7 +26,7 @@ class ImageFeatures:
         pixels: (n, 2) float64, u and v; pixel centres at integers.
         responses: (n,) float64, strength.
         descriptors: (n, 128) float32.
-        image_shape: (height, width) of the image.
+        image_shape: (height, width).
     """
 
     pixels: NDArray[np.float64]
@@ -39,7 +39,7 @@ class ImageFeatures:
 
 
 class SiftExtractor:
-    """Extracts the strongest SIFT features; OpenCV may add a few of equal strength. Not thread-safe."""
+    """Extracts the strongest SIFT features. Not thread-safe."""
 
     def __init__(self, max_features: int) -> None:
         self.max_features = max_features
@@ -63,8 +63,8 @@ class SiftExtractor:
 
 
 def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows that are each other's nearest neighbours and pass the ratio test from ``a`` to ``b``. None
-    if ``b`` has fewer than two rows."""
+    """Pairs (m, 2) of rows that are mutually nearest and pass the ratio test from ``a`` to ``b``. None if ``b`` has
+    fewer than two rows."""
     if len(a) == 0 or len(b) < 2:
         return np.empty((0, 2), dtype=np.int64)
     squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)

@@ -1,4 +1,4 @@
-"""Store of fused frames on disk, from which maps are rebuilt with corrected poses."""
+"""Store of fused frames on disk, from which maps are rebuilt."""
 
 import weakref
 from collections import deque
@@ -23,11 +23,11 @@ DEPTH_UNIT = 0.0005
 """Step of the stored depth, reference depths: 0.14 mm rms in a room, a seventh of ``sigma_base``."""
 JPEG_QUALITY = 95
 KEEP_ANGLE_DEG = 5.0
-"""Rotation since the last stored frame at which a fused frame is stored, degrees."""
+"""Rotation since the last stored frame that stores a fused frame, degrees."""
 MAX_PENDING = 3
-"""Frames that may wait for the encoding thread before ``add`` blocks."""
+"""Frames that wait for encoding before ``add`` blocks."""
 CELLS = 8, 6
-"""Cells of an image, across and down; ``KeptFrame.cells`` tells which of them were mostly fused."""
+"""Cells of an image, across and down, see ``KeptFrame.cells``."""
 EncodedFrame = tuple[bytes, bytes, bytes]
 
 
@@ -52,11 +52,11 @@ class KeptFrame:
 
     Attributes:
         timestamp: Seconds.
-        T_world_camera: (4, 4), updated when the map is corrected.
-        submap: Number of its submap; -1 if the submap was discarded.
+        T_world_camera: (4, 4), corrected with the map.
+        submap: Number of its submap; -1 if discarded.
         cells: Bit mask of the ``CELLS`` in which most pixels were fused.
-        color_timestamp: Seconds, of the colour image; None if unknown.
-        count: Number of fused frames that it represents; 0 if its images were removed.
+        color_timestamp: Seconds; None if unknown.
+        count: Fused frames that it represents; 0 without images.
     """
 
     timestamp: float
@@ -68,17 +68,17 @@ class KeptFrame:
 
 
 class FrameStore(Stateful):
-    """Selected fused frames in a temporary file, which the operating system removes.
+    """Selected fused frames in a temporary file.
 
     A frame is stored if the camera has moved by ``distance`` (m) or turned by ``angle_deg`` since the last stored
-    frame. It is also stored if ``gap`` frames were fused since then, or if the submap is another. Other frames increase
-    the count of the last stored frame. A background thread encodes the frames (depth RVL, colour JPEG, mask PNG).
-    Frames are numbered in order of time; a frame without images keeps its number and pose. Not thread-safe.
+    frame, if ``gap`` frames were fused since then, or in another submap. Other frames increase the count of the last
+    one. A background thread encodes (depth RVL, colour JPEG, mask PNG). Frames are numbered in order of time; without
+    images they keep number and pose. Not thread-safe.
 
     Attributes:
-        registered: Registers recorded colour to the depth image; None if colour is registered already.
+        registered: Registers recorded colour to depth; None for registered colour.
         frames: All frames, by number.
-        archived: Reads a frame, by number, from the database of a continued run.
+        archived: Reads a frame of a continued run, by number.
     """
 
     frames: Remembered[list[KeptFrame]]
@@ -105,7 +105,7 @@ class FrameStore(Stateful):
 
     @classmethod
     def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
-        """The store for a configuration; None if neither loops nor submaps need one."""
+        """The store for a configuration; None if loops and submaps are off."""
         loops = config.loops
         if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
             return None
@@ -123,10 +123,10 @@ class FrameStore(Stateful):
         submap: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> bool:
-        """Store a fused frame with its recorded colour, or increase the count of the last stored frame; return whether
-        it was stored.
+        """Store a fused frame with its recorded colour, or increase the count of the last one; returns whether it was
+        stored.
 
-        Pixels that were not fused are stored too; the arrays must not change afterwards.
+        The arrays must not change afterwards.
 
         Raises:
             MapError: The temporary file cannot be written.
@@ -151,11 +151,11 @@ class FrameStore(Stateful):
         return [number for number, frame in enumerate(self.frames) if frame.count]
 
     def in_submap(self, submap: int) -> list[int]:
-        """Numbers of the frames of a submap, in order of time: the nodes of its pose graph."""
+        """Frames of a submap in order of time: the nodes of its pose graph."""
         return [number for number, frame in enumerate(self.frames) if frame.submap == submap]
 
     def kept_of(self, submap: int) -> list[int]:
-        """Numbers of the frames of a submap with images."""
+        """Frames of a submap with images."""
         return [number for number in self.in_submap(submap) if self.frames[number].count]
 
     def remove_submap(self, submap: int) -> None:
@@ -175,7 +175,7 @@ class FrameStore(Stateful):
         self.frames[number].count = 0
 
     def __getitem__(self, number: int) -> StoredFrame:
-        """The stored frame of a number, 0 = oldest; its images must not have been removed."""
+        """The stored frame of a number, which must have images."""
         import cv2
 
         depth_file, color_file, mask_file = self.encoded(number)
@@ -215,9 +215,9 @@ class FrameStore(Stateful):
         numbers: Sequence[int] | None = None,
         Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
     ) -> None:
-        """Fuse stored frames into a map, in the given order, each with the weight of its count.
+        """Fuse stored frames into a map in the given order, each with the weight of its count.
 
-        ``numbers``: None = all with images. ``Ts_world_camera``: poses (4, 4), None = the stored ones.
+        ``numbers``: None = all with images. ``Ts_world_camera``: (4, 4) each, None = stored.
         """
         for i, number in enumerate(self.kept if numbers is None else numbers):
             stored = self[number]
@@ -233,7 +233,6 @@ class FrameStore(Stateful):
 
 
 def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
-    """Bit mask of the image cells in which most pixels are static depth measurements."""
     import cv2
 
     used = (static & (frame.depth > 0)).astype(np.float32)
@@ -242,7 +241,7 @@ def _fused_cells(frame: Frame, static: NDArray[np.bool_]) -> int:
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float], depth_unit: float) -> EncodedFrame:
-    """Depth in 16-bit steps of ``depth_unit`` metres (RVL), exposed colour as JPEG, static mask as 1-bit PNG."""
+    """Depth in 16-bit steps of ``depth_unit`` metres (RVL), exposed colour (JPEG), static mask (1-bit PNG)."""
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest

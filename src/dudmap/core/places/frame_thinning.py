@@ -1,7 +1,6 @@
-"""Removal of stored images that newer frames replace: their number grows with the observed space, not with time.
+"""Removal of stored images that newer frames replace: their number grows with space, not time.
 
-In a running average with a capped weight only the newest measurements of a surface count. The pose stays a node of the
-pose graph.
+In a running average with a capped weight only the newest measurements count. The pose stays in the pose graph.
 """
 
 import numpy as np
@@ -15,17 +14,17 @@ from dudmap.core.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE
 from dudmap.core.state import Remembered, Stateful
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 15.0
-"""Largest distance (reference depths) and angle (deg) between equal views: half the spacing of keyframes."""
+"""Largest distance (reference depths) and angle (deg) between equal views: half the keyframe spacing."""
 MIN_KEPT = 256
-"""Frames that always keep their images: 50 MB at 640x480."""
+"""Frames that always keep images: 50 MB at 640x480."""
 
 
 class FrameThinning(Stateful):
     """Removes the images of frames of the current submap whose view newer frames show (SAME_DISTANCE, SAME_ANGLE_DEG).
 
-    * They fill every cell that the frame was fused in: more than ``similarity.threshold`` of the measurements of a
-      running average. Background behind an object that stays is thus kept.
-    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, for the verification of loops.
+    * They fill every cell that the frame was fused in, which keeps background behind an object: more than
+      ``similarity.threshold`` of the measurements of a running average.
+    * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, for loop verification.
     """
 
     _stored: Remembered[int] = 0  # number of frames stored until the last call
@@ -37,7 +36,7 @@ class FrameThinning(Stateful):
         self._enough = config.similarity.threshold * held
 
     def thin(self) -> None:
-        """Test the frames with the view of a newly stored frame; call it with every frame."""
+        """Test the frames with the view of a new stored frame; call with every frame."""
         history = self.atlas.history
         if history is None or self.atlas.rebuildings or self.atlas.repainting or len(history) == self._stored:
             return
@@ -53,7 +52,7 @@ class FrameThinning(Stateful):
                 spare -= 1
 
     def _is_replaced(self, history: FrameStore, nodes: list[int], Ts: NDArray[np.float64], i: int) -> bool:
-        """Whether newer frames replace frame ``nodes[i]``; ``Ts`` (n, 4, 4) are the poses of the ``nodes``."""
+        """Whether newer frames replace frame ``nodes[i]``."""
         newer = i + 1 + np.flatnonzero(_same_view(Ts[i + 1 :], Ts[i], self.atlas.unit))
         cells = np.array([history.frames[nodes[j]].cells for j in (i, *newer)], np.int64)
         fused = (cells[:, None] >> np.arange(np.prod(CELLS))) & 1
@@ -68,7 +67,6 @@ class FrameThinning(Stateful):
 
 
 def _same_view(Ts: NDArray[np.float64], T: NDArray[np.float64], unit: float) -> NDArray[np.bool_]:
-    """Mask of the poses (n, 4, 4) with the view of a pose (4, 4)."""
     relative = se3.inverse(T) @ Ts
     near = np.linalg.norm(relative[:, :3, 3], axis=1) < SAME_DISTANCE * unit
     return near & (se3.rotation_angles(relative) < np.radians(SAME_ANGLE_DEG))

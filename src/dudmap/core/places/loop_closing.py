@@ -1,4 +1,4 @@
-"""Loop closing: recognise places and remove the drift since their last visit from trajectory and map."""
+"""Loop closing: recognise places and remove the drift since their last visit."""
 
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,25 +20,25 @@ from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 
 NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
-"""A keyframe within this distance (reference depths) and angle (deg) of the camera counts as seen."""
+"""Distance (reference depths) and angle (deg) at which a keyframe counts as seen."""
 CHECK_INTERVAL = 5
-"""Frames between two checks for nearby keyframes, and between start and evaluation of a search."""
+"""Frames between checks for nearby keyframes, and between start and evaluation of a search."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.03, 1.0
-"""Largest difference of the corrections of two frames that confirm each other, reference depths and degrees."""
+"""Largest difference of corrections that confirm each other, reference depths and degrees."""
 NO_DRIFT, NO_DRIFT_DEG = 0.02, 0.7
-"""Smaller corrections (reference depths, deg) are within the noise and not applied."""
+"""Corrections within the noise, reference depths and degrees."""
 MAX_VERIFIED = 2
-"""Largest number of matches of one frame that are verified by registration."""
+"""Matches of one frame that are verified by registration."""
 MAX_BACKOFF = 4
-"""Largest factor of the linear back-off: after n failed searches the next waits n ``loops.gap`` frames."""
+"""Largest back-off: after n failed searches the next waits n ``loops.gap`` frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopSearch:
-    """A tracked frame that is matched with keyframes in the background.
+    """A tracked frame that is matched in the background.
 
-    ``returned``: Nearby keyframes have not been seen for ``loops.min_age``, so that a match is expected. ``due``:
-    Number of the frame at which the matches are evaluated.
+    ``returned``: Nearby keyframes have not been seen for ``loops.min_age``, so that a match is expected. ``due``: Frame
+    number of the evaluation.
     """
 
     query: LoopQuery
@@ -51,10 +51,10 @@ class LoopSearch:
 class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
-    A match is accepted if features (3D-3D RANSAC), distances and intensities of the local map of the matched time give
-    the same camera pose. A second frame must confirm the correction. The newest frame must not have been registered to
-    the older surfaces meanwhile. A background thread matches features; the result is evaluated ``CHECK_INTERVAL``
-    frames later, independent of timing. ``closed`` is the number of corrections and joins.
+    Features (3D-3D RANSAC), and distances and intensities of the local map of the matched time, must give the same
+    camera pose. A second frame must confirm the correction, and the newest frame must not be registered to the older
+    surfaces. Matching runs in the background and is evaluated ``CHECK_INTERVAL`` frames later, independent of timing.
+    ``closed`` counts corrections and joins.
     """
 
     corrector: Remembered[LoopCorrector]
@@ -78,10 +78,9 @@ class LoopCloser(Stateful):
         self._executor: ThreadPoolExecutor | None = None
 
     def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.
+        """Search for a loop closure with a tracked frame, and evaluate the last search when due.
 
-        Returns the correction (4, 4) of the camera pose, None if nothing was corrected. ``monitor`` judges
-        registrations by the residuals of recent frames.
+        Returns the correction (4, 4) of the camera pose, or None. ``monitor`` judges registrations.
         """
         self._frame += 1
         self.thinning.thin()
@@ -134,7 +133,7 @@ class LoopCloser(Stateful):
         return correctable and self._is_old(keyframe, now)
 
     def _evaluate(self, search: LoopSearch, newest: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Verify the matches of a search; returns the correction of the pose, None if none was made."""
+        """Verify the matches of a search; returns the correction of the pose, or None."""
         query, distance = search.query, NO_DRIFT * self.atlas.unit
         T = query.tracking.T_world_camera
         pending, self._pending = self._pending, None

@@ -1,4 +1,4 @@
-"""Correction of a submap after a loop closure: pose graph optimization and the map built from its poses."""
+"""Correction of a submap after a loop closure: pose graph optimization and a new map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +13,19 @@ from dudmap.core.places.pose_graph import Edge, optimize
 from dudmap.core.state import Remembered, Stateful
 
 TRUNCATED_DISTANCE = 0.05
-"""Truncation of the distances in the misfit of frames to a map, reference depths."""
+"""Truncation of distances in the misfit of frames to a map, reference depths."""
 ODOMETRY_NOISE = 0.002, 0.02
-"""Standard deviation of a tracked motion: reference depths (or radians), and the same per reference depth of its
-path."""
+"""Standard deviation of a tracked motion: reference depths (or radians), and per reference depth of path."""
 LOOP_NOISE = 0.005, 0.003
-"""Standard deviation of a motion measured at a loop closure: reference depths and radians."""
+"""Standard deviation of a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
-"""Largest misfit of the new pass to the map of the old pass. It is the ratio times its misfit to its own map, plus the
-offset (reference depths; intensities 0..1). Measured: a correct correction has the ratio 1.1, errors of 5 cm, or of
-2 cm and 1 degree, more than 2."""
+"""Largest misfit of the new pass to the old map: ratio times the misfit to its own map, plus offset (reference depths;
+intensities 0..1). Measured: correct corrections have 1.1; errors of 5 cm, or of 2 cm and 1 degree, more than 2."""
 
 
 class LoopCorrector(Stateful):
-    """Distributes the drift measured by loop closures over the stored frames of the current submap.
-
-    ``edges`` are the motions measured by loop closures, between numbers of stored frames.
-    """
+    """Distributes the drift over the stored frames of the current submap. ``edges``: motions measured by loop
+    closures."""
 
     edges: Remembered[list[Edge]]
 
@@ -40,9 +36,12 @@ class LoopCorrector(Stateful):
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Measured motion to the newest stored frame from the one nearest in time to a recognised keyframe, None if
-        they are the same. ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose
-        relative to the map at the time of the keyframe."""
+        """Measured motion from the stored frame nearest in time to a keyframe to the newest one; None if they are the
+        same.
+
+        ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose in the map at the time of
+        the keyframe.
+        """
         history = self.atlas.history
         assert history is not None
         nodes = self.atlas.nodes(self.atlas.current)
@@ -56,10 +55,10 @@ class LoopCorrector(Stateful):
         return Edge(old, new, T_old_new, LOOP_NOISE[0] * self.atlas.unit, LOOP_NOISE[1])
 
     def correct(self, loop: Edge) -> NDArray[np.float64] | None:
-        """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
+        """Optimize the pose graph with a new loop edge and begin to rebuild the map.
 
-        Returns the motion (4, 4) of the newest pose. Returns None if the poses are not finite, or if the new pass fits
-        the map of the old pass clearly worse than its own map (``MAX_RATIO``).
+        Returns the motion (4, 4) of the newest pose. None if the poses are not finite, or the new pass does not fit the
+        map of the old pass (``MAX_RATIO``).
         """
         history = self.atlas.history
         assert history is not None
@@ -93,8 +92,7 @@ class LoopCorrector(Stateful):
     def _misfit(
         self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]
     ) -> tuple[float, float]:
-        """Mean distance (m) and mean intensity difference (0..1) of stored frames to a map; infinite without
-        overlap."""
+        """Mean distance (m) and intensity difference (0..1) of stored frames to a map; infinite without overlap."""
         import cv2
 
         history = self.atlas.history
@@ -129,11 +127,9 @@ def _is_worse(after: tuple[float, float], before: tuple[float, float], unit: flo
 def _passes(
     Ts: NDArray[np.float64], kept: NDArray[np.int64], a: int, b: int, unit: float
 ) -> tuple[list[int], list[int]]:
-    """Indices of the ``kept`` poses (k,) of a path (n, 4, 4) that view the place of pose ``b``, of the old and the new
-    pass.
+    """Indices of the ``kept`` poses of a path that view the place of pose ``b``, of the old and the new pass.
 
-    The old pass of the loop ``a`` to ``b`` ends at the farthest point of the path from ``b``. Both passes have about as
-    many poses.
+    The old pass of the loop ``a`` to ``b`` ends at the farthest point from ``b``. Both passes have about as many poses.
     """
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b], unit))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]
@@ -144,17 +140,17 @@ def _passes(
 
 
 def _odometry_edges(Ts: NDArray[np.float64], unit: float) -> list[Edge]:
-    """Motions between consecutive stored frames (n, 4, 4); standard deviations (m, rad) grow with their length."""
+    """Motions between stored frames; standard deviations (m, rad) grow with their length."""
     motions = se3.inverse(Ts[:-1]) @ Ts[1:]
     sigmas = (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * lengths(motions, unit)).tolist()
     return [Edge(i, i + 1, T, sigma * unit, sigma) for i, (T, sigma) in enumerate(zip(motions, sigmas, strict=True))]
 
 
 def step_lengths(Ts: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """Lengths (n - 1,) of the steps along a path (n, 4, 4), see ``lengths``."""
+    """``lengths`` (n - 1,) of the steps along a path (n, 4, 4)."""
     return lengths(se3.inverse(Ts[:-1]) @ Ts[1:], unit)
 
 
 def lengths(motions: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """Lengths (n,) of motions (n, 4, 4) in multiples of ``unit`` (m); one radian counts as one."""
+    """Lengths (n,) of motions (n, 4, 4) in ``unit`` (m); one radian counts as one."""
     return np.linalg.norm(motions[:, :3, 3], axis=1) / unit + se3.rotation_angles(motions)

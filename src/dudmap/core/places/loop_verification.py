@@ -1,4 +1,4 @@
-"""Geometric verification of recognised places: plausible drift, and registration against the map of that time."""
+"""Geometric verification of recognised places: plausible drift, and registration to the map of that time."""
 
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -25,12 +25,12 @@ from dudmap.core.tracking.tracker import Tracker, TrackingResult
 from dudmap.core.verdict import Outcome, Verdict
 
 LOCAL_FRAMES = 8
-"""Number of stored frames in the local map of a place, the nearest ones to the recognised pose."""
+"""Stored frames in the local map of a place, nearest first."""
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
-"""Largest distance (reference depths) and angle (deg) of these frames from the recognised pose."""
+"""Largest distance (reference depths) and angle (deg) of these frames from the pose."""
 DRIFT_ALLOWANCE, DRIFT_SHARE = 0.05, 0.1
-"""Drift that is plausible after any path, reference depths and radians. Further drift as a share of the path since the
-last visit; 1 rad counts as one reference depth."""
+"""Plausible drift after any path, reference depths and radians, and as a share of the path; 1 rad counts as one
+reference depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +50,12 @@ class LoopQuery:
 
     @cached_property
     def static_weights(self) -> list[NDArray[np.float32]] | None:
-        """Per level (h, w), weights of the pixels in a registration; None = 1."""
+        """Per level (h, w), weights of the registration; None = 1."""
         return None if self.labels is None else static_weights(self.labels, self.levels)
 
 
 class LoopVerifier:
-    """Decides whether a frame shows a recognised place; the atlas is read only."""
+    """Decides whether a frame shows a recognised place, without changing the atlas."""
 
     def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
         self.config = config
@@ -63,9 +63,9 @@ class LoopVerifier:
         self.tracker = tracker
 
     def plausibility(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> Verdict:
-        """Whether the path since the last visit of a place of the current submap explains the implied drift.
+        """Whether the path since the last visit explains the implied drift.
 
-        ``T_world_camera``: tracked pose (4, 4) of the frame.
+        ``T_world_camera``: tracked pose (4, 4).
         """
         since = [pose.T_world_camera for pose in self._poses_since(place)]
         unit = self.atlas.unit
@@ -78,10 +78,8 @@ class LoopVerifier:
         return Verdict((moved, Outcome.of("drift_rad", angle, limit, far + "rad")))
 
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of a frame in a local map of frames stored up to the time of the place, or in its saved map.
-
-        Returns None unless features, distances and intensities agree.
-        """
+        """Pose (4, 4) of a frame in a local map up to the time of the place, or in its saved map; None unless features,
+        distances and intensities agree."""
         local = self._local_map(place)
         if local is None:
             return None
@@ -91,11 +89,10 @@ class LoopVerifier:
         return found.T_world_camera if verdict.accepted else None
 
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
-        """Whether a correction improves the fit of the newest frame to the map of the time of a place.
+        """Whether a correction improves the fit of the newest frame to the map of the place.
 
-        Near a revisited place registration can return to the older surfaces by itself; an earlier correction would then
-        displace the camera. The older pass are the frames stored before the farthest point of the path since the last
-        visit. True if no stored frame of it is near.
+        Registration can return to the older surfaces by itself; a correction would then displace the camera. The older
+        pass are the frames stored before the farthest point of the path. True if none of them is near.
         """
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked
@@ -113,7 +110,7 @@ class LoopVerifier:
         return (pose for pose in islice(poses, begin, None) if pose.submap == self.atlas.current)
 
     def _local_map(self, place: PlaceMatch) -> TsdfVolume | None:
-        """Map around a place at the time of its last visit; None without stored frames nearby."""
+        """Map around a place at its last visit; None without stored frames nearby."""
         history, keyframe = self.atlas.history, place.keyframe
         assert history is not None
         if keyframe.submap == self.atlas.saved:
@@ -136,7 +133,7 @@ class LoopVerifier:
 
 
 def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
-    """Mean truncated distance, metres, of the static measurements of a frame at a pose to a map."""
+    """Mean truncated distance, metres, of a frame's static measurements to a map."""
     level = query.levels[-1]
     weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
     volume.look_at(T_world_camera)

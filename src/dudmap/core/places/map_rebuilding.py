@@ -1,8 +1,7 @@
 """Rebuilding of a map from the stored frames of its submap, a few with every new frame.
 
-ElasticFusion (Whelan et al. 2015) deforms the surface. BundleFusion (Dai et al. 2017) re-integrates frame by frame, as
-here, in order of time, because later frames carve. Until the new map is complete, frames are registered to a
-provisional map of stored frames with the present view.
+Frames are re-integrated in order of time, because later frames carve (BundleFusion, Dai et al. 2017). Meanwhile frames
+are registered to a provisional map of the present view.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,18 +14,17 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 
 MAX_IMMEDIATE = 24
-"""Largest number of stored frames that are fused at once, the nearest to the view first."""
+"""Stored frames fused at once, nearest to the view first."""
 PER_FRAME = 2
-"""Stored frames that are fused with every later frame. At most one is stored per frame, so that the rebuilding ends."""
+"""Stored frames fused with every later frame; at most one is stored per frame."""
 MAX_ADDED = 8
-"""Stored frames added to the provisional map at once around the candidate pose of a lost camera."""
+"""Stored frames added at once around a candidate pose of a lost camera."""
 VIEW_DEPTH = 2.0
-"""Depth of the point for comparing views, reference depths: the middle of an indoor view."""
+"""Depth of the view point, by which views are compared, reference depths: middle of an indoor view."""
 NEAR = 3.0
-"""Largest distance between the view points of the camera and of a stored frame added to the provisional map,
-reference depths."""
+"""Largest distance of an added frame's view point from the camera's, reference depths."""
 SPACING = 0.3
-"""Smallest distance between the view points of two added frames, reference depths."""
+"""Smallest distance between view points of added frames, reference depths."""
 
 
 @dataclass(eq=False)
@@ -34,8 +32,8 @@ class MapRebuilding:
     """An incomplete new map of a submap, which also receives all new frames.
 
     Attributes:
-        shown: Numbers of the stored frames that the provisional map has, or does not need because a near one is in it.
-        start: Number of stored frames when the rebuilding began.
+        shown: Stored frames that the provisional map has or does not need.
+        start: Stored frames when the rebuilding began.
     """
 
     history: FrameStore
@@ -52,11 +50,11 @@ class MapRebuilding:
 
     @property
     def missing(self) -> list[int]:
-        """Numbers of the stored frames that the new map lacks, in order of time."""
+        """Stored frames that the new map lacks, in order of time."""
         return [n for n in self.history.kept_of(self.submap) if n not in self.fused]
 
     def fuse(self, count: int | None = None) -> bool:
-        """Fuse the next ``count`` stored frames (None = all) into the new map; returns whether it is complete."""
+        """Fuse the next ``count`` stored frames (None = all); returns whether the map is complete."""
         missing = self.missing
         for n in missing[:count]:
             self.history.reintegrate(self.volume, [n])
@@ -64,12 +62,11 @@ class MapRebuilding:
         return count is None or len(missing) <= count
 
     def add_shown(self, numbers: Sequence[int]) -> None:
-        """Note that the provisional map has these stored frames, too."""
+        """Record frames of the provisional map."""
         self.shown.update(numbers)
 
     def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> int:
-        """Add at most ``count`` stored frames with the view of a camera to the provisional map; returns their
-        number."""
+        """Add at most ``count`` frames with the view of a camera to the provisional map; returns their number."""
         unknown = np.array([n for n in self.history.kept_of(self.submap) if n < self.start and n not in self.shown])
         unknown = unknown.astype(int)
         unit = self.volume.sensor.reference_depth
@@ -92,14 +89,14 @@ class MapRebuilding:
 def nearest_views(
     Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], count: int, unit: float = 1.0
 ) -> NDArray[np.int64]:
-    """Sorted indices of at most ``count`` poses (n, 4, 4) whose views are nearest to the view of a camera."""
+    """Sorted indices of at most ``count`` poses (n, 4, 4) with views nearest to a camera's."""
     return np.sort(np.argsort(view_distances(Ts, T_world_camera, unit), kind="stable")[:count])
 
 
 def view_distances(
     Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], unit: float = 1.0
 ) -> NDArray[np.float64]:
-    """Distances (n,) between the view points of poses (n, 4, 4) and of a camera, metres; ``unit``: reference depth."""
+    """Distances (n,) of the view points of poses (n, 4, 4) from a camera's, metres; ``unit``: reference depth."""
     return np.linalg.norm(_looked_at(Ts, unit) - _looked_at(T_world_camera, unit), axis=-1)
 
 

@@ -1,7 +1,7 @@
-"""Place recognition: keyframes with features of known 3D position, and the poses they suggest for a frame.
+"""Place recognition: keyframes with features of known 3D position, and the poses they suggest.
 
-SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012). Poses by 3D-3D
-RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
+SIFT features (Lowe 2004) are compared as RootSIFT (Arandjelovic and Zisserman 2012). Poses come from 3D-3D RANSAC over
+three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
 """
 
 import math
@@ -24,29 +24,29 @@ from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.core.verdict import Outcome, Verdict
 
 MAX_FEATURES, IMAGE_WIDTH = 400, 320
-"""Largest number of features of a frame, and width of the image in which they are detected, pixels."""
+"""Features of a frame, and width of the image in which they are detected, pixels."""
 RATIO = 0.85
-"""Threshold of the ratio test: nearest over second nearest descriptor distance (Lowe 2004: 0.8)."""
+"""Nearest over second nearest descriptor distance (Lowe 2004: 0.8)."""
 MIN_INLIERS, MIN_SHARE = 15, 0.25
-"""Smallest number of RANSAC inliers of a match, and their smallest share among the matches with a keyframe."""
+"""RANSAC inliers of a match, and their share among the matches."""
 MIN_ON_MAP = 0.4
-"""Smallest share of the measurements that are static and lie on the map at an accepted pose."""
+"""Smallest share of measurements static and on the map at an accepted pose."""
 MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
-"""Largest correction of the feature-based pose by the registration, reference depths and degrees."""
+"""Largest correction of the feature pose by the registration, reference depths and degrees."""
 COARSE_FEATURES = 64
-"""Number of strongest features per keyframe in the coarse comparison that selects keyframes for matching."""
+"""Strongest features per keyframe that select keyframes for matching."""
 MAX_MATCHED = 5
-"""Number of keyframes per frame whose features are all matched; it bounds the time of a query."""
+"""Fully matched keyframes per frame."""
 POSITION_ERROR = 0.01
-"""Largest error of a feature's position beyond sensor noise, metres per metre of depth: 2.6 pixels at a width of 320
-and 63 degrees."""
+"""Largest position error of a feature beyond sensor noise, per metre of depth: 2.6 pixels at a width of 320 and 63
+degrees."""
 DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
-"""Matches in one submap whose poses differ by less (reference depths, deg) are duplicates."""
+"""Matches in one submap at nearer poses (reference depths, deg) are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedFeatures:
-    """SIFT features of a frame with known depth, strongest first.
+    """SIFT features of a frame with depth, strongest first.
 
     Attributes:
         descriptors: (n, 128) float32, RootSIFT, unit length.
@@ -65,11 +65,11 @@ NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
 
 @dataclass(eq=False)
 class Keyframe:
-    """A tracked frame with stored features.
+    """A tracked frame with features.
 
     Attributes:
-        T_world_camera: (4, 4) in the world of its submap; updated when the map is corrected.
-        last_seen: Last time at which the camera was near its pose, seconds.
+        T_world_camera: (4, 4) in its submap; corrected with the map.
+        last_seen: Last time near its pose, seconds.
     """
 
     timestamp: float
@@ -81,7 +81,7 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class LastFrame:
-    """The last tracked frame; its features are extracted when a later frame is lost.
+    """The last tracked frame; its features are extracted when needed.
 
     Attributes:
         dynamic_mask: (H, W) bool, pixels without features; None for none.
@@ -97,7 +97,7 @@ class PlaceMatch:
     """A frame that shows the place of a keyframe.
 
     Attributes:
-        T_world_camera: (4, 4) pose of the frame in the world of the keyframe's submap.
+        T_world_camera: (4, 4) pose of the frame in the keyframe's submap.
         num_inliers: Feature matches that agree with the pose.
     """
 
@@ -106,9 +106,9 @@ class PlaceMatch:
     num_inliers: int
 
     def verdict(self, found: TrackingResult, unit: float, static_share: float = 1.0) -> Verdict:
-        """Whether a registration of the frame confirms the pose from features.
+        """Whether a registration confirms the pose from features.
 
-        ``unit``: reference depth, metres. ``static_share``: static share of its measurements.
+        ``unit``: reference depth, metres. ``static_share``: static share of the measurements.
         """
         distance, angle_deg = difference(found.T_world_camera, self.T_world_camera)
         seen = "only {figure:.0%} of the measurements are static and on the map"
@@ -124,7 +124,7 @@ class PlaceMatch:
 class KeyframeDatabase(Stateful):
     """Keyframes along the trajectory, and place recognition by their features.
 
-    Another thread extracts the features of a new keyframe; ``settle`` waits for them. ``extract`` is not thread-safe.
+    Another thread extracts features of new keyframes; ``settle`` waits for them. ``extract`` is not thread-safe.
     """
 
     keyframes: Remembered[list[Keyframe]]
@@ -141,16 +141,13 @@ class KeyframeDatabase(Stateful):
         self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
     def state(self) -> dict[str, Any]:
-        """The keyframes, after waiting for their features."""
+        """The keyframes with their features."""
         self.settle()
         return super().state()
 
     def extract(self, observation: Observation, dynamic_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
-        """SIFT features of a frame that lie on one static surface.
-
-        Args:
-            dynamic_mask: (H, W) bool, excluded pixels; None = none.
-        """
+        """SIFT features of a frame on one static surface. ``dynamic_mask``: (H, W) bool, excluded pixels; None =
+        none."""
         self.settle()
         return self._extract(observation, dynamic_mask)
 
@@ -180,8 +177,8 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
-        """Make a tracked frame a keyframe if no keyframe of its submap is near and ``relocalization.keyframe_gap``
-        tracked frames have passed; call with every tracked frame.
+        """Make a tracked frame a keyframe if none of its submap is near and ``relocalization.keyframe_gap`` tracked
+        frames have passed; call with every tracked frame.
 
         ``settle`` removes it if it has fewer than ``MIN_INLIERS`` features.
         """
@@ -204,7 +201,7 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> None:
-        """Remember the last tracked frame, the first candidate for recognition of a lost frame."""
+        """Remember the last tracked frame, the first candidate for recognition."""
         timestamp = observation.timestamp
         place = Keyframe(timestamp, T_world_camera.copy(), NO_FEATURES, submap, timestamp)
         self.last = LastFrame(place, observation, dynamic_mask)
@@ -215,15 +212,14 @@ class KeyframeDatabase(Stateful):
         return [*self.keyframes, *([] if self.last is None else [self.last.keyframe])]
 
     def recognise(self, features: PlacedFeatures) -> list[PlaceMatch]:
-        """Places that a frame with these features may show: the last tracked frame, which needs half as many
-        inliers, then the keyframes."""
+        """Places with these features: the last tracked frame, which needs half as many inliers, then keyframes."""
         if self.last is not None and len(self.last.keyframe.features) == 0:
             self.last.keyframe.features = self.extract(self.last.observation, self.last.dynamic_mask)
         last = [] if self.last is None else [self.last.keyframe]
         return self.match(features, last, MIN_INLIERS // 2) + self.match(features)
 
     def settle(self) -> None:
-        """Wait for the features of the newest keyframe, and remove it if they are too few."""
+        """Wait for the newest features; remove a keyframe with too few."""
         features, self._unsettled = self._unsettled(), _nothing
         if features is None:
             return
@@ -237,9 +233,9 @@ class KeyframeDatabase(Stateful):
     def match(
         self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None, min_inliers: int | None = None
     ) -> list[PlaceMatch]:
-        """Keyframes that match the features of a frame, each with the frame's pose; distinct poses, most inliers first.
+        """Keyframes that match the features, each with the frame's pose; distinct poses, most inliers first.
 
-        ``among`` limits the keyframes (None = all). ``min_inliers`` None takes ``MIN_INLIERS``.
+        ``among``: candidates (None = all). ``min_inliers``: None = ``MIN_INLIERS``.
         """
         among = self.keyframes if among is None else among
         fewest = MIN_INLIERS if min_inliers is None else min_inliers
@@ -269,7 +265,7 @@ class KeyframeDatabase(Stateful):
     def near(
         self, T_world_camera: NDArray[np.float64], submap: int, distance: float, angle_deg: float
     ) -> list[Keyframe]:
-        """Keyframes of a submap that are closer to a pose (4, 4) than a distance (m) and an angle (deg)."""
+        """Keyframes of a submap closer to a pose (4, 4) than a distance (m) and an angle (deg)."""
         if not self.keyframes:
             return []
         Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
@@ -279,7 +275,7 @@ class KeyframeDatabase(Stateful):
         return [self.keyframes[n] for n in close.nonzero()[0] if self.keyframes[n].submap == submap]
 
     def _remove_most_redundant(self) -> None:
-        """Remove the older of the two keyframes of one submap whose poses are nearest to each other."""
+        """Remove the older of the two nearest keyframes of one submap."""
         Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
         cosine = (np.einsum("iab,jab->ij", Ts[:, :3, :3], Ts[:, :3, :3]) - 1) / 2
@@ -291,7 +287,7 @@ class KeyframeDatabase(Stateful):
         del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
 
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Largest plausible error (n,) of the position of a feature, metres."""
+        """Largest plausible position error of a feature, metres."""
         z = points[:, 2]
         return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
 
@@ -301,10 +297,10 @@ def _nothing() -> None:
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
-    """The keyframes whose strongest features are most similar to the frame's, best first.
+    """The keyframes whose strongest features are most similar, best first.
 
-    A score sums, over the frame's features, the excess of its best cosine similarity over the median of all keyframes.
-    Features of many places do not count.
+    A score sums the excess of a feature's best cosine similarity over the median of all keyframes, so that features of
+    many places do not count.
     """
     if len(among) <= MAX_MATCHED:
         return among
@@ -317,7 +313,7 @@ def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterab
 
 
 def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
-    """Values (n, 9) of the 3x3 neighbourhoods of pixels (n, 2) of an image, clamped at its border."""
+    """Values (n, 9) of 3x3 neighbourhoods, clamped at the border."""
     u, v = np.rint(pixels).astype(np.int64).T
     offsets = np.arange(-1, 2)
     rows = np.clip(v[:, None, None] + offsets[:, None], 0, image.shape[0] - 1)
@@ -326,10 +322,7 @@ def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
 
 
 def _depth_at(depth: NDArray[np.float32], pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Median depth (n,) of 3x3 neighbourhoods, and whether their measurements lie on one surface.
-
-    A corner at a depth edge has no well-defined position.
-    """
+    """Median depth of 3x3 neighbourhoods, and whether they lie on one surface."""
     readings = _neighbourhood(depth, pixels)
     median = np.median(readings, axis=1)
     spread = readings.max(axis=1) - readings.min(axis=1)

@@ -10,7 +10,7 @@ from dudmap.core.geometry import se3
 
 MAX_ITERATIONS = 20
 MAX_STEP = 1e-9
-"""The optimization has converged when no pose moves by more than this, metres and radians."""
+"""Largest step at convergence, metres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,9 +18,9 @@ class Edge:
     """Measured motion between two poses.
 
     Attributes:
-        T_a_b: (4, 4) measured motion.
-        sigma_distance: Standard deviation of its translation, metres, per axis.
-        sigma_angle: Standard deviation of its rotation, radians, per axis.
+        T_a_b: (4, 4).
+        sigma_distance: Standard deviation of its translation per axis, metres.
+        sigma_angle: Standard deviation of its rotation per axis, radians.
     """
 
     a: int
@@ -38,13 +38,13 @@ def optimize(
 ) -> NDArray[np.float64]:
     """Minimize the sum over all edges of ``|e|^2`` with ``e = log(T_a_b^-1 T_a^-1 T_b)``, weighted by the variances.
 
-    ``covariances`` (E, 6, 6) of ``e`` replace the variances of the edges. ``huber``: threshold of the Huber kernel,
-    standard deviations.
+    ``covariances`` (E, 6, 6) of ``e`` replace the variances of the edges. ``huber``: Huber threshold, standard
+    deviations.
 
-    Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. SciPy (SuperLU) solves the
-    sparse normal equations. The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
-    inverse right Jacobian, by ``xi_a`` that matrix times ``-Ad(T_b^-1 T_a)``. The edges must connect all initial poses
-    (N, 4, 4). The result is not finite if the normal equations are singular.
+    Gauss-Newton on SE(3) with right updates ``T exp(xi)``; the first pose is fixed. SciPy (SuperLU) solves the normal
+    equations. The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2`` (inverse right Jacobian, first order), by
+    ``xi_a`` that matrix times ``-Ad(T_b^-1 T_a)``. The edges must connect all poses (N, 4, 4). The result is not finite
+    if the normal equations are singular.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve

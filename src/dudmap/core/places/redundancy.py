@@ -1,6 +1,6 @@
-"""Redundant views: frames without new information for the map, which are not fused (thesis section 4.3).
+"""Redundant views: frames without new information, which are not fused (thesis section 4.3).
 
-The thesis compares SIFT features of two images; the map's weights measure the information directly.
+The map's weights measure the information directly; the thesis compares SIFT features.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MAX_ROTATION_DEG = 0.3
-"""Rotation since the last fused frame above which a view counts as new, degrees: 0.7 label pixels."""
+"""Rotation since the last fused frame above which a view is new, degrees: 0.7 label pixels."""
 
 
 @dataclass(eq=False)
 class _Place:
-    """Record of the frames fused from one place.
+    """Frames fused from one place.
 
     Attributes:
-        T_world_camera: (4, 4) pose of the first frame fused from there.
-        depth: (h, w) float32, metres, last fused static measurement of each pixel; 0 = none.
+        T_world_camera: (4, 4) pose of the first of them.
+        depth: (h, w) float32, metres, last fused static measurement; 0 = none.
         to_carve: (h, w), number of further frames to fuse at each pixel, to carve an object that left.
     """
 
@@ -37,9 +37,9 @@ class _Place:
 
 
 class RedundantViews(Stateful):
-    """Decides which frames are not fused because the map has their information already.
+    """Decides which frames are not fused because the map has their information.
 
-    A view is redundant only at the place of the last fused frames: elsewhere the systematic errors differ.
+    A view is redundant only at the place of the last fused frames: elsewhere systematic errors differ.
     """
 
     _place: Remembered[_Place | None] = None
@@ -49,16 +49,15 @@ class RedundantViews(Stateful):
         self._learnt = 2 * config.volume.free_after
 
     def is_redundant(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> bool:
-        """Whether to leave a registered frame out of the fusion into a map.
+        """Whether to leave a registered frame out of the fusion.
 
-        It is redundant if the map has on average more than ``similarity.threshold`` of the information on the visible
-        static surface, except for
+        The map must have on average more than ``similarity.threshold`` of the information on visible static surface,
+        except for
 
-        * a surface with fewer than 2 ``volume.free_after`` observations: the space before it is not yet known to be
-          free. Each frame observes every second plane of blocks
-        * measurements off the surface of the map: a new object
-        * measurements behind the last fused depth of their pixel, until they are fused as often: an object left and is
-          carved
+        * a surface with fewer than 2 ``volume.free_after`` observations, because the space before it is not yet known
+          to be free (each frame observes every second plane of blocks)
+        * measurements off the map surface: a new object
+        * measurements behind the last fused depth, until fused as often: an object left and is carved
         """
         place, config, level = self._place, self.config.similarity, view.labelled
         if place is None or not config.enabled or not self._is_near(place, estimate.T_world_camera):
@@ -72,7 +71,7 @@ class RedundantViews(Stateful):
         return bool(np.count_nonzero(opened_mask(unfused, level)) < MIN_REGION * unfused.size)
 
     def update(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> None:
-        """Record a frame that was fused into a map."""
+        """Record a fused frame."""
         config, level, T_world_camera = self.config.similarity, view.labelled, estimate.T_world_camera
         if not config.enabled:
             return
@@ -93,13 +92,13 @@ class RedundantViews(Stateful):
             self._place.T_world_camera = T_new_old @ self._place.T_world_camera
 
     def reset(self) -> None:
-        """Forget the place, because later frames are fused into another map."""
+        """Forget the place."""
         self._place = None
 
     def _known_share(
         self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share (h, w) of the surface information at each measurement that the map has; 0 off its surface."""
+        """Share of the surface information at each measurement that the map has; 0 off its surface."""
         volume.look_at(T_world_camera)
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)

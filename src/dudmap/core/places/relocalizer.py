@@ -1,4 +1,4 @@
-"""Relocalization: the pose of a lost frame from recognised keyframes, and the decision to start a new submap."""
+"""Relocalization of a lost frame by recognised keyframes, and the start of new submaps."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -21,15 +21,14 @@ from dudmap.core.verdict import Outcome, Verdict
 from dudmap.core.young_map import UNDECIDED
 
 MIN_READINGS = 0.2
-"""Smallest share of valid depth pixels in the first frame of a submap."""
+"""Smallest share of depth pixels in the first frame of a submap."""
 Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
-"""Registers and labels the lost frame against a map, starting at a pose (4, 4) in the world of that map."""
+"""Registers and labels the lost frame against a map, from a pose (4, 4) in its world."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relocalization:
-    """Verified pose and labels of a lost frame in the map of the recognised submap, which may differ from the current
-    one."""
+    """Verified pose and labels of a lost frame in the recognised submap."""
 
     estimate: PoseEstimate
     submap: int
@@ -39,8 +38,8 @@ class Relocalization:
 class Relocalizer(Stateful):
     """Recovers the camera pose after tracking was lost.
 
-    A lost frame is compared with the last tracked frame and all keyframes of the atlas; registration verifies each
-    candidate pose. The atlas is not changed.
+    A lost frame is compared with the last tracked frame and all keyframes; registration verifies each candidate. The
+    atlas is not changed.
     """
 
     _lost_since: Remembered[float | None] = None
@@ -59,11 +58,11 @@ class Relocalizer(Stateful):
 
     @property
     def is_lost(self) -> bool:
-        """Whether no frame has been tracked since the last call of ``lost``."""
+        """Whether no frame was tracked since ``lost``."""
         return self._lost_since is not None
 
     def start_in_saved_map(self) -> None:
-        """Declare the camera's place in the current map unknown until a frame is recognised."""
+        """Declare the camera's place unknown until a frame is recognised."""
         self._place_unknown = True
 
     @property
@@ -73,23 +72,22 @@ class Relocalizer(Stateful):
         return Verdict((Outcome("place_unknown", 1, 0, reason),) if self._place_unknown else ())
 
     def lost(self, timestamp: float, *, mostly_dynamic: bool = False) -> None:
-        """Record a lost frame (timestamp in seconds); ``mostly_dynamic``: most of the view moved in the last tracked
-        frame."""
+        """Record a lost frame; ``mostly_dynamic``: most of the view moved in the last tracked frame."""
         if self._lost_since is None:
             self._lost_since, self._mostly_dynamic = timestamp, mostly_dynamic
 
     def found(self) -> None:
-        """Record that the camera is tracked again or that a new submap was started."""
+        """Record that the camera is tracked, or a new submap started."""
         self._lost_since, self._mostly_dynamic, self._place_unknown = None, False, False
         self._recent.clear()
 
     def recover(
         self, view: FrameView, register: Register, judge: Callable[[TrackingResult], Verdict]
     ) -> Relocalization | None:
-        """Pose of a lost frame, verified by registration against the map; None if no candidate passes.
+        """Verified pose of a lost frame; None if no candidate passes.
 
         Candidates in the current submap come first: the last tracked frame, then most feature matches. The first that
-        its registration confirms and ``judge`` accepts is the result. The timer records stage ``recognise``.
+        its registration confirms and ``judge`` accepts is the result.
         """
         if not (self.config.relocalization.enabled and view.observation.has_color):
             return None
@@ -115,15 +113,15 @@ class Relocalizer(Stateful):
 
     @property
     def may_start_submaps(self) -> bool:
-        """Whether a map may be discarded for a new, empty one."""
+        """Whether a map may be discarded for an empty one."""
         return self.config.submaps.enabled and self.atlas.history is not None
 
     def start_verdict(self, view: FrameView) -> Verdict:
-        """Whether to start a new, empty submap with this lost frame. All of these conditions must hold:
+        """Whether to start an empty submap with this lost frame. Conditions:
 
         * The camera has been lost for ``submaps.patience`` seconds.
         * The frame has enough depth for a map and, if it has colour, enough features for a keyframe.
-        * The image motion is camera motion (``_shows_static_world``), by the last lost image (fast people) and an image
+        * The image motion is camera motion (``_shows_static_world``), by the last lost image (fast people) and one
           UNDECIDED older (slow people).
         """
         return Verdict.of(self._start_outcomes(view))
@@ -156,13 +154,12 @@ class Relocalizer(Stateful):
         return self.config.dynamics.enabled and self.config.dynamics.start_seconds > 0
 
     def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
-        """Whether the motion between an earlier lost image and this one is certainly the camera's.
+        """Whether the motion since an earlier lost image is certainly the camera's.
 
-        Two images do not determine which of two motions is the camera's: a near crowd may fill most pixels, the far
-        world most surface. A map starts only if one motion explains AGREED of the surface and most of the pixels.
-        Exceptions:
+        A near crowd may fill most pixels, the far world most surface. A map starts only if one motion explains AGREED
+        of the surface and most of the pixels. Exceptions:
 
-        * Without a common motion (no texture): True unless most of the view moved when the camera was lost.
+        * No common motion (no texture): True unless most of the view moved when the camera was lost.
         * Images are not compared (``dynamics.start_seconds`` = 0): True.
         """
         if not self._compares_images:

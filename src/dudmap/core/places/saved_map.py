@@ -1,4 +1,4 @@
-"""A saved map that a later run continues: its volume, its keyframes and the residuals of its last registrations."""
+"""A saved map that a later run continues."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from dudmap.input_files import DAMAGE, open_arrays
 
 MAP_FILE, KEYFRAME_FILE = "map.npz", "keyframes.npz"
 KIND, VERSION = "dudmap keyframes", 1
-"""Content and version of a keyframe file; the version increases when older programs cannot read it."""
+"""Content and version of a keyframe file; older programs refuse a higher version."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,8 @@ class SavedMap:
     Attributes:
         volume: The map.
         keyframes: Keyframes of the main submap.
-        registrations: Residuals of the last registrations, which judge the first ones of the next run.
-        folder: Folder from which the map was read.
+        registrations: Last residuals, which judge the first registrations of the next run.
+        folder: Folder of the map.
     """
 
     volume: TsdfVolume
@@ -38,7 +38,7 @@ class SavedMap:
 
     @classmethod
     def load(cls, folder: str | Path, voxel_size: float | None = None) -> "SavedMap":
-        """Read the map of a run folder; its voxels must have ``voxel_size`` (m), unless that is None.
+        """Read the map of a run folder; ``voxel_size``: required one (m), or None.
 
         Raises:
             MapError: A file is missing, damaged or of a newer version, or there are no keyframes.
@@ -67,7 +67,7 @@ class SavedMap:
         return cls(volume, keyframes, registrations, folder)
 
     def save_keyframes(self, path: str | Path) -> None:
-        """Write everything except the volume, which ``TsdfVolume.save`` writes.
+        """Write everything except the volume.
 
         Raises:
             MapError: The file cannot be written.
@@ -95,7 +95,7 @@ class SavedMap:
 def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistory, float]:
     """Keyframes, registrations and voxel size (m) of a keyframe file.
 
-    Descriptors are stored with 11 bits and points with 24; the rounding is far below their noise.
+    Descriptors have 11 bits and points 24, far below their noise.
 
     Raises:
         MapError: The file is missing, damaged or of a newer version.
@@ -130,7 +130,6 @@ def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistor
 
 
 def _check_arrays(data: "Mapping[str, NDArray]") -> None:
-    """Check the arrays of a keyframe file; raises a ``ValueError``."""
     n, total = len(data["counts"]), len(data["points"])
     wanted = {
         "counts": ("iu", (n,)), "timestamps": ("f", (n,)), "Ts_world_camera": ("f", (n, 4, 4)),
@@ -155,7 +154,7 @@ def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class PriorMap:
-    """The map of a first pass, against which a second pass registers and labels its frames.
+    """The map of a first pass, for a second pass.
 
     Attributes:
         volume: Map of the largest submap.
